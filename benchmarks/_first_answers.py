@@ -1,0 +1,492 @@
+"""What a user waits for: the programs that `python -m benchmarks.compilation` times.
+
+Each case is a function that imports and prepares all that the wait is not about, and
+returns what is waited for. It runs in a process of its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+Thunk = Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something to wait for.
+
+    - `prepare`: gives what is waited for, and if there is, what comes after it: the
+      same for other shapes.
+    - `limit`: seconds that the wait may last, `None` if a ratio is what counts.
+    - `peer`: the case that does the same without delucax.
+    - `at_most`: how many times the peer's wait it may last.
+    """
+
+    prepare: Callable[[], tuple[Thunk, ...]]
+    limit: float | None = None
+    peer: str | None = None
+    at_most: float | None = None
+
+
+CASES: dict[str, Case] = {}
+
+
+def case(name: str, limit: float | None = None, **options: Any) -> Callable[..., Any]:
+    """Register a function as a case."""
+
+    def register(prepare: Callable[[], Any]) -> Callable[[], Any]:
+        CASES[name] = Case(prepare, limit, **options)
+        return prepare
+
+    return register
+
+
+def system(n: int) -> tuple[np.ndarray, ...]:
+    """A random unstable system with a quarter as many controls as states, and weights;
+    in discrete time."""
+    rng = np.random.default_rng(n)
+    m = max(1, n // 4)
+    A = 1.2 * rng.normal(size=(n, n)) / np.sqrt(n)
+    return A, rng.normal(size=(n, m)), np.eye(n), np.eye(m)
+
+
+def of_shapes(solve: Callable[..., Any]) -> tuple[Thunk, ...]:
+    """Four states first, then further shapes."""
+    data = [system(n) for n in (4, 2, 10, 30, 50)]
+    return tuple(lambda given=given: solve(*given) for given in data)
+
+
+@case("dare", 0.5, peer="SciPy: dare")
+def dare():
+    import delucax as dlx
+
+    return of_shapes(dlx.riccati.dare)
+
+
+@case("care", 0.5, peer="SciPy: care")
+def care():
+    import delucax as dlx
+
+    return of_shapes(dlx.riccati.care)
+
+
+@case("SciPy: dare")
+def scipy_dare():
+    import scipy.linalg
+
+    return of_shapes(scipy.linalg.solve_discrete_are)
+
+
+@case("SciPy: care")
+def scipy_care():
+    import scipy.linalg
+
+    return of_shapes(scipy.linalg.solve_continuous_are)
+
+
+@case("dlyap", 0.5)
+def dlyap():
+    import delucax as dlx
+
+    return of_shapes(lambda A, B, Q, R: dlx.riccati.dlyap(0.5 * A, Q))
+
+
+@case("lyap", 0.5)
+def lyap():
+    import delucax as dlx
+
+    solve = dlx.riccati.lyap
+    return of_shapes(lambda A, B, Q, R: solve(A - 2 * np.eye(len(A)), Q))
+
+
+@case("hinf_dare", 0.5)
+def hinf_dare():
+    import delucax as dlx
+
+    return of_shapes(
+        lambda A, B, Q, R: dlx.riccati.hinf_dare(A, B, 0.1 * np.eye(len(A)), Q, R)
+    )
+
+
+@case("hinf_care", 0.5)
+def hinf_care():
+    import delucax as dlx
+
+    return of_shapes(
+        lambda A, B, Q, R: dlx.riccati.hinf_care(A, B, 0.1 * np.eye(len(A)), Q, R)
+    )
+
+
+@case("dre, 50 steps", 0.5)
+def dre():
+    import delucax as dlx
+
+    return of_shapes(lambda *given: dlx.riccati.dre(*given, horizon=50))
+
+
+def linear(A: np.ndarray, B: np.ndarray, C: Any = None) -> Any:
+    """A discrete-time model."""
+    import delucax as dlx
+
+    return dlx.LinearDynamics(A, B, C, dt=0.1)
+
+
+@case("LQR of matrices", 0.5)
+def lqr():
+    import delucax as dlx
+
+    return of_shapes(lambda A, B, Q, R: dlx.controllers.LQR(linear(A, B), Q, R))
+
+
+@case("LQG of matrices", 0.5)
+def lqg():
+    import delucax as dlx
+
+    def design(A, B, Q, R):
+        C = np.eye(len(A))[: len(R)]
+        return dlx.controllers.LQG(linear(A, B, C), Q, R, Q, R)
+
+    return of_shapes(design)
+
+
+@case("HInfinity of matrices", 0.5)
+def hinfinity():
+    import delucax as dlx
+
+    return of_shapes(lambda A, B, Q, R: dlx.controllers.HInfinity(linear(A, B), Q, R))
+
+
+@case("python-control: dlqr")
+def control_lqr():
+    import control
+
+    return of_shapes(lambda A, B, Q, R: control.dlqr(A, B, Q, R))
+
+
+def upright(design: Callable[..., Any]) -> Callable[[], tuple[Thunk, ...]]:
+    """`make`, `linearize` and a design about the upright pendulum."""
+
+    def prepare():
+        import delucax as dlx
+
+        def answer():
+            env = dlx.make("pendulum")
+            return design(dlx.controllers, dlx.linearize(env.dynamics))
+
+        return (answer,)
+
+    return prepare
+
+
+case("LQR of the pendulum", 1.5)(
+    upright(lambda c, plant: c.LQR(plant, np.eye(2), np.eye(1)))
+)
+case("LQG of the pendulum", 1.5)(
+    upright(
+        lambda c, plant: c.LQG(
+            plant, np.eye(2), np.eye(1), 0.01 * np.eye(2), 0.01 * np.eye(2)
+        )
+    )
+)
+case("HInfinity of the pendulum", 1.5)(
+    upright(lambda c, plant: c.HInfinity(plant, np.eye(2), np.eye(1)))
+)
+
+
+def compiled(solve: str, gradient: bool) -> Callable[[], tuple[Thunk, ...]]:
+    """A Riccati equation of four states under `jit`, at the user's arrays."""
+
+    def prepare():
+        import jax
+        import jax.numpy as jnp
+
+        import delucax as dlx
+
+        def number(*given):
+            solution = getattr(dlx.riccati, solve)(*given, throw=False)
+            return jnp.sum(solution.X) + jnp.sum(solution.K)
+
+        def solution(*given):
+            return getattr(dlx.riccati, solve)(*given, throw=False)
+
+        program = jax.grad(number, argnums=(0, 1, 2, 3)) if gradient else solution
+        data = tuple(jnp.asarray(M) for M in system(4))
+        run = jax.jit(program)
+        return (lambda: run(*data),)
+
+    return prepare
+
+
+case("jit of dare", 1.0)(compiled("dare", False))
+case("jit of dare, gradient", 1.5)(compiled("dare", True))
+case("jit of care", 1.5)(compiled("care", False))
+case("jit of care, gradient", 2.25)(compiled("care", True))
+
+
+@case("rollout", 0.8)
+def rollout():
+    import jax
+
+    import delucax as dlx
+
+    env, zero = dlx.make("pendulum"), dlx.controllers.Zero(1)
+    key = jax.random.key(0)
+    return (lambda: dlx.rollout(env, zero, key=key),)
+
+
+@case("simulate", peer="Diffrax: diffeqsolve", at_most=1.3)
+def simulate():
+    import jax.numpy as jnp
+
+    import delucax as dlx
+
+    system, controls = dlx.systems.Pendulum(), jnp.zeros((100, 1))
+    x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
+    return (
+        lambda: dlx.simulate(system, controls, 0.0, 5.0, x0, dt=0.05, ts=ts).states,
+    )
+
+
+@case("Diffrax: diffeqsolve")
+def diffeqsolve():
+    import diffrax
+    import jax.numpy as jnp
+
+    x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
+    controls = jnp.zeros((100, 1))
+
+    def field(t, x, controls):
+        k = jnp.clip((t / 0.05).astype(int), 0, 99)
+        torque = controls[k, 0]
+        return jnp.stack([x[1], 15.0 * jnp.sin(x[0]) + 3.0 * torque])
+
+    def answer():
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            diffrax.Tsit5(),
+            0.0,
+            5.0,
+            None,
+            x0,
+            controls,
+            saveat=diffrax.SaveAt(ts=ts),
+            stepsize_controller=diffrax.PIDController(
+                rtol=1e-6, atol=1e-9, jump_ts=jnp.linspace(0.0, 5.0, 101)
+            ),
+        ).ys
+
+    return (answer,)
+
+
+def quadrotor(constrained: bool) -> Callable[[], tuple[Thunk, ...]]:
+    """A plan of 50 steps of the planar quadrotor."""
+
+    def prepare():
+        import jax.numpy as jnp
+
+        import delucax as dlx
+
+        env = dlx.make("planar_quadrotor")
+        x0 = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        low = lambda t, x, u: 0.2 - x[1] - 0.3 * x[0]
+        constraints = dlx.planning.Constraints(low) if constrained else None
+        given = env.dynamics, env.cost, x0, 50
+        return (lambda: dlx.planning.ilqr(*given, constraints=constraints),)
+
+    return prepare
+
+
+case("ilqr of the quadrotor", 2.0)(quadrotor(False))
+case("ilqr of the quadrotor, a state constraint", 3.0)(quadrotor(True))
+
+
+@case("MPC, first step", 2.0)
+def mpc():
+    import jax.numpy as jnp
+
+    import delucax as dlx
+
+    env = dlx.make("cartpole")
+    mpc = dlx.controllers.MPC(env.dynamics, env.cost, 20, bounds=(-10.0, 10.0))
+    x0 = jnp.array([0.1, 0.1, 0.0, 0.0])
+    return (lambda: mpc(jnp.asarray(0.0), x0, mpc.init()),)
+
+
+@case("fit, ten steps", peer="Optax by hand, ten steps", at_most=1.3)
+def fit():
+    import jax
+    import optax
+
+    import delucax as dlx
+
+    env, key = dlx.make("pendulum", horizon=50), jax.random.key(0)
+    policy = dlx.controllers.MLP(3, 1, 32, 2, features=env.encode, key=key)
+    loss = dlx.training.expected_cost(env, batch=32)
+    run = lambda: dlx.training.fit(
+        loss, policy, optax.adam(1e-3), 10, key=key, progress=False
+    )
+    return (run,)
+
+
+@case("Optax by hand, ten steps")
+def by_hand():
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    key = jax.random.key(0)
+    network = eqx.nn.MLP(3, 1, 32, 2, jnp.tanh, key=key)
+    optimiser = optax.adam(1e-3)
+
+    def loss(network, key):
+        def total(key):
+            low, high = jnp.array([-jnp.pi, -1.0]), jnp.array([jnp.pi, 1.0])
+            x0 = jax.random.uniform(key, (2,), minval=low, maxval=high)
+
+            def step(x, _):
+                theta, speed = x
+                u = network(jnp.stack([jnp.cos(theta), jnp.sin(theta), speed]))[0]
+                u = jnp.clip(u, -2.0, 2.0)
+                angle = (theta + jnp.pi) % (2 * jnp.pi) - jnp.pi
+                cost = angle**2 + 0.1 * speed**2 + 0.001 * u**2
+                speed = speed + 0.05 * (15.0 * jnp.sin(theta) + 3.0 * u)
+                speed = jnp.clip(speed, -8.0, 8.0)
+                return jnp.stack([theta + 0.05 * speed, speed]), cost
+
+            return jnp.sum(jax.lax.scan(step, x0, None, 50)[1])
+
+        return jnp.mean(jax.vmap(total)(jax.random.split(key, 32)))
+
+    @eqx.filter_jit
+    def update(network, state, key):
+        value, slope = eqx.filter_value_and_grad(loss)(network, key)
+        updates, state = optimiser.update(slope, state)
+        return eqx.apply_updates(network, updates), state, value
+
+    def answer():
+        model, at = network, optimiser.init(eqx.filter(network, eqx.is_array))
+        value = None
+        for k in range(10):
+            model, at, value = update(model, at, jax.random.fold_in(key, k))
+        return value
+
+    return (answer,)
+
+
+def bounded_lq(gradient: bool) -> Callable[[], tuple[Thunk, ...]]:
+    """128 linear-quadratic problems with bounded controls; Frey et al., 2025."""
+
+    def prepare():
+        import jax
+        import jax.numpy as jnp
+
+        import delucax as dlx
+
+        rng = np.random.RandomState(42)
+        A, B = np.eye(8) + 0.2 * rng.randn(8, 8), rng.randn(8, 4)
+        b, starts = rng.randn(8), rng.randn(128, 8)
+
+        class Weighted(dlx.AbstractCost):
+            H: Any = dlx.parameter()
+
+            def __call__(self, t, x, u):
+                z = jnp.concatenate([x, u])
+                return z @ self.H @ z
+
+            def final(self, t, x):
+                return x @ self.H[:8, :8] @ x
+
+        def plan(A, B, b, H, x0):
+            dynamics = dlx.LinearDynamics(A, B, dt=1.0, x_next=b)
+            return dlx.planning.ilqr(
+                dynamics, Weighted(H), x0, jnp.zeros((20, 4)), bounds=(-1.0, 1.0)
+            )
+
+        def first_controls(*data):
+            one = lambda x0: jnp.sum(plan(*data, x0).controls[0])
+            return jnp.sum(jax.vmap(one)(starts))
+
+        def plans(*data):
+            return jax.vmap(lambda x0: plan(*data, x0).controls)(starts)
+
+        data = tuple(jnp.asarray(M) for M in (A, B, b, np.eye(12)))
+        run = jax.jit(jax.grad(first_controls, (0, 1, 2, 3)) if gradient else plans)
+        return (lambda: run(*data),)
+
+    return prepare
+
+
+case("128 bounded LQ problems", 2.0)(bounded_lq(False))
+case("128 bounded LQ problems, adjoint", 4.0)(bounded_lq(True))
+
+
+@case("steering in least time", 5.0)
+def steering():
+    import jax.numpy as jnp
+
+    import delucax as dlx
+
+    steps = 50
+
+    class Steering(dlx.AbstractDynamics):
+        """The particle of COPS, in time relative to its end, which the first control
+        decides and the fifth state keeps; the rule of Runge and Kutta."""
+
+        disturbance_size = 0
+
+        @property
+        def state_names(self):
+            return "x", "y", "vx", "vy", "T"
+
+        @property
+        def control_names(self):
+            return "angle", "T change"
+
+        @property
+        def dt(self):
+            return jnp.asarray(1.0 / steps)
+
+        def advance(self, t, x, u, w):
+            angle, x = u[0], x.at[4].add(u[1])
+
+            def field(x):
+                push = 100.0 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+                return x[4] * jnp.concatenate([x[2:4], push, jnp.zeros(1)])
+
+            h = self.dt
+            a = field(x)
+            b = field(x + h / 2 * a)
+            c = field(x + h / 2 * b)
+            d = field(x + h * c)
+            return x + h / 6 * (a + 2 * b + 2 * c + d), dlx.RESULTS.successful
+
+    constraints = dlx.planning.Constraints(
+        equality=lambda t, x, u: jnp.where(t > 0.5 / steps, u[1], 0.0),
+        final_equality=lambda t, x: x[1:4] - jnp.array([5.0, 45.0, 0.0]),
+    )
+    cost = dlx.costs.Function(lambda t, x, u: 0.0 * u[0], lambda t, x: x[4])
+    x0 = jnp.array([0.0, 0.0, 0.0, 0.0, 0.6])
+    start = jnp.zeros((steps, 2)).at[:, 0].set(0.3)
+    bounds = (jnp.array([-jnp.pi / 2, -0.4]), jnp.array([jnp.pi / 2, 1.0]))
+    given = Steering(), cost, x0, start, 0.0, None, bounds
+    plan = lambda: dlx.planning.ilqr(*given, constraints=constraints, throw=False)
+    return (lambda: plan().states,)
+
+
+@case("gym.make and a step", 1.0)
+def gym():
+    import gymnasium
+    import numpy as np
+
+    import delucax.interop.gymnasium  # noqa: F401
+
+    def answer():
+        env = gymnasium.make("delucax/Pendulum-v1")
+        env.reset(seed=0)
+        return env.step(np.zeros(1, np.float32))
+
+    return (answer,)

@@ -1,0 +1,212 @@
+"""`python -m benchmarks.compilation`: how long the first answer takes, and why.
+
+Each case of `_first_answers.py` runs in a process of its own, as a user would: default
+flags, and, unless `--x64`, single precision. Imports are timed apart. Prints the wait,
+the time that JAX traced, lowered and compiled, the number of programs and the operations
+in them, beside the peers; with `--cache` also what a second process waits for that finds
+the compiled programs on disk. Writes `benchmarks/results/compilation.json`.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks._first_answers import CASES
+
+
+OUT = Path(__file__).parent / "results" / "compilation.json"
+STAGES = {
+    "/jax/core/compile/jaxpr_trace_duration": "trace",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
+    "/jax/core/compile/backend_compile_duration": "compile",
+}
+
+
+def operations(jaxpr: Any) -> int:
+    """The operations of a program, those of nested ones included."""
+    import jax
+
+    total = 0
+    for equation in jaxpr.eqns:
+        total += 1
+        for value in equation.params.values():
+            for leaf in jax.tree.leaves(value, is_leaf=lambda v: hasattr(v, "eqns")):
+                inner = getattr(leaf, "jaxpr", leaf)
+                if hasattr(inner, "eqns"):
+                    total += operations(inner)
+    return total
+
+
+def answer(name: str) -> dict[str, Any]:
+    """Run one case in this process."""
+    start = time.perf_counter()
+    thunks = CASES[name].prepare()
+    row: dict[str, Any] = {"case": name, "prepare": time.perf_counter() - start}
+    spent = dict.fromkeys(STAGES.values(), 0.0)
+    programs = 0
+    if "jax" in sys.modules:
+        import jax
+
+        def heard(event: str, seconds: float, **_: Any) -> None:
+            nonlocal programs
+            if event in STAGES:
+                spent[STAGES[event]] += seconds
+                programs += STAGES[event] == "compile"
+
+        jax.monitoring.register_event_duration_secs_listener(heard)
+        wait = jax.block_until_ready
+    else:
+        wait = lambda value: value
+    waits = []
+    for k, thunk in enumerate(thunks):
+        start = time.perf_counter()
+        wait(thunk())
+        waits.append(time.perf_counter() - start)
+        if k == 0:
+            row |= {"first": waits[0], **spent, "programs": programs}
+    start = time.perf_counter()
+    wait(thunks[0]())
+    row["again"] = time.perf_counter() - start
+    if waits[1:]:
+        row["further"] = max(waits[1:])
+    if "equinox" in sys.modules and "delucax" in sys.modules:
+        import equinox as eqx
+
+        try:
+            jaxpr = eqx.filter_make_jaxpr(thunks[0])()[0]
+            row["operations"] = operations(jaxpr.jaxpr)
+        except Exception:  # not to be traced, as what reads numbers
+            row["operations"] = None
+    return row
+
+
+def in_a_process(name: str, **variables: str) -> dict[str, Any]:
+    """Run one case in a fresh process."""
+    command = [sys.executable, "-m", "benchmarks.compilation", "--answer", name]
+    environment = os.environ | variables
+    run = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if run.returncode:
+        return {"case": name, "error": run.stderr.strip().splitlines()[-1:]}
+    return json.loads(run.stdout.strip().splitlines()[-1])
+
+
+def median(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of the numbers of several runs."""
+    good = [row for row in rows if "error" not in row]
+    if not good:
+        return rows[0]
+    number = lambda value: isinstance(value, float)
+    return {
+        key: statistics.median(row[key] for row in good) if number(value) else value
+        for key, value in good[0].items()
+    }
+
+
+def import_times(rounds: int) -> list[dict[str, Any]]:
+    """Seconds of the imports, in turns."""
+    statements = {
+        "import delucax": "import delucax",
+        "import diffrax, optax, lineax": "import diffrax, optax, lineax",
+    }
+    taken: dict[str, list[float]] = {name: [] for name in statements}
+    for _ in range(rounds):
+        for name, statement in statements.items():
+            code = (
+                "import time; t = time.perf_counter(); "
+                f"{statement}; print(time.perf_counter() - t)"
+            )
+            run = subprocess.run([sys.executable, "-c", code], capture_output=True)
+            taken[name].append(float(run.stdout))
+    return [{"case": name, "first": statistics.median(s)} for name, s in taken.items()]
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print a table."""
+    columns = "first trace lower compile further again programs operations".split()
+    columns += ["limit", "peer", "ratio"]
+    print(f"{'case':44s}" + "".join(f"{c:>11s}" for c in columns))
+    for row in rows:
+        if "error" in row:
+            print(f"{row['case']:44s} {row['error']}")
+            continue
+        cells = (row.get(c) for c in columns)
+        cells = (
+            "" if c is None else f"{c:.3f}" if isinstance(c, float) else c
+            for c in cells
+        )
+        print(f"{row['case']:44s}" + "".join(f"{c!s:>11s}" for c in cells))
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.compilation")
+    parser.add_argument("--answer", help=argparse.SUPPRESS)
+    parser.add_argument("--cases", nargs="*", help="only those that contain a word")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--x64", action="store_true", help="in double precision")
+    parser.add_argument("--cache", action="store_true", help="a second process, too")
+    parser.add_argument("--out", default=None)
+    options = parser.parse_args()
+    if options.answer:
+        print(json.dumps(answer(options.answer)))
+        return
+    names = [
+        name
+        for name in CASES
+        if not options.cases or any(word in name for word in options.cases)
+    ]
+    variables = {"JAX_ENABLE_X64": "1" if options.x64 else "0"}
+    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    for _ in range(options.rounds):
+        for name in names:
+            runs[name].append(in_a_process(name, **variables))
+    rows = [] if options.cases else import_times(2 * options.rounds + 1)
+    found = {name: median(r) for name, r in runs.items()}
+    for name, row in found.items():
+        case = CASES[name]
+        row["limit"] = case.limit
+        if case.peer in found and "first" in row and "first" in found[case.peer]:
+            row["peer"] = found[case.peer]["first"]
+            row["ratio"] = row["first"] / row["peer"]
+        rows.append(row)
+    show(rows)
+    if options.cache:
+        print("\nA second process that finds the programs on disk")
+        for name in names:
+            with tempfile.TemporaryDirectory() as folder:
+                kept = variables | {
+                    "JAX_COMPILATION_CACHE_DIR": folder,
+                    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+                    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+                }
+                before, after = (in_a_process(name, **kept) for _ in range(2))
+            if "error" in before or "error" in after or not before.get("compile"):
+                continue
+            found[name] |= {
+                "wait with cache": after["first"] / before["first"],
+                "compile with cache": after["compile"] / before["compile"],
+            }
+            print(
+                f"{name:44s} wait {before['first']:.2f} -> {after['first']:.2f} "
+                f"({after['first'] / before['first']:.2f}), compile "
+                f"{before['compile']:.2f} -> {after['compile']:.2f} "
+                f"({after['compile'] / before['compile']:.2f})"
+            )
+    if options.out or not options.cases:
+        from benchmarks._machine import describe
+
+        out = Path(options.out or OUT)
+        content = {"machine": describe(), "x64": options.x64, "cases": rows}
+        out.write_text(json.dumps(content, indent=1) + "\n")
+        print(f"\nwritten: {out}")
+
+
+if __name__ == "__main__":
+    main()
