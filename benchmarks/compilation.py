@@ -1,10 +1,11 @@
 """`python -m benchmarks.compilation`: how long the first answer takes, and why.
 
-Each case of `_first_answers.py` runs in a process of its own, as a user would: default
-flags, and, unless `--x64`, single precision. Imports are timed apart. Prints the wait,
-the time that JAX traced, lowered and compiled, the number of programs and the operations
-in them, beside the peers; with `--cache` also what a second process waits for that finds
-the compiled programs on disk. Writes `benchmarks/results/compilation.json`.
+Each case of `_first_answers.py` runs in a process of its own, as a user would: with
+default flags and, unless `--x64`, in single precision. Imports are timed apart. Prints
+the wait, the seconds that JAX traced, lowered and compiled, the number of programs and
+the operations in them, beside the peers; with `--cache` also the wait of a second
+process, which finds the compiled programs on disk. Writes
+`benchmarks/results/compilation.json`.
 """
 
 import argparse

@@ -14,4 +14,14 @@ from ._derivatives import (
     jacobian as jacobian,
     nan_tangent as nan_tangent,
 )
+from ._host import (
+    fori_loop as fori_loop,
+    host_unless_traced as host_unless_traced,
+    on_host as on_host,
+    scan as scan,
+    stop_gradient as stop_gradient,
+    vmap as vmap,
+    while_loop as while_loop,
+    xp as xp,
+)
 from ._normal import normal as normal

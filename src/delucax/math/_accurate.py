@@ -4,10 +4,10 @@ import itertools
 import math
 
 import jax.lax as lax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._jax import scan, xp
 from ._norms import power_of_two
 
 
@@ -37,13 +37,13 @@ def _term_by_term(left, right, *added):
 
     Source: Ogita, Rump and Oishi, 2005.
     """
-    eps, k = jnp.finfo(left.dtype).eps, left.shape[1]
-    nothing = jnp.zeros((len(left), right.shape[1]), left.dtype)
+    eps, k = xp.finfo(left.dtype).eps, left.shape[1]
+    nothing = xp.zeros((len(left), right.shape[1]), left.dtype)
     total, *added = added or (nothing,)
-    off, size = nothing, jnp.abs(total)
+    off, size = nothing, xp.abs(total)
     for part in added:
         total, error = _sum(total, part)
-        off, size = off + error, size + jnp.abs(part)
+        off, size = off + error, size + xp.abs(part)
 
     def add(carry, factors):
         total, off, size = carry
@@ -54,11 +54,11 @@ def _term_by_term(left, right, *added):
             total, error = _sum(total, part)
             off += error
         off += low * low_row
-        return (total, off, size + jnp.abs(column[:, None] * row)), None
+        return (total, off, size + xp.abs(column[:, None] * row)), None
 
-    (total, off, size), _ = lax.scan(add, (total, off, size), (left.T, right))
+    (total, off, size), _ = scan(add, (total, off, size), (left.T, right))
     total += off
-    return total, eps * jnp.abs(total) + (4 * (k + len(added) + 1) * eps) ** 2 * size
+    return total, eps * xp.abs(total) + (4 * (k + len(added) + 1) * eps) ** 2 * size
 
 
 def _by_slices(left, right, *added):
@@ -69,28 +69,28 @@ def _by_slices(left, right, *added):
     Source: Ozaki, Ogita, Oishi and Rump, 2012.
     """
     (n, k), m, dtype = left.shape, right.shape[1], left.dtype
-    eps, digits = jnp.finfo(dtype).eps, jnp.finfo(dtype).nmant + 1
+    eps, digits = xp.finfo(dtype).eps, xp.finfo(dtype).nmant + 1
     count = 1 if digits > 50 else 2
     bits = int((digits - math.log2(count * k)) / 2)
     # k products of two slices of so many bits sum up without rounding.
-    both = jnp.concatenate([left, right.T])
+    both = xp.concatenate([left, right.T])
     # Scaled so that the k-th column and the k-th row have like size.
-    across, down = (jnp.max(jnp.abs(M), axis=0) for M in (both[:n], both[n:]))
-    unit = power_of_two(jnp.sqrt(down) / jnp.sqrt(jnp.where(across > 0, across, 1)))
-    unit = jnp.where(unit > 0, unit, 1)
-    both *= jnp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
-    power = power_of_two(jnp.max(jnp.abs(both), axis=1, keepdims=True))
-    power = lax.max(power, jnp.finfo(dtype).tiny)
+    across, down = (xp.max(xp.abs(M), axis=0) for M in (both[:n], both[n:]))
+    unit = power_of_two(xp.sqrt(down) / xp.sqrt(xp.where(across > 0, across, 1)))
+    unit = xp.where(unit > 0, unit, 1)
+    both *= xp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
+    power = power_of_two(xp.max(xp.abs(both), axis=1, keepdims=True))
+    power = lax.max(power, xp.finfo(dtype).tiny)
     # Entries rounded to ever smaller steps, the slices between, and the remainders.
     step = 2.0 ** (bits * np.arange(1, count + 1)[:, None, None] - 2)
     step = step.astype(dtype)
-    whole = power * (jnp.round(both / power * step) / step)
+    whole = power * (xp.round(both / power * step) / step)
     rests = [both, *(both - M for M in whole)]
     slices = [whole[0], *(b - a for a, b in itertools.pairwise(whole))]
 
     def side_by_side(rows, columns):
-        rows = jnp.concatenate([M[:n] for M in rows], axis=1)
-        return rows, jnp.concatenate([M[n:] for M in columns], axis=1).T
+        rows = xp.concatenate([M[:n] for M in rows], axis=1)
+        return rows, xp.concatenate([M[n:] for M in columns], axis=1).T
 
     exact = (side_by_side(slices[: i + 1], slices[i::-1]) for i in range(count))
     parts = [*added, *(rows @ columns for rows, columns in exact)]
@@ -100,9 +100,9 @@ def _by_slices(left, right, *added):
         total, error = _sum(total, part)
         off += error
     total += off + rows @ columns
-    lost = (rows.shape[1] + 2) * eps * (jnp.abs(rows) @ jnp.abs(columns))
-    lost += (len(parts) * eps) ** 2 * sum(jnp.abs(part) for part in parts)
-    return total, lost + eps * jnp.abs(total)
+    lost = (rows.shape[1] + 2) * eps * (xp.abs(rows) @ xp.abs(columns))
+    lost += (len(parts) * eps) ** 2 * sum(xp.abs(part) for part in parts)
+    return total, lost + eps * xp.abs(total)
 
 
 def product_in_parts(
@@ -121,14 +121,14 @@ def product_in_parts(
         return left @ right, k
     length = -(-k // _PARTS)
     pad = _PARTS * length - k
-    left = jnp.pad(left, ((0, 0), (0, pad))).reshape(len(left), _PARTS, length)
-    right = jnp.pad(right, ((0, pad), (0, 0))).reshape(_PARTS, length, -1)
+    left = xp.pad(left, ((0, 0), (0, pad))).reshape(len(left), _PARTS, length)
+    right = xp.pad(right, ((0, pad), (0, 0))).reshape(_PARTS, length, -1)
 
     def add(total, factors):
         return total + factors[0] @ factors[1], None
 
-    total = jnp.zeros((len(left), right.shape[2]), left.dtype)
-    return lax.scan(add, total, (jnp.swapaxes(left, 0, 1), right))[0], length + _PARTS
+    total = xp.zeros((len(left), right.shape[2]), left.dtype)
+    return scan(add, total, (xp.swapaxes(left, 0, 1), right))[0], length + _PARTS
 
 
 def _sum(a: Array, b: Array) -> tuple[Array, Array]:
@@ -140,6 +140,6 @@ def _sum(a: Array, b: Array) -> tuple[Array, Array]:
 
 def _halves(x: Array) -> tuple[Array, Array]:
     """`x` as the sum of two numbers of half the digits (Dekker's splitting)."""
-    info = jnp.finfo(x.dtype)
+    info = xp.finfo(x.dtype)
     high = lax.reduce_precision(x, info.nexp, (info.nmant + 1) // 2 - 1)
     return high, x - high

@@ -6,10 +6,10 @@ from typing import Any
 
 import jax
 import jax.lax as lax
-import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float, Inexact
 
+from .._jax import xp
 from .._typing import BoolScalar, Square
 
 
@@ -96,7 +96,7 @@ class _Elimination(lx.AbstractLinearSolver):
             for j in range(i + 1, n):
                 x[i] = x[i] - rows[i][j] * x[j]
             x[i] = x[i] / rows[i][i]
-        return jnp.stack(x), lx.RESULTS.successful, {}
+        return xp.stack(x), lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
         del options
@@ -125,12 +125,12 @@ def _factor(matrix):
     pivots = []
     for k in range(n):
         # The pivot is the largest entry of the column: a comparison for each row.
-        best, pivot = jnp.abs(rows[k][k]), jnp.asarray(k)
+        best, pivot = xp.abs(rows[k][k]), xp.asarray(k)
         for i in range(k + 1, n):
-            size = jnp.abs(rows[i][k])
+            size = xp.abs(rows[i][k])
             larger = size > best
             best = lax.select(larger, size, best)
-            pivot = lax.select(larger, jnp.asarray(i), pivot)
+            pivot = lax.select(larger, xp.asarray(i), pivot)
         rows, pivot = _materialised((rows, pivot))
         pivots.append(pivot)
         chosen = list(rows[k])
@@ -152,10 +152,10 @@ def is_definite(matrix: Square) -> BoolScalar:
     """Whether all pivots of a symmetric matrix are positive."""
     n = matrix.shape[0]
     if n > SMALL:
-        return jnp.all(jnp.isfinite(jnp.linalg.cholesky(matrix)))
+        return xp.all(xp.isfinite(xp.linalg.cholesky(matrix)))
     # Elimination without pivoting, whose pivots are the squares of Cholesky's diagonal.
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
-    definite = jnp.asarray(True)
+    definite = xp.asarray(True)
     for k in range(n):
         definite = definite & (rows[k][k] > 0)
         for i in range(k + 1, n):
@@ -174,9 +174,9 @@ def no_tangent(tree: Any) -> Any:
     """The zero tangent of a tree, integers and flags included."""
 
     def zero(x):
-        if jnp.issubdtype(x.dtype, jnp.inexact):
-            return jnp.zeros_like(x)
-        return jnp.zeros(x.shape, jax.dtypes.float0)
+        if xp.issubdtype(x.dtype, xp.inexact):
+            return xp.zeros_like(x)
+        return xp.zeros(x.shape, jax.dtypes.float0)
 
     return jax.tree.map(zero, tree)
 

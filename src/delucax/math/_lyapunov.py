@@ -2,10 +2,10 @@
 finite time, by doubling."""
 
 import jax.lax as lax
-import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
+from .._jax import scan, stop_gradient, while_loop, xp
 from .._typing import Scalar, Square
 from ._linear_solve import factorised, full_precision, symmetric
 from ._norms import relative_size
@@ -43,7 +43,7 @@ def smith(
 
     Source: Smith, 1968.
     """
-    eps = jnp.finfo(C.dtype).eps
+    eps = xp.finfo(C.dtype).eps
     powers = (A,) if B is None else (A, B)
 
     def more(carry):
@@ -59,8 +59,8 @@ def smith(
         relative = relative_size(change, X)
         return X, tuple(power @ power for power in powers), relative, k + 1
 
-    start = (C, powers, jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0))
-    X, *_, iterations = lax.while_loop(more, body, start)
+    start = (C, powers, xp.asarray(xp.inf, C.dtype), xp.asarray(0))
+    X, *_, iterations = while_loop(more, body, start)
     return X, iterations
 
 
@@ -74,14 +74,14 @@ def stable_sylvester(
     the transform loses of a wide spectrum.
     """
     n, m = C.shape
-    eps = jnp.finfo(C.dtype).eps
+    eps = xp.finfo(C.dtype).eps
     other = A.T if B is None else B
     # The geometric mean of the eigenvalues' sizes: the transform maps what is far above
     # it and far below it towards the circle alike. The determinant gives it without
     # eigenvalues.
-    logs = jnp.linalg.slogdet(A)[1]
-    logs = 2 * logs if B is None else logs + jnp.linalg.slogdet(B)[1]
-    c = jnp.exp(logs / (2 * n if B is None else n + m))
+    logs = xp.linalg.slogdet(A)[1]
+    logs = 2 * logs if B is None else logs + xp.linalg.slogdet(B)[1]
+    c = xp.exp(logs / (2 * n if B is None else n + m))
     shifted_A, power_A = _cayley(A, c)
     shifted_B, power_B = (shifted_A, None) if B is None else _cayley(B.T, c)
 
@@ -101,20 +101,20 @@ def stable_sylvester(
         relative = relative_size(left_over, left, right, C)
         # The first round solves, those after it refine.
         better = (relative < residual) | (k == 0)
-        X = jnp.where(better, candidate, X)
-        residual = jnp.where(better, relative, residual)
+        X = xp.where(better, candidate, X)
+        residual = xp.where(better, relative, residual)
         going = better & (residual > 10 * eps)
         return X, left_over, residual, iterations + doublings, going, k + 1
 
-    unknown, zero = jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0)
-    start = jnp.zeros_like(C), C, unknown, zero, jnp.asarray(True), zero
-    X, _, _, iterations, *_ = lax.while_loop(more, body, start)
+    unknown, zero = xp.asarray(xp.inf, C.dtype), xp.asarray(0)
+    start = xp.zeros_like(C), C, unknown, zero, xp.asarray(True), zero
+    X, _, _, iterations, *_ = while_loop(more, body, start)
     return X, iterations
 
 
 def _cayley(A, c):
     """The solution with `A - c`, and `(A - c)^-1 (A + c)`."""
-    shift = c * jnp.eye(len(A), dtype=A.dtype)
+    shift = c * xp.eye(len(A), dtype=A.dtype)
     solved = factorised(A - shift)
     return solved, solved(A + shift)
 
@@ -129,10 +129,10 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     Source: Van Loan, 1978.
     """
     n = A.shape[0]
-    fastest = lax.stop_gradient(time * jnp.linalg.norm(A))
-    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, MAX_DOUBLINGS)
+    fastest = stop_gradient(time * xp.linalg.norm(A))
+    doublings = xp.clip(xp.ceil(xp.log2(xp.maximum(fastest, 1))), 0, MAX_DOUBLINGS)
     short = time * 0.5**doublings
-    block = jnp.block([[-A, Q], [jnp.zeros_like(A), A.T]]) * short
+    block = xp.block([[-A, Q], [xp.zeros_like(A), A.T]]) * short
     # exp([[-A, Q], [0, A']] t) = [[exp(-A t), exp(-A t) W], [0, exp(A' t)]].
     exponential = jsl.expm(block)
     power = exponential[n:, n:].T
@@ -143,9 +143,9 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
         W, power = carry
         more = k < doublings
         # Zero where it is not used: what overflows there must not reach a derivative.
-        safe_power = jnp.where(more, power, 0)
+        safe_power = xp.where(more, power, 0)
         W_next = W + safe_power @ W @ safe_power.T
-        return (W_next, jnp.where(more, safe_power @ safe_power, power)), None
+        return (W_next, xp.where(more, safe_power @ safe_power, power)), None
 
-    (W, _), _ = lax.scan(double, (W, power), jnp.arange(MAX_DOUBLINGS))
+    (W, _), _ = scan(double, (W, power), xp.arange(MAX_DOUBLINGS))
     return symmetric(W)

@@ -3,8 +3,9 @@
 from typing import Any
 
 import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
+
+from .._jax import xp
 
 
 ULPS = 4
@@ -32,11 +33,11 @@ def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Ar
         jax.grad(dlx.math.safe_norm)(jnp.zeros(3))
         ```
     """
-    x = jnp.asarray(x)
-    squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
+    x = xp.asarray(x)
+    squared = xp.sum(x * x, axis=axis, keepdims=keepdims)
     # The square root of a masked one: its gradient is finite where it is not taken.
     at_zero = squared == 0
-    return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, squared)))
+    return xp.where(at_zero, 0.0, xp.sqrt(xp.where(at_zero, 1.0, squared)))
 
 
 def within_ball(x: Array, radius: ArrayLike) -> Array:
@@ -45,7 +46,7 @@ def within_ball(x: Array, radius: ArrayLike) -> Array:
     norm = safe_norm(x, axis=None)
     # Inside, the factor is exactly 1, and so is its derivative of `x`.
     over = norm > radius
-    return jnp.where(over, radius / jnp.where(over, norm, 1), 1).astype(x.dtype) * x
+    return xp.where(over, radius / xp.where(over, norm, 1), 1).astype(x.dtype) * x
 
 
 def clip(x: ArrayLike, low: Any, high: Any) -> Array:
@@ -72,27 +73,27 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
         dlx.math.clip(jnp.array([-3.0, 0.5, 3.0]), -2.0, 2.0)
         ```
     """
-    x = jnp.where(x > high, high, x)
-    return jnp.where(x < low, low, x)
+    x = xp.where(x > high, high, x)
+    return xp.where(x < low, low, x)
 
 
 def size(matrix: Array) -> Array:
     """The Frobenius norm."""
     # Scaled by the largest entry, whose square may overflow or underflow.
-    scale = _divisor(jnp.max(jnp.abs(matrix)))
+    scale = _divisor(xp.max(xp.abs(matrix)))
     return scale * _norm(matrix / scale)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
     """The norm of an equation's residual over the sum of the norms of its terms."""
-    return relative_and_total_size(error, jnp.stack(terms))[0]
+    return relative_and_total_size(error, xp.stack(terms))[0]
 
 
 def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
     """The norm of an equation's residual, or of a stack of residuals, over the sum of
     the norms of its stacked terms; and this sum."""
-    scale = _divisor(jnp.max(jnp.abs(terms)))
-    total = jnp.sum(_norm(terms / scale))
+    scale = _divisor(xp.max(xp.abs(terms)))
+    total = xp.sum(_norm(terms / scale))
     return _norm(error / scale) / _divisor(total), scale * total
 
 
@@ -103,17 +104,17 @@ def one_if_zero(x: Array) -> Array:
 
 def _divisor(x):
     # `lax.max` propagates NaN, as a comparison would not.
-    return lax.max(x, jnp.finfo(x.dtype).tiny)
+    return lax.max(x, xp.finfo(x.dtype).tiny)
 
 
 def _norm(matrix):
-    return jnp.sqrt(jnp.sum(matrix * matrix, axis=(-2, -1)))
+    return xp.sqrt(xp.sum(matrix * matrix, axis=(-2, -1)))
 
 
 def power_of_two(x: Array) -> Array:
     """A power of two near each number, to the last bit, which `jnp.exp2` is not."""
     # Rounded to no digit of the mantissa.
-    return lax.reduce_precision(x, jnp.finfo(x.dtype).nexp, 0)
+    return lax.reduce_precision(x, xp.finfo(x.dtype).nexp, 0)
 
 
 def relative_drift(
@@ -125,22 +126,22 @@ def relative_drift(
     `F(x) - x`, less the rounding of `x_i`. Leading axes are times, along which the unit
     is that of the largest value.
     """
-    largest = lambda z: jnp.max(jnp.abs(z).reshape(-1, z.shape[-1]), axis=0)
-    terms = jnp.abs(jacobian) @ jnp.concatenate(
+    largest = lambda z: xp.max(xp.abs(z).reshape(-1, z.shape[-1]), axis=0)
+    terms = xp.abs(jacobian) @ xp.concatenate(
         [units_of(largest(x)), units_of(largest(u))]
     )
-    left = jnp.abs(drift)
+    left = xp.abs(drift)
     if is_map:
-        rounding = ULPS * jnp.finfo(x.dtype).eps * largest(x)
-        left = jnp.maximum(left - rounding, 0)
-    return jnp.max(jnp.where(left == 0, 0, left / (left + terms)))
+        rounding = ULPS * xp.finfo(x.dtype).eps * largest(x)
+        left = xp.maximum(left - rounding, 0)
+    return xp.max(xp.where(left == 0, 0, left / (left + terms)))
 
 
 def units_of(z: Array) -> Array:
     """The size of each entry; for one that is zero up to rounding that of the largest
     entry, at most 1, and 1 if all are zero."""
-    size = jnp.abs(z)
-    largest = jnp.max(size, initial=0)
+    size = xp.abs(z)
+    largest = xp.max(size, initial=0)
     # A state at rest at zero still needs a unit in which its drift is judged.
-    floor = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)
-    return jnp.where(size > 100 * jnp.finfo(z.dtype).eps * floor, size, floor)
+    floor = xp.where(largest > 0, xp.minimum(largest, 1), 1)
+    return xp.where(size > 100 * xp.finfo(z.dtype).eps * floor, size, floor)

@@ -1,7 +1,8 @@
 """Products too small to be worth a call into a linear-algebra library."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
+
+from .._jax import xp
 
 
 _UNROLL = 32
@@ -29,7 +30,7 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
         dlx.math.matvec(jnp.eye(2), jnp.array([1.0, 2.0]))
         ```
     """
-    matrix, vector = jnp.asarray(matrix), jnp.asarray(vector)
+    matrix, vector = xp.asarray(matrix), xp.asarray(vector)
     if matrix.ndim != 2 or vector.shape != matrix.shape[1:]:
         raise ValueError(
             "matvec: matrix and vector must have shapes (m, n) and (n,), got "
@@ -45,7 +46,7 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
         for j in range(1, n):
             row = row + matrix[i, j] * vector[j]
         rows.append(row)
-    return jnp.stack(rows)
+    return xp.stack(rows)
 
 
 def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
@@ -67,7 +68,7 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
         dlx.math.quadratic_form(jnp.eye(2), jnp.array([1.0, 2.0]))
         ```
     """
-    vector = jnp.asarray(vector)
+    vector = xp.asarray(vector)
     return dot(vector, matvec(matrix, vector))
 
 

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -16,6 +15,7 @@ from .._check import (
     is_concrete,
     symmetric_matrix,
 )
+from .._jax import xp
 from .._module import as_float_array
 
 
@@ -47,14 +47,14 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
     matrix = square_matrix(value, name, where)
     transposed = matrix.conj().T
     # As large as products such as C'WC may leave by rounding.
-    slack = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
-    wrong = jnp.max(jnp.abs(matrix - transposed)) > slack
+    slack = 100 * xp.finfo(matrix.dtype).eps * xp.max(xp.abs(matrix))
+    wrong = xp.max(xp.abs(matrix - transposed)) > slack
     if is_concrete(wrong) and wrong:
-        kind = "Hermitian" if jnp.iscomplexobj(matrix) else "symmetric"
+        kind = "Hermitian" if xp.iscomplexobj(matrix) else "symmetric"
         raise ValueError(f"{where}: {name} must be {kind}, got {matrix}.")
     average = (matrix + transposed) / 2
     # Traced data cannot be checked yet: NaN makes the result `ill_posed`.
-    return average if is_concrete(wrong) else jnp.where(wrong, jnp.nan, average)
+    return average if is_concrete(wrong) else xp.where(wrong, xp.nan, average)
 
 
 def riccati_arguments(
@@ -83,8 +83,8 @@ def riccati_arguments(
         if matrix is not None:
             _check_shape(matrix.shape, shape, name, where, f"{n_A} and {n_B}")
     check_definite(R, n_R, where, definite)
-    dtype = jnp.result_type(*jax.tree.leaves((A, B, Q, R, S, E)))
-    S = jnp.zeros((n, m), dtype) if S is None else S
+    dtype = xp.result_type(*jax.tree.leaves((A, B, Q, R, S, E)))
+    S = xp.zeros((n, m), dtype) if S is None else S
     given = RiccatiData(A, B, Q, R, S, E)
     return jax.tree.map(lambda M: M.astype(dtype), given)
 
@@ -104,21 +104,21 @@ def where_solved(ok: Array, zeroed: Any, units: Any) -> tuple[Any, Any]:
     cannot be solved with: a NaN would survive being multiplied by zero afterwards.
     """
     ok = ok[:, None, None] if ok.ndim else ok
-    eye = lambda M: jnp.eye(M.shape[-1], dtype=M.dtype)
+    eye = lambda M: xp.eye(M.shape[-1], dtype=M.dtype)
     return (
-        jax.tree.map(lambda M: jnp.where(ok, M, 0), zeroed),
-        jax.tree.map(lambda M: jnp.where(ok, M, eye(M)), units),
+        jax.tree.map(lambda M: xp.where(ok, M, 0), zeroed),
+        jax.tree.map(lambda M: xp.where(ok, M, eye(M)), units),
     )
 
 
 def is_complex(*matrices: Array | None) -> bool:
     """Whether any of the matrices is."""
-    return any(map(jnp.iscomplexobj, jax.tree.leaves(matrices)))
+    return any(map(xp.iscomplexobj, jax.tree.leaves(matrices)))
 
 
 def real_form(M: Array) -> Array:
     """`[[Re M, -Im M], [Im M, Re M]]`, which adds and multiplies as `M` does."""
-    return jnp.block([[M.real, -M.imag], [M.imag, M.real]])
+    return xp.block([[M.real, -M.imag], [M.imag, M.real]])
 
 
 def complex_form(M: Array) -> Array:
@@ -157,10 +157,10 @@ def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
             steps[name] = array.shape[0]
     T, dtype = _length(where, horizon, steps), _real_dtype(where, arrays)
     # Constant arguments are repeated: one scan serves both kinds.
-    zero = jnp.zeros((), dtype)
+    zero = xp.zeros((), dtype)
     shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
     return {
-        name: jnp.broadcast_to(arrays.get(name, zero).astype(dtype), shape(name))
+        name: xp.broadcast_to(arrays.get(name, zero).astype(dtype), shape(name))
         for name in given
     }
 
@@ -179,8 +179,8 @@ def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
 
 def _real_dtype(where: str, given: dict[str, Array]):
     """The real precision that all can be held in."""
-    dtype = jnp.result_type(*given.values())
-    if not jnp.issubdtype(dtype, jnp.floating):
+    dtype = xp.result_type(*given.values())
+    if not xp.issubdtype(dtype, xp.floating):
         raise ValueError(f"{where}: {', '.join(given)} must be real, got {dtype}.")
     return dtype
 
@@ -220,7 +220,7 @@ def final_weight(value: Any, A: Array, where: str) -> Array:
     """The final weight, checked; zero by default."""
     shape = A.shape[-2:]
     if value is None:
-        return jnp.zeros(shape, A.dtype)
+        return xp.zeros(shape, A.dtype)
     final = symmetric_matrix(value, "final", where)
     _check_shape(final.shape, shape, "final", where, "A")
     return final.astype(A.dtype)

@@ -1,11 +1,10 @@
 """Riccati equations by doubling, and by the sign of the Hamiltonian matrix."""
 
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array
 
+from .._jax import while_loop, xp
 from .._typing import BoolScalar, Scalar, Square
 from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
@@ -22,7 +21,7 @@ def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
     # X0 > 0 makes R + B'X0 B invertible, and excludes the fixed points that leave an
     # undetectable unstable mode unstable.
     A, B, Q, R, S, _ = data
-    X0 = height * jnp.eye(A.shape[0], dtype=A.dtype)
+    X0 = height * xp.eye(A.shape[0], dtype=A.dtype)
     # The data of the equation of H = X - X0.
     cross = height * (A.T @ B) + S
     weight = symmetric(R + height * (B.T @ B))
@@ -40,8 +39,8 @@ def continuous_start(
     # Under vmap both run for all members: the unwanted one ends before its first step.
     by_sign, sign_steps = _by_sign(A, G, Q, ~doubled)
     by_doubling, doublings = _by_doubling(A, G, Q, doubled)
-    X = jnp.where(doubled, by_doubling, by_sign)
-    return X, size(G), jnp.where(doubled, doublings, sign_steps)
+    X = xp.where(doubled, by_doubling, by_sign)
+    return X, size(G), xp.where(doubled, doublings, sign_steps)
 
 
 def _by_sign(A, G, Q, wanted):
@@ -53,11 +52,11 @@ def _by_sign(A, G, Q, wanted):
     Source: Roberts, 1971; Byers, 1987 (the symmetric form and the scaling).
     """
     n, dtype = A.shape[0], A.dtype
-    eps = jnp.finfo(dtype).eps
-    eye, both = jnp.eye(n, dtype=dtype), jnp.eye(2 * n, dtype=dtype)
+    eps = xp.finfo(dtype).eps
+    eye, both = xp.eye(n, dtype=dtype), xp.eye(2 * n, dtype=dtype)
 
     def J(M):
-        return jnp.concatenate([M[n:], -M[:n]])
+        return xp.concatenate([M[n:], -M[:n]])
 
     def more(carry):
         *_, going, k = carry
@@ -69,7 +68,7 @@ def _by_sign(A, G, Q, wanted):
         ratio = size(turned) / size(W)
         # Scaling speeds up the way to the neighbourhood of the limit, where it would
         # keep the iteration from settling.
-        scale = jnp.where(before < 1e-2, 1, jnp.sqrt(ratio))
+        scale = xp.where(before < 1e-2, 1, xp.sqrt(ratio))
         new = symmetric(scale * W + turned / scale) / 2
         change = size(new - W) / size(new)
         # Convergence is quadratic: a small change that is not halved is rounding.
@@ -78,13 +77,13 @@ def _by_sign(A, G, Q, wanted):
         going = (change > 10 * eps) & ~stalled
         return new, change, going, k + 1
 
-    W = jnp.block([[-Q, -A.T], [-A, G]])
-    start = (W, jnp.asarray(jnp.inf, dtype), jnp.asarray(wanted), jnp.asarray(0))
-    W, *_, iterations = lax.while_loop(more, body, start)
+    W = xp.block([[-Q, -A.T], [-A, G]])
+    start = (W, xp.asarray(xp.inf, dtype), xp.asarray(wanted), xp.asarray(0))
+    W, *_, iterations = while_loop(more, body, start)
     # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W. M alone may be
     # singular, so that X is computed by least squares from all 2n columns.
-    upper = jnp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
-    lower = jnp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
+    upper = xp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
+    lower = xp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
     return symmetric(factorised(upper.T, lx.QR())(lower.T).T), iterations
 
 
@@ -96,16 +95,16 @@ def _by_doubling(A, G, Q, wanted):
     """
     n = A.shape[0]
     # The formulas take 2c. It is at least twice the size of any eigenvalue of A.
-    shift = 2 * one_if_zero(size(A)) * jnp.eye(n, dtype=A.dtype)
+    shift = 2 * one_if_zero(size(A)) * xp.eye(n, dtype=A.dtype)
     moved = A - shift / 2
     left = solve(moved, G)
     mixed = moved.T + Q @ left
-    right = solve(mixed.T, jnp.concatenate([mixed.T + shift, left.T], axis=1))
+    right = solve(mixed.T, xp.concatenate([mixed.T + shift, left.T], axis=1))
     # With A_c = A - cI and W = A_c' + Q A_c^-1 G: A = I + 2c W^-T, G = 2c A_c^-1 G W^-1
     # and H = 2c W^-1 Q A_c^-1, the element to be doubled.
     H = solve(mixed, solve(moved.T, Q).T)
     H, G = symmetric(shift @ H), symmetric(shift @ right[:, n:])
-    return double((right[:, :n], G, H), jnp.zeros_like(H), wanted)
+    return double((right[:, :n], G, H), xp.zeros_like(H), wanted)
 
 
 def double(
@@ -116,7 +115,7 @@ def double(
 
     `X0` is what `J` is a correction to, for its size alone.
     """
-    eps = jnp.finfo(X0.dtype).eps
+    eps = xp.finfo(X0.dtype).eps
 
     def more(carry):
         _, relative, k = carry
@@ -125,20 +124,20 @@ def double(
     def body(carry):
         before, _, k = carry
         after = composed(before, before)
-        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
+        finite = xp.all(xp.stack([xp.all(xp.isfinite(M)) for M in after]))
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
-            lambda new, old: jnp.where(finite, new, old), after, before
+            lambda new, old: xp.where(finite, new, old), after, before
         )
         # In units of X = X0 + J, of which J may be a small part.
-        changes = jnp.stack([J - before[2], J])
+        changes = xp.stack([J - before[2], J])
         (change, whole), _ = relative_and_total_size(changes, (X0 + J)[None])
         # The next change is at most |A|^2 |J|.
-        relative = jnp.minimum(change, size(A) ** 2 * whole)
-        return after, jnp.where(finite, relative, 0), k + 1
+        relative = xp.minimum(change, size(A) ** 2 * whole)
+        return after, xp.where(finite, relative, 0), k + 1
 
-    relative = jnp.where(wanted, jnp.asarray(jnp.inf, X0.dtype), 0)
-    start = element, relative, jnp.asarray(0)
-    (_, _, J), _, doublings = lax.while_loop(more, body, start)
+    relative = xp.where(wanted, xp.asarray(xp.inf, X0.dtype), 0)
+    start = element, relative, xp.asarray(0)
+    (_, _, J), _, doublings = while_loop(more, body, start)
     return J, doublings

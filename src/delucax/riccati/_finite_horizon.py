@@ -3,11 +3,10 @@
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector
+from .._jax import vmap, xp
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Numbers
 from ..math._linear_solve import full_precision, solve
@@ -146,7 +145,7 @@ def dre(
     final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
     # Without linear terms p, s and k are zero, and are not computed.
-    final_q = jnp.zeros(n) if final_q is None else final_q
+    final_q = xp.zeros(n) if final_q is None else final_q
     final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(
         *stage.values(), final, final_q, is_affine, bool(parallel)
@@ -161,17 +160,17 @@ def dre(
 @full_precision
 def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parallel):
     X = values(A, B, Q, R, S, final, 0, parallel)
-    good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
+    good = xp.all(xp.isfinite(X[:-1]), axis=(1, 2))
     (A, B, Q, S, after), R = where_solved(good, (A, B, Q, S, X[1:]), R)
-    K, loop = jax.vmap(gain)(A, B, R, S, after)
+    K, loop = vmap(gain)(A, B, R, S, after)
     (T, _, m), n = B.shape, A.shape[-1]
     if is_affine:
         p, s, k = _affine(loop, K, B, R, after, d, q, r, final_q, parallel)
     else:
-        p, s, k = (jnp.zeros(shape, A.dtype) for shape in ((T + 1, n), T + 1, (T, m)))
-    masked = lambda M: jnp.where(good.reshape(-1, *(1,) * (M.ndim - 1)), M, jnp.nan)
+        p, s, k = (xp.zeros(shape, A.dtype) for shape in ((T + 1, n), T + 1, (T, m)))
+    masked = lambda M: xp.where(good.reshape(-1, *(1,) * (M.ndim - 1)), M, xp.nan)
     p, s = p.at[:-1].set(masked(p[:-1])), s.at[:-1].set(masked(s[:-1]))
-    result = choose(jnp.all(good), RESULTS.successful, RESULTS.infeasible)
+    result = choose(xp.all(good), RESULTS.successful, RESULTS.infeasible)
     return FiniteHorizonSolution(X, masked(K), masked(loop), result, p, s, masked(k))
 
 
@@ -179,18 +178,18 @@ def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     """The linear and constant parts of the cost-to-go, and the feed-forward."""
     # With V(x) = x'Xx + 2 p'x + s at the next step, the control of x meets
     # X (A x + B u + d) + p: the derivative in u is zero at u = -K x - k.
-    pushed = jnp.einsum("tij,tj->ti", after, d)
-    added = jnp.einsum("tji,tj->ti", loop, pushed) + q
-    added = added - jnp.einsum("tji,tj->ti", K, r)
+    pushed = xp.einsum("tij,tj->ti", after, d)
+    added = xp.einsum("tji,tj->ti", loop, pushed) + q
+    added = added - xp.einsum("tji,tj->ti", K, r)
     p = linear_recursion(loop, added, final_q, parallel, lambda loop, p: loop.T @ p)
     ahead = p[1:] + pushed
-    push = r + jnp.einsum("tji,tj->ti", B, ahead)
-    pivot = R + jnp.swapaxes(B, 1, 2) @ after @ B
-    k = jax.vmap(solve)(pivot, push[..., None])[..., 0]
+    push = r + xp.einsum("tji,tj->ti", B, ahead)
+    pivot = R + xp.swapaxes(B, 1, 2) @ after @ B
+    k = vmap(solve)(pivot, push[..., None])[..., 0]
     # What d adds to the cost-to-go, less what the feed-forward saves of it.
-    gained = jnp.sum(d * (p[1:] + ahead), axis=1) - jnp.sum(k * push, axis=1)
-    s = jnp.cumsum(gained[::-1])[::-1]
-    return p, jnp.concatenate([s, jnp.zeros(1, s.dtype)]), k
+    gained = xp.sum(d * (p[1:] + ahead), axis=1) - xp.sum(k * push, axis=1)
+    s = xp.cumsum(gained[::-1])[::-1]
+    return p, xp.concatenate([s, xp.zeros(1, s.dtype)]), k
 
 
 def cre(
@@ -251,7 +250,7 @@ def cre(
     where = "cre"
     given = constant_matrices(where, A=A, B=B, Q=Q, R=R, S=S)
     A, B = given["A"], given["B"]
-    given.setdefault("S", jnp.zeros_like(B))
+    given.setdefault("S", xp.zeros_like(B))
     final = final_weight(final, A, where)
     times = increasing_times(times, where).astype(A.dtype)
     solution = _continuous_solution(*(given[M] for M in "ABQRS"), final, times)
@@ -267,13 +266,13 @@ def cre(
 def _continuous_solution(A, B, Q, R, S, final, times):
     # Without a definite R the Hamiltonian has no minimum, whatever X is.
     definite = is_clearly_definite(R)
-    safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
+    safe = xp.where(definite, R, xp.eye(R.shape[0], dtype=R.dtype))
     X = flow_values(*without_cross_weight(A, B, Q, safe, S), final, times, False)
-    good = definite & jnp.all(jnp.isfinite(X), axis=(1, 2))
-    known = jnp.where(good[:, None, None], X, 0)
-    K = jax.vmap(lambda X: solve(safe, B.T @ X + S.T))(known)
-    masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
-    result = choose(jnp.all(good), RESULTS.successful, RESULTS.infeasible)
+    good = definite & xp.all(xp.isfinite(X), axis=(1, 2))
+    known = xp.where(good[:, None, None], X, 0)
+    K = vmap(lambda X: solve(safe, B.T @ X + S.T))(known)
+    masked = lambda M: xp.where(good[:, None, None], M, xp.nan)
+    result = choose(xp.all(good), RESULTS.successful, RESULTS.infeasible)
     return FiniteHorizonSolution(
         masked(known), masked(K), masked(A - B @ K), result, times=times
     )

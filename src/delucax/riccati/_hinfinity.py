@@ -9,11 +9,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._check import check_definite
+from .._jax import stop_gradient, vmap, xp
 from .._results import choose, RESULTS
 from .._typing import Numbers, Scalar, Square
 from ..math._linear_solve import full_precision, solve, symmetric
@@ -176,7 +175,7 @@ def checked_game(where: str, A: Any, B: Any, D: Any, Q: Any, R: Any) -> tuple:
     """The matrices of a stationary game, in one precision, that fit each other."""
     given = constant_matrices(where, A=A, B=B, D=D, Q=Q, R=R)
     check_definite(given["Q"], "Q", where, False)
-    given.setdefault("D", jnp.eye(len(given["A"]), dtype=given["A"].dtype))
+    given.setdefault("D", xp.eye(len(given["A"]), dtype=given["A"].dtype))
     return tuple(given[name] for name in "ABDQR")
 
 
@@ -199,13 +198,13 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     m = B.shape[1]
     loop = A - B @ K[:m]
     bound = spectral_radius if discrete else spectral_abscissa
-    masked = lambda M: jnp.where(game.good, M, jnp.nan)
+    masked = lambda M: xp.where(game.good, M, xp.nan)
     # A little below the least level the equation nearly has a solution.
     near = game.residual < 100 * _rounding(len(X), X.dtype)
     failure = choose(game.holds & near, RESULTS.not_converged, RESULTS.infeasible)
     # Without a disturbance it is the control problem: no level is to blame.
     failure = choose(end.solvable, failure, RESULTS.not_stabilising)
-    bound = masked(bound(lax.stop_gradient(loop)))
+    bound = masked(bound(stop_gradient(loop)))
     return GameSolution(
         X=masked(X),
         K=masked(K[:m]),
@@ -221,7 +220,7 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
 
 def _rounding(n: int, dtype) -> float:
     """The relative residual that counts as solved."""
-    return 1000 * n * float(jnp.finfo(dtype).eps)
+    return 1000 * n * float(xp.finfo(dtype).eps)
 
 
 def _game_start(discrete: bool, problem: tuple) -> Square:
@@ -229,14 +228,14 @@ def _game_start(discrete: bool, problem: tuple) -> Square:
     `(A, Q)` is not detectable."""
     A, B, _, Q, R = problem
     if discrete:
-        scale = jnp.linalg.norm(Q)
-        scale = one_if_zero(jnp.where(scale > 0, scale, jnp.linalg.norm(R)))
+        scale = xp.linalg.norm(Q)
+        scale = one_if_zero(xp.where(scale > 0, scale, xp.linalg.norm(R)))
     else:
         control = symmetric(B @ solve(R, B.T))
         # With Q = 0 the unstable modes alone set the size of X, |A|^2 / |B R^-1 B'|.
-        tiny = jnp.finfo(A.dtype).tiny ** 0.5
-        unseen = jnp.linalg.norm(A) ** 2 / jnp.maximum(jnp.linalg.norm(control), tiny)
-        Q = jnp.where(jnp.linalg.norm(Q) > 0, Q, shifted(unseen, Q))
+        tiny = xp.finfo(A.dtype).tiny ** 0.5
+        unseen = xp.linalg.norm(A) ** 2 / xp.maximum(xp.linalg.norm(control), tiny)
+        Q = xp.where(xp.linalg.norm(Q) > 0, Q, shifted(unseen, Q))
         scale = scale_of(control, Q)
     return shifted(scale, A)
 
@@ -245,7 +244,7 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     """The stabilising solution of the game equation, with the conditions under which it
     is a saddle point."""
     A, B, D, _, R = problem
-    (n, m), eps = B.shape, jnp.finfo(A.dtype).eps
+    (n, m), eps = B.shape, xp.finfo(A.dtype).eps
     data = joint(problem, gamma)
     # Doubling of the equation of X - X0, from below the solution, to which it rises.
     element, unit = _element(discrete, data, problem, gamma, X0)
@@ -261,17 +260,17 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     # Both loops must be stable: against the worst disturbance, and without any.
     _, _, weight = stationary(discrete, data, X)
     alone = A - B @ left.K[:m]
-    loops = jnp.stack([left.closed_loop, alone])
+    loops = xp.stack([left.closed_loop, alone])
     if discrete:
-        stable = jax.vmap(spectral_radius)(loops) < 1 - n * eps
+        stable = vmap(spectral_radius)(loops) < 1 - n * eps
         decided = is_saddle(symmetric(weight), D.shape[1])
     else:
-        slack = n * eps * jnp.linalg.norm(A)
-        stable = jax.vmap(spectral_abscissa)(loops) < -slack
+        slack = n * eps * xp.linalg.norm(A)
+        stable = vmap(spectral_abscissa)(loops) < -slack
         decided = is_clearly_definite(R)
     # The equation alone also has solutions above the level of any controller, at which
     # X is not semidefinite or a loop not stable (Doyle et al., 1989).
-    holds = is_semidefinite(X, 1000) & decided & jnp.all(stable)
+    holds = is_semidefinite(X, 1000) & decided & xp.all(stable)
     solved = left.relative < _rounding(n, A.dtype)
     return Game(X, left.bounds[0], holds, solved, iterations)
 
@@ -290,7 +289,7 @@ def _element(discrete, data, problem, gamma, X0):
     constant = Q + moved + moved.T - X0 @ G @ X0
     unit = scale_of(G, constant)
     H = hamiltonian(A - G @ X0, unit * G, constant / unit)
-    return short_element(H, 0.5 / one_if_zero(jnp.linalg.norm(H))), unit
+    return short_element(H, 0.5 / one_if_zero(xp.linalg.norm(H))), unit
 
 
 def _correction(discrete, X, loop, error):
@@ -304,9 +303,9 @@ def _correction(discrete, X, loop, error):
     eye = shifted(1, X)
     # With X = root root', loop and error become root' loop root'^-1, root^-1 error
     # root'^-1; a singular X is shifted by its rounding.
-    slack = jnp.finfo(X.dtype).eps * one_if_zero(size(X))
-    root = lax.stop_gradient(jnp.linalg.cholesky(X + slack * eye))
-    root = jnp.where(jnp.all(jnp.isfinite(root)), root, eye)
+    slack = xp.finfo(X.dtype).eps * one_if_zero(size(X))
+    root = stop_gradient(xp.linalg.cholesky(X + slack * eye))
+    root = xp.where(xp.all(xp.isfinite(root)), root, eye)
     loop = solve(root, (root.T @ loop).T).T
     error = solve(root, solve(root, error).T)
     return symmetric(root @ lyapunov(False, loop, symmetric(error)) @ root.T)
@@ -318,7 +317,7 @@ def _with_implicit_derivative(
 ) -> Square:
     """`X` of a solved game with its implicit derivatives; zero of an unsolved one."""
     del discrete, problem, gamma
-    return jnp.where(game.good, game.X, 0)
+    return xp.where(game.good, game.X, 0)
 
 
 @_with_implicit_derivative.defjvp
@@ -329,8 +328,8 @@ def _implicit_derivative_jvp(discrete, primals, tangents):
     (A, *others), R = where_solved(game.good, problem[:4], problem[4])
     if not discrete:
         # The trivial game has A = 0, which is not stable: it is given A = -I.
-        A = A - shifted(jnp.where(game.good, 0, 1), A)
-    gamma = jnp.where(game.good, gamma, 1)
+        A = A - shifted(xp.where(game.good, 0, 1), A)
+    gamma = xp.where(game.good, gamma, 1)
     # By the implicit function theorem, as for the equation of control.
     _, error, loop = jax.jvp(
         lambda *at: left_side(discrete, X, joint(*at)),
@@ -338,7 +337,7 @@ def _implicit_derivative_jvp(discrete, primals, tangents):
         tangents[:2],
         has_aux=True,
     )
-    return X, _correction(discrete, X, loop, jnp.where(game.good, error, 0))
+    return X, _correction(discrete, X, loop, xp.where(game.good, error, 0))
 
 
 def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
@@ -347,7 +346,7 @@ def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
     solve_game = functools.partial(_solve_game, discrete)
     end, _ = bisect_level(solve_game, problem, start, gamma)
     X = _with_implicit_derivative(discrete, problem, gamma, end.game)
-    total = jnp.trace(X)
+    total = xp.trace(X)
     if discrete:
         total += inverse_margins(problem[2][None], X[None], gamma)
     return total

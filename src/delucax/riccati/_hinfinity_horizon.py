@@ -3,10 +3,9 @@
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+from .._jax import vmap, xp
 from .._results import choose, RESULTS
 from .._typing import Numbers
 from ..math._linear_solve import full_precision, solve, symmetric
@@ -31,14 +30,14 @@ def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
     A, B, D, Q, R, final, *times = problem
     if discrete:
         both, weight = joint_inputs(B, D, R, gamma)
-        S = jnp.zeros_like(both)
+        S = xp.zeros_like(both)
         return values(A, both, Q, weight, S, final, D.shape[-1], False)
     definite = is_clearly_definite(R)
-    safe = jnp.where(definite, R, shifted(1, R))
+    safe = xp.where(definite, R, shifted(1, R))
     # The quadratic term of both players, which flows like that of control alone.
     G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
     X = flow_values(A, G, Q, final, *times, True)
-    return jnp.where(definite, X, jnp.nan)
+    return xp.where(definite, X, xp.nan)
 
 
 def hinf_dre(
@@ -104,9 +103,9 @@ def hinf_dre(
         ```
     """
     where = "hinf_dre"
-    A = jnp.asarray(A) if isinstance(A, list | tuple) else A
-    if D is None and eqx.is_array_like(A) and jnp.ndim(A) in (2, 3):
-        D = jnp.eye(jnp.shape(A)[-1], dtype=jnp.result_type(A, jnp.float32))
+    A = xp.asarray(A) if isinstance(A, list | tuple) else A
+    if D is None and eqx.is_array_like(A) and xp.ndim(A) in (2, 3):
+        D = xp.eye(xp.shape(A)[-1], dtype=xp.result_type(A, xp.float32))
     stage = stage_arguments(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
     final = final_weight(final, stage["A"], where)
     problem = (*stage.values(), final)
@@ -184,34 +183,34 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     def solve_game(problem, gamma, _) -> Game:
         # There is no equation to be solved: all that can fail is that X is not finite.
         X = _values(discrete, problem, gamma)
-        zero, yes = jnp.zeros((), X.dtype), jnp.ones((), bool)
-        return Game(X, zero, jnp.all(jnp.isfinite(X)), yes, jnp.asarray(0))
+        zero, yes = xp.zeros((), X.dtype), xp.ones((), bool)
+        return Game(X, zero, xp.all(xp.isfinite(X)), yes, xp.asarray(0))
 
     def barrier(problem, gamma):
         X = _values(discrete, problem, gamma)
-        total = jnp.trace(X[0])
+        total = xp.trace(X[0])
         return total + inverse_margins(problem[2], X[1:], gamma) if discrete else total
 
-    start = jnp.zeros((points, *A.shape[-2:]), A.dtype)
+    start = xp.zeros((points, *A.shape[-2:]), A.dtype)
     end, level, gamma = game_at_level(
         solve_game, barrier, problem, start, gamma, tolerance
     )
     X = _values(discrete, problem, level)
-    good = jnp.all(jnp.isfinite(X), axis=(1, 2))
-    masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
+    good = xp.all(xp.isfinite(X), axis=(1, 2))
+    masked = lambda M: xp.where(good[:, None, None], M, xp.nan)
     m = B.shape[-1]
     if discrete:
         # X[t+1] decides the gains of step t, which exist where X[t] does.
         good = good[:-1]
         both, weight = joint_inputs(B, D, R, level)
         (A, both, after), weight = where_solved(good, (A, both, X[1:]), weight)
-        K, _ = jax.vmap(gain)(A, both, weight, jnp.zeros_like(both), after)
+        K, _ = vmap(gain)(A, both, weight, xp.zeros_like(both), after)
         B = both[..., :m]
     else:
-        known, X = jnp.where(good[:, None, None], X, 0), masked(X)
-        R = jnp.where(jnp.any(good), R, shifted(1, R))
+        known, X = xp.where(good[:, None, None], X, 0), masked(X)
+        R = xp.where(xp.any(good), R, shifted(1, R))
         data = joint((A, B, D, Q, R), level)
-        K = jax.vmap(lambda X: joint_gain(False, data, X))(known)
+        K = vmap(lambda X: joint_gain(False, data, X))(known)
     return GameSolution(
         X=X,
         K=masked(K[:, :m]),

@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import check_step
+from .._jax import stop_gradient, vmap, while_loop, xp
 from .._results import raise_on_failure, Result
 from .._typing import Scalar, Square
 from ..math._linear_solve import full_precision, solve
@@ -90,18 +89,18 @@ class GameSolution(eqx.Module):
 def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
     """`[B D]`, and the weight of the joint control `[u; w]`."""
     m, k = B.shape[-1], D.shape[-1]
-    weight = jnp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
+    weight = xp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
     # gamma^2 w'w is subtracted from the cost.
-    worth = -(gamma**2) * jnp.eye(k, dtype=R.dtype)
+    worth = -(gamma**2) * xp.eye(k, dtype=R.dtype)
     weight = weight.at[..., :m, :m].set(R).at[..., m:, m:].set(worth)
-    return jnp.concatenate([B, D], axis=-1), weight
+    return xp.concatenate([B, D], axis=-1), weight
 
 
 def joint(problem: tuple, gamma: Scalar) -> RiccatiData:
     """The equation of the game `(A, B, D, Q, R)`."""
     A, B, D, Q, R = problem
     both, weight = joint_inputs(B, D, R, gamma)
-    return RiccatiData(A, both, Q, weight, jnp.zeros_like(both), None)
+    return RiccatiData(A, both, Q, weight, xp.zeros_like(both), None)
 
 
 def joint_gain(discrete: bool, data: RiccatiData, X: Square) -> Array:
@@ -115,12 +114,12 @@ def at_level(solver, where, discrete, problem, gamma, tolerance, throw) -> GameS
     given level, or at the least one to within a tolerance."""
     dtype = problem[0].dtype
     if tolerance is None:
-        tolerance = 16 * jnp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
+        tolerance = 16 * xp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
     check_step(tolerance, where, "tolerance")
     if gamma is not None:
         check_step(gamma, where, "gamma")
-        gamma = jnp.asarray(gamma, dtype)
-    solution = solver(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
+        gamma = xp.asarray(gamma, dtype)
+    solution = solver(discrete, problem, gamma, xp.asarray(tolerance, dtype))
     facts = lambda: f"Level gamma {float(solution.gamma):.6g}."
     return raise_on_failure(solution, where, throw, facts=facts)
 
@@ -172,18 +171,18 @@ def bisect_level(
     solution. The level is the upper, feasible end of a bracket of relative width
     `tolerance`, and 0 where no disturbance has any effect.
     """
-    problem, start, gamma = lax.stop_gradient((problem, start, gamma))
+    problem, start, gamma = stop_gradient((problem, start, gamma))
     A, B, D, *others = problem
-    one = jnp.ones((), A.dtype)
+    one = xp.ones((), A.dtype)
 
     def more(now):
         if gamma is not None:
             return (now.trials == 0) | (now.solvable & (now.trials < 2))
         # Until both ends are known the bracket grows, within limits; then it shrinks.
-        open_end = jnp.isinf(now.high) | (now.low == 0)
+        open_end = xp.isinf(now.high) | (now.low == 0)
         wide = now.high > now.low * (1 + tolerance)
         near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
-        going = jnp.where(open_end, near, wide) & (now.trials < _MAX_TRIALS)
+        going = xp.where(open_end, near, wide) & (now.trials < _MAX_TRIALS)
         return (now.trials == 0) | (now.solvable & now.affected & going)
 
     def body(now):
@@ -191,24 +190,24 @@ def bisect_level(
         if gamma is None:
             # Up by factors until feasible, down until not, and then into the middle, of
             # the logarithms: the level may have any size.
-            known = jnp.where(jnp.isinf(now.high), 1, now.high)
-            up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
-            down = jnp.where(now.low == 0, known / _FACTOR, jnp.sqrt(now.low * known))
-            trial = jnp.where(jnp.isinf(now.high), up, down)
+            known = xp.where(xp.isinf(now.high), 1, now.high)
+            up = xp.where(now.low == 0, now.start, _FACTOR * now.low)
+            down = xp.where(now.low == 0, known / _FACTOR, xp.sqrt(now.low * known))
+            trial = xp.where(xp.isinf(now.high), up, down)
         else:
             trial = gamma
-        trial = jnp.where(first, one, trial)
-        tried = (A, B, jnp.where(first, 0, D), *others)
+        trial = xp.where(first, one, trial)
+        tried = (A, B, xp.where(first, 0, D), *others)
         game = solve_game(tried, trial, now.base)
         good = game.good
         # The cost of a unit disturbance, trace D'XD: the square of a typical level, at
         # which the bracket starts.
         X = game.X[1:] if D.ndim == 3 else game.X
-        effect = jnp.einsum("...ik,...ij,...jk->", D, X, D)
-        size = jnp.linalg.norm(X) * jnp.sum(D**2)
-        slack = 10 * A.shape[-1] * jnp.finfo(A.dtype).eps * size
+        effect = xp.einsum("...ik,...ij,...jk->", D, X, D)
+        size = xp.linalg.norm(X) * xp.sum(D**2)
+        slack = 10 * A.shape[-1] * xp.finfo(A.dtype).eps * size
         at_first = now._replace(
-            start=jnp.sqrt(jnp.maximum(effect, jnp.finfo(A.dtype).tiny)),
+            start=xp.sqrt(xp.maximum(effect, xp.finfo(A.dtype).tiny)),
             solvable=good,
             affected=effect > slack,
             base=game.X,
@@ -218,10 +217,10 @@ def bisect_level(
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
         # Of a search the best game is kept, at a given level the one that was solved.
-        keep = better if gamma is None else jnp.ones((), bool)
+        keep = better if gamma is None else xp.ones((), bool)
         later = now._replace(
-            low=jnp.where(stuck, now.high, jnp.where(good, now.low, trial)),
-            high=jnp.where(better, trial, now.high),
+            low=xp.where(stuck, now.high, xp.where(good, now.low, trial)),
+            high=xp.where(better, trial, now.high),
             game=_where(keep | (now.trials == 1), game, now.game),
         )
         return _where(first, at_first, later)._replace(trials=now.trials + 1)
@@ -229,19 +228,19 @@ def bisect_level(
     unknown = jax.eval_shape(solve_game, problem, one, start)
     begin = Bisection(
         low=0 * one,
-        high=jnp.inf * one,
+        high=xp.inf * one,
         start=one,
-        solvable=jnp.zeros((), bool),
-        affected=jnp.zeros((), bool),
+        solvable=xp.zeros((), bool),
+        affected=xp.zeros((), bool),
         base=start,
-        game=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), unknown),
-        trials=jnp.asarray(0),
+        game=jax.tree.map(lambda s: xp.zeros(s.shape, s.dtype), unknown),
+        trials=xp.asarray(0),
     )
-    end = lax.while_loop(more, body, begin)
+    end = while_loop(more, body, begin)
     if gamma is not None:
         return end, gamma
-    level = jnp.where(jnp.isfinite(end.high) & end.solvable, end.high, one)
-    return end, jnp.where(end.solvable & ~end.affected, 0, level)
+    level = xp.where(xp.isfinite(end.high) & end.solvable, end.high, one)
+    return end, xp.where(end.solvable & ~end.affected, 0, level)
 
 
 def game_at_level(
@@ -254,11 +253,11 @@ def game_at_level(
         attained = with_derivative(barrier, problem, level)
     else:
         attained = level = gamma
-    return end, jnp.where(level > 0, level, 1), attained
+    return end, xp.where(level > 0, level, 1), attained
 
 
 def _where(condition, first, second):
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
+    return jax.tree.map(lambda a, b: xp.where(condition, a, b), first, second)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -281,21 +280,21 @@ def _with_derivative_jvp(barrier, primals, tangents):
     level = once_differentiable(level)
     problem = jax.tree.map(once_differentiable, problem)
     # d gamma = -(d barrier / d problem) / (d barrier / d gamma), at some distances.
-    still = jax.tree.map(jnp.zeros_like, problem)
+    still = jax.tree.map(xp.zeros_like, problem)
     attained = level > 0
-    safe = jnp.where(attained, level, 1)
+    safe = xp.where(attained, level, 1)
 
     def at_distance(away):
         along = functools.partial(jax.jvp, barrier, (problem, safe * (1 + away)))
-        _, slope = along((still, jnp.ones_like(safe)))
-        _, change = along((tangents[0], jnp.zeros_like(safe)))
-        return -change / jnp.where(slope != 0, slope, 1)
+        _, slope = along((still, xp.ones_like(safe)))
+        _, change = along((tangents[0], xp.zeros_like(safe)))
+        return -change / xp.where(slope != 0, slope, 1)
 
     # The error is a series in the root of the distance, as two eigenvalues may meet on
     # the boundary. Extrapolation from four distances removes its first terms.
-    away = jnp.finfo(level.dtype).eps ** (3 / 8) * jnp.asarray(_AWAY, level.dtype)
-    tangent = jax.vmap(at_distance)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
-    return primals[1], jnp.where(attained, tangent, 0)
+    away = xp.finfo(level.dtype).eps ** (3 / 8) * xp.asarray(_AWAY, level.dtype)
+    tangent = vmap(at_distance)(away) @ xp.asarray(_WEIGHTS, level.dtype)
+    return primals[1], xp.where(attained, tangent, 0)
 
 
 @jax.custom_jvp
@@ -320,8 +319,8 @@ def inverse_margins(
     D: Float[Array, "T n k"], X: Float[Array, "T n n"], gamma: Scalar
 ) -> Scalar:
     """The traces of `(gamma^2 I - D'XD)^-1`, summed, in a unit that fits."""
-    eye = jnp.eye(D.shape[-1], dtype=D.dtype)
-    margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
-    inverses = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
+    eye = xp.eye(D.shape[-1], dtype=D.dtype)
+    margins = gamma**2 * eye - xp.swapaxes(D, 1, 2) @ X @ D
+    inverses = vmap(lambda M: xp.trace(solve(M, eye)))(margins)
     # In the unit of X, so that the sum may be added to its trace.
-    return lax.stop_gradient(gamma**2 * jnp.linalg.norm(X)) * jnp.sum(inverses)
+    return stop_gradient(gamma**2 * xp.linalg.norm(X)) * xp.sum(inverses)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix
+from .._jax import stop_gradient, while_loop, xp
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Numbers
 from ..math._linear_solve import full_precision, no_tangent, solve
@@ -223,7 +223,7 @@ def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
         raise ValueError(
             f"{where}: {name} must have shape {shape}, got shape {C.shape}."
         )
-    dtype = jnp.result_type(*jax.tree.leaves((A, B, C)))
+    dtype = xp.result_type(*jax.tree.leaves((A, B, C)))
     A, B, C = jax.tree.map(lambda M: M.astype(dtype), (A, B, C))
     # In continuous time a Lyapunov equation is A X + X A' = -Q.
     C = -C if B is None and not discrete else C
@@ -242,7 +242,7 @@ def _solution(discrete, A, B, C) -> MatrixSolution:
     result = choose(solution.solved, RESULTS.successful, failure)
     return MatrixSolution(
         X=complex_form(solution.X) if complex_data else solution.X,
-        residual=lax.stop_gradient(solution.residual),
+        residual=stop_gradient(solution.residual),
         iterations=solution.iterations,
         result=choose(solution.finite, result, RESULTS.ill_posed),
     )
@@ -264,7 +264,7 @@ class _Candidate(NamedTuple):
 def _solved(discrete, A, B, C) -> _Candidate:
     """The solution of `A X + X B = C` or `X - A X B = C`; `B` is `A'` by default."""
     given = jax.tree.leaves((A, B, C))
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in given]))
+    finite = xp.all(xp.stack([xp.all(xp.isfinite(M)) for M in given]))
     last = _DENSE_SOLVE if C.size <= _DENSE else _SHIFTED
 
     def body(carry):
@@ -277,17 +277,17 @@ def _solved(discrete, A, B, C) -> _Candidate:
         # For a linear equation a small residual is a small backward error: enough.
         better = (residual < before.residual) | direct
         after = before._replace(
-            X=jnp.where(better, X, before.X),
-            residual=jnp.where(better, residual, before.residual),
+            X=xp.where(better, X, before.X),
+            residual=xp.where(better, residual, before.residual),
             iterations=before.iterations + iterations,
         )
         over = after.solved | (kind == last)
-        return jnp.where(over, _DONE, kind + 1), after
+        return xp.where(over, _DONE, kind + 1), after
 
-    unknown, zero = jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0)
-    nothing = _Candidate(jnp.full_like(C, jnp.nan), unknown, zero, finite)
-    start = jnp.where(finite, _DIRECT, _DONE), nothing
-    return lax.while_loop(lambda carry: carry[0] != _DONE, body, start)[1]
+    unknown, zero = xp.asarray(xp.inf, C.dtype), xp.asarray(0)
+    nothing = _Candidate(xp.full_like(C, xp.nan), unknown, zero, finite)
+    start = xp.where(finite, _DIRECT, _DONE), nothing
+    return while_loop(lambda carry: carry[0] != _DONE, body, start)[1]
 
 
 def _separated(discrete, A, B, C, direct, shifted):
@@ -297,46 +297,46 @@ def _separated(discrete, A, B, C, direct, shifted):
         X, steps = smith(*_or_trivial(direct, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
-        eye_A, eye_B = (jnp.eye(size, dtype=C.dtype) for size in C.shape)
+        eye_A, eye_B = (xp.eye(size, dtype=C.dtype) for size in C.shape)
         other = (A.T if B is None else B) + eye_B
         A, F = A + eye_A, solve(A + eye_A, A - eye_A)
         right = solve(A, C)
         C = -2 * solve(other.T, right.T).T
         B = None if B is None else solve(other.T, (B - eye_B).T).T
-        A, sign = F, jnp.where(shifted, -1.0, 1.0)
-        Y, more_steps = _one_side(A, B, C, sign, jnp.zeros(()), shifted)
-        return jnp.where(direct, X, Y), steps + more_steps
+        A, sign = F, xp.where(shifted, -1.0, 1.0)
+        Y, more_steps = _one_side(A, B, C, sign, xp.zeros(()), shifted)
+        return xp.where(direct, X, Y), steps + more_steps
     n, m = C.shape
     # Where the sum of the eigenvalues of A and B is positive, those of -A and -B may be
     # stable: -(A X + X B) = -C.
-    mean = jnp.trace(A) / n + (jnp.trace(A) / n if B is None else jnp.trace(B) / m)
-    sign = jnp.where(mean > 0, -1.0, 1.0)
+    mean = xp.trace(A) / n + (xp.trace(A) / n if B is None else xp.trace(B) / m)
+    sign = xp.where(mean > 0, -1.0, 1.0)
     if B is None:
         # There is no other line for an equation that is its own transpose.
-        return _one_side(A, None, C, sign, jnp.zeros(()), direct)
+        return _one_side(A, None, C, sign, xp.zeros(()), direct)
     # A shift by where the line is, between the spectra of A and -B.
-    safe_A, safe_B = (jnp.where(shifted, sign * M, 0) for M in (A, B))
+    safe_A, safe_B = (xp.where(shifted, sign * M, 0) for M in (A, B))
     middle = (spectral_abscissa(safe_A) - spectral_abscissa(safe_B)) / 2
-    shift = sign * jnp.where(shifted, middle, 0)
+    shift = sign * xp.where(shifted, middle, 0)
     return _one_side(A, B, C, sign, shift, direct | shifted)
 
 
 def _one_side(A, B, C, sign, shift, wanted):
     """The solution after a shift and a change of sign that make the matrices stable."""
     sign, shift = sign.astype(C.dtype), shift.astype(C.dtype)
-    A = sign * (A - shift * jnp.eye(A.shape[0], dtype=A.dtype))
+    A = sign * (A - shift * xp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
-        B = sign * (B + shift * jnp.eye(B.shape[0], dtype=B.dtype))
+        B = sign * (B + shift * xp.eye(B.shape[0], dtype=B.dtype))
     A, B, C = _or_trivial(wanted, A, B, sign * C, -1)
     return stable_sylvester(A, B, C)
 
 
 def _or_trivial(wanted, A, B, C, scale=0):
     """The problem if it is wanted; else a trivial one."""
-    A = jnp.where(wanted, A, scale * jnp.eye(A.shape[0], dtype=A.dtype))
+    A = xp.where(wanted, A, scale * xp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
-        B = jnp.where(wanted, B, scale * jnp.eye(B.shape[0], dtype=B.dtype))
-    return A, B, jnp.where(wanted, C, 0)
+        B = xp.where(wanted, B, scale * xp.eye(B.shape[0], dtype=B.dtype))
+    return A, B, xp.where(wanted, C, 0)
 
 
 def _dense_solution(discrete, A, B, C, X, wanted):
@@ -345,11 +345,11 @@ def _dense_solution(discrete, A, B, C, X, wanted):
     def dense(_):
         # vec(A X + X B), row by row, is this matrix times vec(X).
         other = A.T if B is None else B
-        eye_A, eye_B = (jnp.eye(size, dtype=A.dtype) for size in C.shape)
+        eye_A, eye_B = (xp.eye(size, dtype=A.dtype) for size in C.shape)
         if discrete:
-            system = jnp.kron(eye_A, eye_B) - jnp.kron(A, other.T)
+            system = xp.kron(eye_A, eye_B) - xp.kron(A, other.T)
         else:
-            system = jnp.kron(A, eye_B) + jnp.kron(eye_A, other.T)
+            system = xp.kron(A, eye_B) + xp.kron(eye_A, other.T)
         return solve(system, C.reshape(-1, 1)).reshape(C.shape)
 
     return if_needed(wanted, dense, X, ())
@@ -363,11 +363,11 @@ def _solved_jvp(discrete, primals, tangents):
     solution = _solved(discrete, *primals)
     ok = solution.solved
     # Masked at input and output, so that a failed member's NaN does not spread.
-    dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
-    X = jnp.where(ok, solution.X, 0)
+    dA, dB, dC = jax.tree.map(lambda t: xp.where(ok, t, 0), tangents)
+    X = xp.where(ok, solution.X, 0)
     # -I/2 for what was not solved: a trivial problem in both times.
-    half = functools.partial(jnp.where, ok)
-    A, B = jax.tree.map(lambda M: half(M, -jnp.eye(len(M), dtype=M.dtype) / 2), (A, B))
+    half = functools.partial(xp.where, ok)
+    A, B = jax.tree.map(lambda M: half(M, -xp.eye(len(M), dtype=M.dtype) / 2), (A, B))
     other, d_other = (A.T, dA.T) if B is None else (B, dB)
     if discrete:
         right = dC + dA @ X @ other + A @ X @ d_other
@@ -377,8 +377,8 @@ def _solved_jvp(discrete, primals, tangents):
     across = None if B is None else B.T
     dX = lax.custom_linear_solve(
         lambda X: X - A @ X @ other if discrete else A @ X + X @ other,
-        jnp.where(ok, right, 0),
+        xp.where(ok, right, 0),
         solve=lambda _, C: _solved(discrete, A, B, C).X,
         transpose_solve=lambda _, C: _solved(discrete, A.T, across, C).X,
     )
-    return solution, no_tangent(solution)._replace(X=jnp.where(ok, dX, 0))
+    return solution, no_tangent(solution)._replace(X=xp.where(ok, dX, 0))

@@ -7,9 +7,9 @@ from typing import Any
 
 import jax
 import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._jax import fori_loop, scan, stop_gradient, vmap, xp
 from .._typing import BoolScalar, Square
 from ..math._linear_solve import full_precision, solve, symmetric
 from ._arguments import where_solved
@@ -26,11 +26,11 @@ its start."""
 
 def is_clearly_definite(M: Square) -> BoolScalar:
     """Whether a symmetric matrix is positive definite, by more than rounding."""
-    L = jnp.linalg.cholesky(lax.stop_gradient(M))
+    L = xp.linalg.cholesky(stop_gradient(M))
     # The pivot L_ii^2 is the Schur complement of M_ii, and is compared with it, so that
     # units do not matter. NaN fails the comparison.
-    least = M.shape[0] * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
-    return jnp.all(jnp.diagonal(L) ** 2 > least)
+    least = M.shape[0] * xp.finfo(M.dtype).eps * xp.abs(xp.diagonal(M))
+    return xp.all(xp.diagonal(L) ** 2 > least)
 
 
 def is_saddle(M: Float[Array, "k k"], maximisers: int) -> BoolScalar:
@@ -44,13 +44,13 @@ def is_saddle(M: Float[Array, "k k"], maximisers: int) -> BoolScalar:
     # Concave in w, and then convex in u once w is at its best: the Schur complement.
     U, C, W = M[:m, :m], M[:m, m:], -M[m:, m:]
     concave = is_clearly_definite(W)
-    safe = jnp.where(concave, W, jnp.eye(maximisers, dtype=M.dtype))
+    safe = xp.where(concave, W, xp.eye(maximisers, dtype=M.dtype))
     return concave & is_clearly_definite(symmetric(U + C @ solve(safe, C.T)))
 
 
 def failed_step(X: Float[Array, "T n n"]) -> int:
     """The last step without a solution: it is NaN there and at all before it."""
-    return int(jnp.sum(jnp.isnan(X[:, 0, 0]))) - 1
+    return int(xp.sum(xp.isnan(X[:, 0, 0]))) - 1
 
 
 def gain(A, B, R, S, X):
@@ -86,13 +86,13 @@ def values(A, B, Q, R, S, final, maximisers: int, parallel: bool):
             return one_step(A, B, Q, R, S, gain(A, B, R, S, X)[0], X)
 
         X = backwards(back, final, (A, B, Q, R, S))
-        X = jnp.concatenate([X, final[None]])
-    pivot = R + jnp.swapaxes(B, 1, 2) @ X[1:] @ B
-    good = jax.vmap(lambda M: is_saddle(M, maximisers))(symmetric(pivot))
-    good &= jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
+        X = xp.concatenate([X, final[None]])
+    pivot = R + xp.swapaxes(B, 1, 2) @ X[1:] @ B
+    good = vmap(lambda M: is_saddle(M, maximisers))(symmetric(pivot))
+    good &= xp.all(xp.isfinite(X[:-1]), axis=(1, 2))
     # A step without a minimum leaves none to all the steps before it.
-    good = lax.cummin(good.astype(jnp.int32), reverse=True).astype(bool)
-    return X.at[:-1].set(jnp.where(good[:, None, None], X[:-1], jnp.nan))
+    good = lax.cummin(good.astype(xp.int32), reverse=True).astype(bool)
+    return X.at[:-1].set(xp.where(good[:, None, None], X[:-1], xp.nan))
 
 
 def backwards(step: Callable[[Array, Any], Array], final: Array, steps: Any) -> Array:
@@ -103,16 +103,16 @@ def backwards(step: Callable[[Array, Any], Array], final: Array, steps: Any) -> 
         X = step(X, here)
         return X, X
 
-    return lax.scan(back, final, steps, reverse=True)[1]
+    return scan(back, final, steps, reverse=True)[1]
 
 
 def _in_parallel(A, B, Q, R, S, final):
     # Adding x_next' P x_next - x' P x to each step, a telescoping sum, does not change
     # the optimal control, and makes the control weight definite even where R is not.
     n = A.shape[-1]
-    size = jnp.linalg.norm(Q, axis=(1, 2)).mean() + jnp.linalg.norm(final)
-    size = jnp.where(size > 0, size, jnp.linalg.norm(R, axis=(1, 2)).mean())
-    P = jnp.where(size > 0, size, 1) * jnp.eye(n, dtype=A.dtype)
+    size = xp.linalg.norm(Q, axis=(1, 2)).mean() + xp.linalg.norm(final)
+    size = xp.where(size > 0, size, xp.linalg.norm(R, axis=(1, 2)).mean())
+    P = xp.where(size > 0, size, 1) * xp.eye(n, dtype=A.dtype)
 
     def element(A, B, Q, R, S):
         cross = A.T @ P @ B + S
@@ -121,17 +121,17 @@ def _in_parallel(A, B, Q, R, S, final):
 
     def combine(later, earlier):
         # The scan runs backwards, so that the later of two comes first.
-        return jax.vmap(composed)(earlier, later)
+        return vmap(composed)(earlier, later)
 
-    steps = jax.vmap(element)(A, B, Q, R, S)
-    nothing = jnp.zeros((1, n, n), A.dtype)
+    steps = vmap(element)(A, B, Q, R, S)
+    nothing = xp.zeros((1, n, n), A.dtype)
     last = (nothing, nothing, (final - P)[None])
-    elements = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), steps, last)
+    elements = jax.tree.map(lambda a, b: xp.concatenate([a, b]), steps, last)
     _, _, J = lax.associative_scan(combine, elements, reverse=True)
     X = (J + P).at[-1].set(final)
     # One exact step from each X to the one before removes the scan's rounding.
-    K, _ = jax.vmap(gain)(A, B, R, S, X[1:])
-    return X.at[:-1].set(jax.vmap(one_step)(A, B, Q, R, S, K, X[1:]))
+    K, _ = vmap(gain)(A, B, R, S, X[1:])
+    return X.at[:-1].set(vmap(one_step)(A, B, Q, R, S, K, X[1:]))
 
 
 def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
@@ -142,7 +142,7 @@ def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
     `A'X0 A - X0`, `R` is `R + B'X0 B`, `S` is `A'X0 B + S`, and `added` is `Q`.
     """
     n = A.shape[0]
-    solved = solve(R, jnp.concatenate([S.T, B.T], axis=1))
+    solved = solve(R, xp.concatenate([S.T, B.T], axis=1))
     K = solved[:, :n]
     closed_loop, G = A - B @ K, symmetric(B @ solved[:, n:])
     # The difference of like terms first: rounding of `added` would hide it.
@@ -159,8 +159,8 @@ def composed(first: Element, second: Element) -> Element:
     A2, C2, J2 = second
     # One inverse serves all: J2 (I + C1 J2)^-1 and (I + C1 J2)^-1 C1 are symmetric.
     n = A1.shape[0]
-    eye = jnp.eye(n, dtype=A1.dtype)
-    solved = solve(eye + C1 @ J2, jnp.concatenate([A1, C1], axis=1))
+    eye = xp.eye(n, dtype=A1.dtype)
+    solved = solve(eye + C1 @ J2, xp.concatenate([A1, C1], axis=1))
     moved, weighted = solved[:, :n], solved[:, n:]
     C = symmetric(C2 + A2 @ weighted @ A2.T)
     return A2 @ moved, C, J1 + symmetric(A1.T @ (J2 @ moved))
@@ -175,16 +175,16 @@ def linear_recursion(loop, added, final, parallel: bool, product):
     if not parallel:
         back = lambda Z, here: product(here[0], Z) + here[1]
         Z = backwards(back, final, (loop, added))
-        return jnp.concatenate([Z, final[None]])
+        return xp.concatenate([Z, final[None]])
 
     # The pair (loop, added) is an affine map; composition of such maps is associative.
     def combine(later, earlier):
         (later_loop, later_added), (loop, added) = later, earlier
-        moved = jax.vmap(product)(loop, later_added)
+        moved = vmap(product)(loop, later_added)
         return later_loop @ loop, moved + added
 
-    loop = jnp.concatenate([loop, jnp.zeros_like(loop[:1])])
-    added = jnp.concatenate([added, final[None]])
+    loop = xp.concatenate([loop, xp.zeros_like(loop[:1])])
+    added = xp.concatenate([added, final[None]])
     return lax.associative_scan(combine, (loop, added), reverse=True)[1]
 
 
@@ -193,17 +193,17 @@ def linear_recursion(loop, added, final, parallel: bool, product):
 def _values_jvp(maximisers, parallel, primals, tangents):
     *matrices, _ = primals
     X = values(*primals, maximisers, parallel)  # pyright: ignore[reportCallIssue]
-    good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
+    good = xp.all(xp.isfinite(X[:-1]), axis=(1, 2))
     A, B, Q, R, S = matrices
     (A, B, Q, S, after), R = where_solved(good, (A, B, Q, S, X[1:]), R)
-    K, loop = jax.vmap(gain)(A, B, R, S, after)
+    K, loop = vmap(gain)(A, B, R, S, after)
 
     # By the envelope theorem a change of the optimal gain does not contribute.
     def cost(A, B, Q, R, S):
-        return jax.vmap(one_step)(A, B, Q, R, S, K, after)
+        return vmap(one_step)(A, B, Q, R, S, K, after)
 
     _, change = jax.jvp(cost, (A, B, Q, R, S), tangents[:-1])
-    change = jnp.where(good[:, None, None], change, 0)
+    change = xp.where(good[:, None, None], change, 0)
     congruence = lambda loop, Z: loop.T @ Z @ loop
     tangent = linear_recursion(loop, change, tangents[-1], parallel, congruence)
     return X, tangent
@@ -212,23 +212,23 @@ def _values_jvp(maximisers, parallel, primals, tangents):
 def scale_of(G: Array, Q: Array) -> Array:
     """The size of `X` at which `X G X` is as large as `Q`; 1 if that is no size."""
     # |G| x^2 = |Q|; its derivative cancels from the result, as any unit will do.
-    quadratic, constant = jnp.linalg.norm(G), jnp.linalg.norm(Q)
+    quadratic, constant = xp.linalg.norm(G), xp.linalg.norm(Q)
     usual = (quadratic > 0) & (constant > 0)
-    ratio = jnp.where(usual, constant, 1) / jnp.where(usual, quadratic, 1)
-    return lax.stop_gradient(jnp.sqrt(ratio))
+    ratio = xp.where(usual, constant, 1) / xp.where(usual, quadratic, 1)
+    return stop_gradient(xp.sqrt(ratio))
 
 
 def hamiltonian(A, G, Q) -> Array:
     """The matrix of the linear flow of `[I; X]`, for `dX/dt = -A'X - XA + XGX - Q`."""
-    return jnp.block([[A, -G], [-Q, -A.T]])
+    return xp.block([[A, -G], [-Q, -A.T]])
 
 
 def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Array]:
     """The element of an interval that is short relative to `1 / |H|`."""
     n = H.shape[0] // 2
     Z = -H * time
-    power = jnp.eye(2 * n, dtype=H.dtype)
-    parts = [power * _PADE[0], jnp.zeros_like(Z)]  # of even and of odd degree
+    power = xp.eye(2 * n, dtype=H.dtype)
+    parts = [power * _PADE[0], xp.zeros_like(Z)]  # of even and of odd degree
     for k in range(1, 7):
         power = power @ Z
         parts[k % 2] = parts[k % 2] + _PADE[k] * power
@@ -238,8 +238,8 @@ def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Ar
     # Backwards over the time: [U; V] = flow [I; X] and V U^-1 is X before it.
     # That is J + A' X (I + C X)^-1 A with the three solved for here.
     first, second = flow[:n, :n], flow[:n, n:]
-    eye = jnp.eye(n, dtype=H.dtype)
-    solved = solve(first, jnp.concatenate([eye, second], axis=1))
+    eye = xp.eye(n, dtype=H.dtype)
+    solved = solve(first, xp.concatenate([eye, second], axis=1))
     J = solve(first.T, flow[n:, :n].T).T
     return solved[:, :n], symmetric(solved[:, n:]), symmetric(J)
 
@@ -248,14 +248,14 @@ def _short_elements(A, G, Q, times):
     """The elements of the intervals between `times`, halved as often as needed; the
     number of halvings; and the unit of `X`."""
     # In this unit the quadratic and the constant part of the flow have equal norms.
-    unit, lengths = scale_of(G, Q), jnp.diff(times)
+    unit, lengths = scale_of(G, Q), xp.diff(times)
     H = hamiltonian(A, unit * G, Q / unit)
     # After that many halvings |H| times the longest interval is at most 1/2.
-    sizes = jnp.maximum(2 * jnp.linalg.norm(H) * lengths, 1)
-    count = jnp.max(lax.stop_gradient(jnp.ceil(jnp.log2(sizes))).astype(jnp.int32))
-    count = jnp.minimum(count, _MAX_HALVINGS)
+    sizes = xp.maximum(2 * xp.linalg.norm(H) * lengths, 1)
+    count = xp.max(stop_gradient(xp.ceil(xp.log2(sizes))).astype(xp.int32))
+    count = xp.minimum(count, _MAX_HALVINGS)
     short = lengths * 0.5**count
-    return unit, count, jax.vmap(lambda time: short_element(H, time))(short)
+    return unit, count, vmap(lambda time: short_element(H, time))(short)
 
 
 def has_solution(C: Array, X: Array, is_game: bool) -> Array:
@@ -266,17 +266,17 @@ def has_solution(C: Array, X: Array, is_game: bool) -> Array:
     be passed shrinks with `X` where `X` is not negative, it is enough to see at the end
     that no eigenvalue of `I + C X` has become negative.
     """
-    C, X = lax.stop_gradient((C, X))
+    C, X = stop_gradient((C, X))
     # In a game C is indefinite and X is not; without a disturbance it is the reverse.
     inner, outer = (X, C) if is_game else (C, X)
     n = X.shape[0]
-    eye = jnp.eye(n, dtype=X.dtype)
-    size = jnp.linalg.norm(inner)
+    eye = xp.eye(n, dtype=X.dtype)
+    size = xp.linalg.norm(inner)
     # I + C X has the eigenvalues of I + root' X root, with C = root root'.
-    slack = 100 * n * jnp.finfo(X.dtype).eps * jnp.where(size > 0, size, 1)
-    root = jnp.linalg.cholesky(inner + slack * eye)
-    moved = jnp.linalg.cholesky(eye + symmetric(root.T @ outer @ root))
-    return jnp.all(jnp.isfinite(root)) & jnp.all(jnp.isfinite(moved))
+    slack = 100 * n * xp.finfo(X.dtype).eps * xp.where(size > 0, size, 1)
+    root = xp.linalg.cholesky(inner + slack * eye)
+    moved = xp.linalg.cholesky(eye + symmetric(root.T @ outer @ root))
+    return xp.all(xp.isfinite(root)) & xp.all(xp.isfinite(moved))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
@@ -291,11 +291,11 @@ def flow_values(A, G, Q, final, times, is_game: bool):
     def twice(_, carry):
         element, good = carry
         # The equation from X = 0 may have a solution over each half and none over both.
-        good &= jax.vmap(reach)(element[1], element[2])
-        return jax.vmap(composed)(element, element), good
+        good &= vmap(reach)(element[1], element[2])
+        return vmap(composed)(element, element), good
 
-    start = (short, jnp.ones(len(times) - 1, bool))
-    parts, possible = lax.fori_loop(0, count, twice, start)
+    start = (short, xp.ones(len(times) - 1, bool))
+    parts, possible = fori_loop(0, count, twice, start)
 
     def back(carry, here):
         X, good = carry
@@ -303,12 +303,12 @@ def flow_values(A, G, Q, final, times, is_game: bool):
         # A finite escape time in the interval: the formula below would step over it.
         good &= possible & has_solution(element[1], X, is_game)
         X = passed(element, X)
-        good &= jnp.all(jnp.isfinite(X))
-        return (X, good), jnp.where(good, X, jnp.nan)
+        good &= xp.all(xp.isfinite(X))
+        return (X, good), xp.where(good, X, xp.nan)
 
-    start = (final / unit, jnp.ones((), bool))
-    _, X = lax.scan(back, start, (parts, possible), reverse=True)
-    return jnp.concatenate([unit * X, final[None]])
+    start = (final / unit, xp.ones((), bool))
+    _, X = scan(back, start, (parts, possible), reverse=True)
+    return xp.concatenate([unit * X, final[None]])
 
 
 def _to_differentiate(A, G, Q, final, times):
@@ -319,31 +319,31 @@ def _to_differentiate(A, G, Q, final, times):
     def twice(element, k):
         # After the last doubling zero elements are composed, which is harmless.
         going = k < count
-        tried = jax.tree.map(lambda M: jnp.where(going, M, 0), element)
-        after = jax.vmap(composed)(tried, tried)
-        kept = jax.tree.map(lambda a, b: jnp.where(going, a, b), after, element)
+        tried = jax.tree.map(lambda M: xp.where(going, M, 0), element)
+        after = vmap(composed)(tried, tried)
+        kept = jax.tree.map(lambda a, b: xp.where(going, a, b), after, element)
         return kept, None
 
-    parts, _ = lax.scan(twice, short, jnp.arange(_MAX_HALVINGS))
+    parts, _ = scan(twice, short, xp.arange(_MAX_HALVINGS))
     X = backwards(lambda X, element: passed(element, X), final / unit, parts)
-    return jnp.concatenate([unit * X, final[None]])
+    return xp.concatenate([unit * X, final[None]])
 
 
 @flow_values.defjvp
 @full_precision
 def _flow_values_jvp(is_game, primals, tangents):
     X = flow_values(*primals, is_game)  # pyright: ignore[reportCallIssue]
-    good = jnp.all(jnp.isfinite(X))
+    good = xp.all(xp.isfinite(X))
     *matrices, times = primals
     # A failed problem is replaced, which keeps its NaN out of the derivatives.
-    safe = (*(jnp.where(good, M, 0) for M in matrices), times)
+    safe = (*(xp.where(good, M, 0) for M in matrices), times)
     _, tangent = jax.jvp(_to_differentiate, safe, tangents)
-    return X, jnp.where(good, tangent, 0)
+    return X, xp.where(good, tangent, 0)
 
 
 def passed(element, X):
     """`X` at the start of an interval from `X` at its end."""
     A, C, J = element
     n = A.shape[0]
-    moved = solve(jnp.eye(n, dtype=A.dtype) + C @ X, A)
+    moved = solve(xp.eye(n, dtype=A.dtype) + C @ X, A)
     return symmetric(J + A.T @ X @ moved)

@@ -5,10 +5,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._jax import vmap, while_loop, xp
 from .._typing import BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts
 from ..math._linear_solve import solve, symmetric
@@ -25,7 +24,7 @@ _FINE = 64
 
 def tolerance(dtype: Any) -> float:
     """The relative residual up to which an equation counts as solved."""
-    return 1e-12 if jnp.finfo(dtype).bits == 64 else 1e-5
+    return 1e-12 if xp.finfo(dtype).bits == 64 else 1e-5
 
 
 class Residual(NamedTuple):
@@ -78,8 +77,8 @@ def riccati_residual(
     weighted = X if E is None else E.T @ X
     # One factorisation for the gain and for the inverse, whose absolute value bounds
     # the last term: G is small, so that its own rounding matters little.
-    solved = solve(weight, jnp.concatenate([cross.T, jnp.eye(m, dtype=dtype)], axis=1))
-    K, inverse = solved[:, :n], jnp.abs(solved[:, n:])
+    solved = solve(weight, xp.concatenate([cross.T, xp.eye(m, dtype=dtype)], axis=1))
+    K, inverse = solved[:, :n], xp.abs(solved[:, n:])
     # The terms of the equation, for their norms. A game's two quadratic terms have
     # opposite signs: their sum would hide how large they are.
     first = m - maximisers
@@ -92,26 +91,26 @@ def riccati_residual(
 
     working, left = _evaluated(discrete, *data, X, K)
     closed_loop = working[1] if E is None else solve(E, working[1])
-    needed = jnp.asarray(accurately)
+    needed = xp.asarray(accurately)
     if accurately is not False:
         sharper = lambda left, *working: _sharper(discrete, *data, X, working, left)
         left = if_needed(needed, sharper, left, working)
     error, lost, gap, gap_lost = left
-    gap = jnp.abs(gap) + gap_lost
+    gap = xp.abs(gap) + gap_lost
     # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
-    bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
+    bound = xp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
 
-    both, terms = jnp.stack([error, bound]), jnp.stack(terms)
+    both, terms = xp.stack([error, bound]), xp.stack(terms)
 
     def in_units(d):
         factor = d[:, None] * d
         return relative_and_total_size(both * factor, terms * factor)
 
     # Powers of two: their products have no rounding.
-    units = jnp.stack([jnp.ones(n, dtype), *others])
-    relative, sizes = jax.vmap(in_units)(units)
+    units = xp.stack([xp.ones(n, dtype), *others])
+    relative, sizes = vmap(in_units)(units)
     bounds = _MARGIN * relative[:, 1]
-    relative = jnp.where(needed, bounds[0], relative[0, 0])
+    relative = xp.where(needed, bounds[0], relative[0, 0])
     return Residual(error, relative, bounds, K, closed_loop, sizes)
 
 
@@ -125,11 +124,11 @@ def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tupl
 
     def once(carry):
         _, operands, value = carry
-        nothing = jax.tree.map(jnp.zeros_like, operands)
-        return jnp.zeros_like(needed), nothing, function(value, *operands)
+        nothing = jax.tree.map(xp.zeros_like, operands)
+        return xp.zeros_like(needed), nothing, function(value, *operands)
 
     start = needed, operands, value
-    return lax.while_loop(lambda carry: carry[0], once, start)[2]
+    return while_loop(lambda carry: carry[0], once, start)[2]
 
 
 def stationary(
@@ -160,27 +159,27 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit, and a product of k
     # terms is off by k units of the product of absolute values. `lost_M` is that bound
     # for M, `from_L` is what an error of L does to XL.
-    unit = jnp.finfo(A.dtype).eps / 2
-    size_B, size_S, size_X, size_N = (jnp.abs(M) for M in (B, S, X, K))
+    unit = xp.finfo(A.dtype).eps / 2
+    size_B, size_S, size_X, size_N = (xp.abs(M) for M in (B, S, X, K))
     # From here on the rounded gain -N is taken for exact: any gain gives a valid bound.
     N = -K
     BN, units_BN = product_in_parts(B, N)
     L, T = A + BN, S.T + R @ N
-    lost_L = (units_BN + 1) * unit * (jnp.abs(A) + size_B @ size_N)
-    lost_T = (m + 1) * unit * (size_S.T + jnp.abs(R) @ size_N)
-    most_L, size_T = jnp.abs(L) + lost_L, jnp.abs(T)
-    Z, lost_Z = X, jnp.zeros_like(X)
+    lost_L = (units_BN + 1) * unit * (xp.abs(A) + size_B @ size_N)
+    lost_T = (m + 1) * unit * (size_S.T + xp.abs(R) @ size_N)
+    most_L, size_T = xp.abs(L) + lost_L, xp.abs(T)
+    Z, lost_Z = X, xp.zeros_like(X)
     if E is not None:
         Z, units = product_in_parts(X, E)
-        lost_Z = units * unit * (size_X @ jnp.abs(E))
+        lost_Z = units * unit * (size_X @ xp.abs(E))
     if discrete:
         Y, units = product_in_parts(X, L)
         lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
         subtracted = Z if E is None else E.T @ Z
     else:
-        Y, lost_Y, from_L = Z, lost_Z, jnp.zeros_like(X)
-        subtracted = jnp.zeros_like(X)
-    size_Y = jnp.abs(Y)
+        Y, lost_Y, from_L = Z, lost_Z, xp.zeros_like(X)
+        subtracted = xp.zeros_like(X)
+    size_Y = xp.abs(Y)
     square, units = product_in_parts(L.T, Y)
     SN, NT = S @ N, N.T @ T
     lost = most_L.T @ (units * unit * size_Y + lost_Y)
@@ -189,12 +188,12 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     if discrete:
         lost += _twice(both)
         if E is not None:
-            lost += jnp.abs(E).T @ (n * unit * jnp.abs(Z) + lost_Z)
+            lost += xp.abs(E).T @ (n * unit * xp.abs(Z) + lost_Z)
     else:
         square, lost = _twice(square), _twice(lost + both)
     lost += m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
     # Four additions, each of a sum no larger than that of the sizes, and a margin.
-    lost += 5 * unit * sum(jnp.abs(M) for M in (square, subtracted, Q, SN, NT))
+    lost += 5 * unit * sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
     gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost += lost_T + 2 * unit * size_T
     error = square - subtracted + Q + SN + NT
@@ -209,8 +208,8 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     """
     N, L, T, Y, Z = working
     n, m = B.shape
-    eps = jnp.finfo(A.dtype).eps
-    stacked = jnp.concatenate
+    eps = xp.finfo(A.dtype).eps
+    stacked = xp.concatenate
     if discrete:
         terms, of_X, added = [(L, Y), (S.T, N), (N, T)], [(L, Y, L)], [Q]
         if E is None:
@@ -224,38 +223,38 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     # Pairs of a rest and the bound on its error. With S and R stacked under A and B one
     # product gives the rests of both L and T.
     pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
-    rests = list(zip(*(jnp.split(M, [n]) for M in pair), strict=True))
+    rests = list(zip(*(xp.split(M, [n]) for M in pair), strict=True))
     if of_X:
         rights, wholes, _ = (stacked(M, axis=1) for M in zip(*of_X, strict=True))
         pair = product(X, rights, -wholes)
-        rests += zip(*(jnp.split(M, len(of_X), axis=1) for M in pair), strict=True)
+        rests += zip(*(xp.split(M, len(of_X), axis=1) for M in pair), strict=True)
     factor = stacked([2 * Y, N, *(M for *_, M in of_X)]).T
     rest, rest_lost = (stacked(M) for M in zip(*rests, strict=True))
-    sizes = jnp.abs(rest)
+    sizes = xp.abs(rest)
     most = sizes + rest_lost
     left, right = (stacked(M) for M in zip(*terms, strict=True))
     error, lost = product(left.T, right, *added)
     error += factor @ rest
-    lost += jnp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
+    lost += xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
     # The second-order terms: an error of L times an error of the factor beside it.
-    most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * jnp.abs(Y)
+    most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * xp.abs(Y)
     if of_X:
         most_Y = most[n + m : 2 * n + m]
         around += most_Y
         lost += 2 * most_L.T @ most_Y
     if discrete:
-        from_L = jnp.abs(X) @ most_L
+        from_L = xp.abs(X) @ most_L
         around += from_L
         lost += most_L.T @ from_L
-    gap_lost = jnp.abs(B.T) @ around + most_T + (n + 4) * eps * jnp.abs(T)
+    gap_lost = xp.abs(B.T) @ around + most_T + (n + 4) * eps * xp.abs(T)
     lost = symmetric(lost)
     # Where nothing cancels the first bound may be the sharper one.
     sharper = lost < wide.lost
     return _Left(
-        jnp.where(sharper, symmetric(error), wide.error),
-        jnp.where(sharper, lost, wide.lost),
+        xp.where(sharper, symmetric(error), wide.error),
+        xp.where(sharper, lost, wide.lost),
         wide.gap,
-        jnp.minimum(gap_lost, wide.gap_lost),
+        xp.minimum(gap_lost, wide.gap_lost),
     )
 
 
@@ -271,18 +270,18 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     It is the backward error: the relative change of the data that makes `X` exact.
     Relative to these norms rounding is small, and its bound is added.
     """
-    eps = jnp.finfo(X.dtype).eps
-    size_A, size_B = jnp.linalg.norm(A), jnp.linalg.norm(B)
+    eps = xp.finfo(X.dtype).eps
+    size_A, size_B = xp.linalg.norm(A), xp.linalg.norm(B)
     if discrete:
         error, factor = X - A @ X @ B - C, 1 + size_A * size_B
         rounding = (sum(X.shape) + 2) * eps / 2
     else:
         error, factor = A @ X + X @ B - C, size_A + size_B
         rounding = (max(X.shape) + 2) * eps / 2
-    terms = factor * jnp.linalg.norm(X) + jnp.linalg.norm(C)
-    relative = jnp.linalg.norm(error) / jnp.where(terms == 0, 1, terms)
+    terms = factor * xp.linalg.norm(X) + xp.linalg.norm(C)
+    relative = xp.linalg.norm(error) / xp.where(terms == 0, 1, terms)
     relative = _MARGIN * (relative + rounding)
-    return jnp.where(jnp.isfinite(relative), relative, jnp.inf)
+    return xp.where(xp.isfinite(relative), relative, xp.inf)
 
 
 def newton_refine(
@@ -303,7 +302,7 @@ def newton_refine(
 
     Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
     """
-    fine, wide = _FINE * float(jnp.finfo(X.dtype).eps), tolerance(X.dtype)
+    fine, wide = _FINE * float(xp.finfo(X.dtype).eps), tolerance(X.dtype)
 
     def body(carry):
         X, last, best, accurately, going, patient, k = carry
@@ -313,7 +312,7 @@ def newton_refine(
         step = if_needed(
             going & ~first,
             lambda _, *at: correction(*at),
-            jnp.zeros_like(X),
+            xp.zeros_like(X),
             (X, *last),
         )
         X = symmetric(X + step)
@@ -322,21 +321,21 @@ def newton_refine(
         # Steps that gain little are at the level of rounding. But far from the solution
         # the residual may rise in the first one.
         helped = first | (new.relative < best[1].relative / 4)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (X, new), best)
+        best = jax.tree.map(lambda a, b: xp.where(better, a, b), (X, new), best)
         rest = best[1].relative
         again = helped | patient & (rest > wide)
         again &= (rest > fine) & (k < _NEWTON_STEPS)
         # The bound is too wide for a certificate: once more, accurately, from the best.
-        hidden = ~again & ~accurately & (jnp.max(best[1].bounds) > wide)
-        X = jnp.where(hidden, best[0], X)
-        k = jnp.where(hidden, 0, k + 1)
+        hidden = ~again & ~accurately & (xp.max(best[1].bounds) > wide)
+        X = xp.where(hidden, best[0], X)
+        k = xp.where(hidden, 0, k + 1)
         last = new.closed_loop, new.error
         return X, last, best, accurately | hidden, again | hidden, helped, k
 
-    yes = jnp.asarray(True)
+    yes = xp.asarray(True)
     shapes = X.shape, (), units, (controls, len(X))
-    matrix, number, vector, gain = (jnp.zeros(shape, X.dtype) for shape in shapes)
+    matrix, number, vector, gain = (xp.zeros(shape, X.dtype) for shape in shapes)
     unknown = Residual(matrix, number, vector, gain, matrix, vector)
-    accurately = jnp.asarray(to_working_precision)
-    start = X, (matrix, matrix), (X, unknown), accurately, yes, yes, jnp.asarray(0)
-    return lax.while_loop(lambda carry: carry[4], body, start)[2]
+    accurately = xp.asarray(to_working_precision)
+    start = X, (matrix, matrix), (X, unknown), accurately, yes, yes, xp.asarray(0)
+    return while_loop(lambda carry: carry[4], body, start)[2]

@@ -5,10 +5,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._jax import stop_gradient, while_loop, xp
 from .._results import choose, Result, RESULTS
 from .._typing import BoolScalar, Scalar, Square
 from ..math._linear_solve import solve
@@ -99,7 +98,7 @@ class SearchResult(NamedTuple):
 
     @property
     def differentiable(self) -> BoolScalar:
-        return self.stable & jnp.all(jnp.isfinite(self.X)) & self.well_posed
+        return self.stable & xp.all(xp.isfinite(self.X)) & self.well_posed
 
     @property
     def result(self) -> Result:
@@ -139,7 +138,7 @@ def search(
         stable = at.gap > new.rounding
         # Rounding of X may not allow a smaller residual: up to a hundred times the
         # tolerance is accepted then.
-        enough = jnp.clip(new.attainable, close, 100 * close)
+        enough = xp.clip(new.attainable, close, 100 * close)
         # With bad scaling a wrong X can have a small balanced residual.
         unfit = badly_scaled & ~balanced
         solved = stable & (at.residual <= enough) & (~unfit | (at.unscaled <= close))
@@ -156,67 +155,67 @@ def search(
         undecided &= (at.residual <= close) & new.bounded
         # The gap of a robust solution hardly changes with Q; that of a marginal one
         # changes by as much as itself.
-        same = jnp.abs(at.gap - best.gap) <= _GAP_TOLERANCE * best.gap
+        same = xp.abs(at.gap - best.gap) <= _GAP_TOLERANCE * best.gap
         marginal = before.marginal & ~(unchanged & solved)
-        marginal = jnp.where(kind == PERTURBED, ~(survives & same), marginal)
+        marginal = xp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
         solved_now, stable_now, kept = jax.tree.map(
-            lambda now, then: jnp.where(take, now, then),
+            lambda now, then: xp.where(take, now, then),
             (solved, stable, at),
             (before.solved, before.stable, best),
         )
         stabilisable = survives | undecided | stable_now
         near_it = survives & new.around
-        on_boundary = jnp.where(kind == REGULARISED, near_it, before.on_boundary)
+        on_boundary = xp.where(kind == REGULARISED, near_it, before.on_boundary)
         after = before._replace(
             best=kept,
             solved=solved_now,
             stable=stable_now,
             marginal=marginal,
-            stabilisable=jnp.where(unit, stabilisable, before.stabilisable),
-            on_boundary=jnp.where(unit, undecided, on_boundary),
+            stabilisable=xp.where(unit, stabilisable, before.stabilisable),
+            on_boundary=xp.where(unit, undecided, on_boundary),
             balanced=balanced,
-            iterations=before.iterations + jnp.where(unchanged, new.iterations, 0),
+            iterations=before.iterations + xp.where(unchanged, new.iterations, 0),
         )
         # The column of the table.
-        success = jnp.where(unchanged, solved, ~marginal & (~unit | survives))
-        outcome = jnp.where(success, 0, jnp.where(unfit, 1, 2))
+        success = xp.where(unchanged, solved, ~marginal & (~unit | survives))
+        outcome = xp.where(success, 0, xp.where(unfit, 1, 2))
         # No index from outside: nothing is clipped, which compiles sooner.
-        following = jnp.asarray(_NEXT).at[kind, outcome].get(mode="promise_in_bounds")
+        following = xp.asarray(_NEXT).at[kind, outcome].get(mode="promise_in_bounds")
         over = unchanged & solved & ~new.near
-        return jnp.where(over, DONE, following), after
+        return xp.where(over, DONE, following), after
 
-    most, no = jnp.asarray(jnp.inf, dtype), jnp.asarray(False)
+    most, no = xp.asarray(xp.inf, dtype), xp.asarray(False)
     flags = "solved", "stable", "marginal", "on_boundary", "balanced"
     nothing = SearchResult(
         Candidate(X, residual=most, unscaled=most, bound=most, gap=-most),
         **dict.fromkeys(flags, no),
-        stabilisable=jnp.asarray(True),
+        stabilisable=xp.asarray(True),
         well_posed=well_posed,
-        iterations=jnp.asarray(0),
+        iterations=xp.asarray(0),
     )
-    start = jnp.where(well_posed, FIRST, DONE)
-    return lax.while_loop(lambda carry: carry[0] != DONE, body, (start, nothing))[1]
+    start = xp.where(well_posed, FIRST, DONE)
+    return while_loop(lambda carry: carry[0] != DONE, body, (start, nothing))[1]
 
 
 def weights(kind: Int[Array, ""], data: RiccatiData) -> tuple[RiccatiData, Scalar]:
     """The data of an attempt of this kind, and the size of the state weight."""
     Q, R, S = data.Q, data.R, data.S
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
-    eps = jnp.finfo(dtype).eps
+    eps = xp.finfo(dtype).eps
     # Where `Q` is zero `R` sets the scale.
-    eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
+    eye_Q, eye_R = xp.eye(n, dtype=dtype), xp.eye(m, dtype=dtype)
     size_Q, size_R = size(Q), size(R)
     scale_R = one_if_zero(size_R)
-    scale_Q = jnp.where(size_Q > 0, size_Q, scale_R)
+    scale_Q = xp.where(size_Q > 0, size_Q, scale_R)
     # A change of Q by eps is within the rounding of the data. One by the root of eps
     # moves eigenvalues off the boundary by about eps^(1/4).
-    change = jnp.where(kind == PERTURBED, -10 * n * eps * size_Q, 0)
-    change = jnp.where(kind == REGULARISED, eps**0.5 * scale_Q, change)
+    change = xp.where(kind == PERTURBED, -10 * n * eps * size_Q, 0)
+    change = xp.where(kind == REGULARISED, eps**0.5 * scale_Q, change)
     unit = kind == UNIT
-    Q = jnp.where(unit, scale_Q * eye_Q, Q + change * eye_Q)
-    R = jnp.where(unit, scale_R * eye_R, R)
-    return data._replace(Q=Q, R=R, S=jnp.where(unit, 0, S)), scale_Q
+    Q = xp.where(unit, scale_Q * eye_Q, Q + change * eye_Q)
+    R = xp.where(unit, scale_R * eye_R, R)
+    return data._replace(Q=Q, R=R, S=xp.where(unit, 0, S)), scale_Q
 
 
 def units(data: RiccatiData) -> Float[Array, "2 n"]:
@@ -228,58 +227,58 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
 
     Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Hamiltonian).
     """
-    A, B, Q, R, _, E = lax.stop_gradient(data)
+    A, B, Q, R, _, E = stop_gradient(data)
     n, dtype = A.shape[0], A.dtype
-    lowest = jnp.finfo(dtype).minexp
+    lowest = xp.finfo(dtype).minexp
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
 
     def logarithm(M):
-        exponent = jnp.log2(M)
-        return jnp.where(jnp.isfinite(exponent), exponent, lowest)
+        exponent = xp.log2(M)
+        return xp.where(xp.isfinite(exponent), exponent, lowest)
 
     # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
     # each. All in base-2 logarithms.
-    effort = jnp.sqrt(_diagonal_sizes(R))
-    force = jnp.max(jnp.abs(plain_B) / one_if_zero(effort), axis=1)
-    weight = logarithm(jnp.sqrt(_diagonal_sizes(Q)))
-    other = ~jnp.eye(n, dtype=bool)
-    inside, force = logarithm(jnp.abs(plain_A) * other), logarithm(force)
+    effort = xp.sqrt(_diagonal_sizes(R))
+    force = xp.max(xp.abs(plain_B) / one_if_zero(effort), axis=1)
+    weight = logarithm(xp.sqrt(_diagonal_sizes(Q)))
+    other = ~xp.eye(n, dtype=bool)
+    inside, force = logarithm(xp.abs(plain_A) * other), logarithm(force)
 
     def more(carry):
         k, change, _ = carry
-        return (k < _SWEEPS) & (jnp.max(jnp.abs(change)) > 1 / 4)
+        return (k < _SWEEPS) & (xp.max(xp.abs(change)) > 1 / 4)
 
     def sweep(carry):
         k, _, d = carry
         moved = inside + d[:, None] - d
         forced, weighed = force + d, weight - d
         # The scale of the cost is free: it is chosen to make both blocks alike.
-        rows = jnp.maximum(jnp.max(moved, axis=1), forced + jnp.max(weighed))
-        columns = jnp.maximum(jnp.max(moved, axis=0), weighed + jnp.max(forced))
+        rows = xp.maximum(xp.max(moved, axis=1), forced + xp.max(weighed))
+        columns = xp.maximum(xp.max(moved, axis=0), weighed + xp.max(forced))
         # Half of the step that each state would take alone, as all move at once.
         change = (columns - rows) / 4
         # A zero row or column, with the logarithm `lowest`, asks for a huge step.
-        change = jnp.where(jnp.abs(change) < -lowest / 8, change, 0)
+        change = xp.where(xp.abs(change) < -lowest / 8, change, 0)
         return k + 1, change, d + change
 
-    start = jnp.zeros(n, dtype)
-    *_, d = lax.while_loop(more, sweep, (0, start + 1, start))
+    start = xp.zeros(n, dtype)
+    *_, d = while_loop(more, sweep, (0, start + 1, start))
     # A factor common to all states has no effect: it is removed to avoid overflow.
-    d -= jnp.mean(d)
+    d -= xp.mean(d)
     f = d
     if E is not None:
-        f = -jnp.max(logarithm(jnp.abs(E)) - d, axis=1)
-    both = jnp.stack([d, f])
-    badly_scaled = jnp.any(
-        jnp.max(both, axis=1) - jnp.min(both, axis=1) > _BALANCE_THRESHOLD
+        f = -xp.max(logarithm(xp.abs(E)) - d, axis=1)
+    both = xp.stack([d, f])
+    badly_scaled = xp.any(
+        xp.max(both, axis=1) - xp.min(both, axis=1) > _BALANCE_THRESHOLD
     )
-    both = jnp.where(badly_scaled, both, 0)
-    return power_of_two(jnp.exp2(both))
+    both = xp.where(badly_scaled, both, 0)
+    return power_of_two(xp.exp2(both))
 
 
 def _diagonal_sizes(M):
     # `jnp.diagonal` gathers, which is slower to compile.
-    return jnp.max(jnp.where(jnp.eye(len(M), dtype=bool), jnp.abs(M), 0), axis=1)
+    return xp.max(xp.where(xp.eye(len(M), dtype=bool), xp.abs(M), 0), axis=1)
 
 
 def in_units(by: Float[Array, "2 n"], data: RiccatiData) -> RiccatiData:

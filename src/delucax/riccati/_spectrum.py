@@ -2,10 +2,9 @@
 
 import math
 
-import jax.lax as lax
-import jax.numpy as jnp
 import numpy as np
 
+from .._jax import fori_loop, while_loop, xp
 from .._typing import Scalar, Square
 from ..math._norms import power_of_two, size
 
@@ -31,8 +30,8 @@ def spectral_radius(A: Square) -> Scalar:
     logarithm, is_narrow, span, _ = _growth(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         within, *_ = _growth(span.T @ A @ span, False)
-        logarithm = jnp.where(is_narrow, within, logarithm)
-    return jnp.exp(logarithm)
+        logarithm = xp.where(is_narrow, within, logarithm)
+    return xp.exp(logarithm)
 
 
 def spectral_abscissa(A: Square) -> Scalar:
@@ -52,16 +51,16 @@ def abscissa_and_size(
     if A.shape[0] > _LARGE:
         part = span.T @ A @ span
         # Directions left out come last.
-        part = part - jnp.diag(jnp.where(kept, 0, size(part)))
+        part = part - xp.diag(xp.where(kept, 0, size(part)))
         within, *_ = _slowest(balanced(part), False)
-        value = jnp.where(is_narrow, within, value)
+        value = xp.where(is_narrow, within, value)
     return value, size(A)
 
 
 def _slowest(A, probing):
     scale = size(A)
     # |exp(hA)^N|^(1/N) tends to exp(h abscissa), h > 0.
-    h = 0.25 / jnp.where(scale > 0, scale, 1)
+    h = 0.25 / xp.where(scale > 0, scale, 1)
     logarithm, *rest = _growth(_exponential(h * A), probing)
     return logarithm / h, *rest
 
@@ -70,11 +69,11 @@ def _exponential(A):
     """`exp(A)` for `|A| <= 1/4`, where the series is exact to rounding."""
     # By blocks of four terms, in Horner's way: six products for twelve terms
     # (Paterson and Stockmeyer, 1973).
-    powers = [jnp.eye(A.shape[0], dtype=A.dtype), A]
+    powers = [xp.eye(A.shape[0], dtype=A.dtype), A]
     while len(powers) < _BLOCK:
         powers.append(powers[-1] @ A)
     step = powers[-1] @ A
-    total = jnp.zeros_like(A)
+    total = xp.zeros_like(A)
     for start in reversed(range(0, _TAYLOR_DEGREE, _BLOCK)):
         terms = (powers[j] / math.factorial(start + j) for j in range(_BLOCK))
         total = total @ step + sum(terms)
@@ -85,16 +84,16 @@ def _growth(A, probing):
     """`log |A^N| / N` for a large `N`. If `probing`, also whether an earlier power has
     few directions left, a basis of them, and which of its columns are used."""
     n, dtype = A.shape[0], A.dtype
-    eps = float(jnp.finfo(dtype).eps)
+    eps = float(xp.finfo(dtype).eps)
     # Probes with a fixed seed: equal problems have equal results.
     count = max(n // 4 if n <= 64 else n // 16, min(n, _LARGE))
     probes = np.random.default_rng(0).normal(size=(n, count)) if probing else 0.0
-    probes = jnp.asarray(probes, dtype)
+    probes = xp.asarray(probes, dtype)
 
     def more(carry):
         *_, logarithm, weight, finished = carry
         # N = 1 / weight: for a log cond of up to 64 the bound is this close.
-        rough = 64 * weight > _DIGITS * jnp.maximum(jnp.abs(logarithm), eps)
+        rough = 64 * weight > _DIGITS * xp.maximum(xp.abs(logarithm), eps)
         return ~finished & rough & (weight > 0.5**_SQUARINGS)
 
     def body(carry):
@@ -102,24 +101,24 @@ def _growth(A, probing):
         grown = size(power)
         # A nilpotent matrix, whose radius is zero: no power of it is scaled any more.
         finished = ~(grown > 0)
-        scaled = power / jnp.where(finished, 1, grown)
+        scaled = power / xp.where(finished, 1, grown)
         # log |A^2N| / 2N is this sum, as each square is of a matrix of norm one.
-        logarithm = logarithm + weight * jnp.log(grown)
+        logarithm = logarithm + weight * xp.log(grown)
         if probing:
             # A basis of the range of the power, as the probes see it. What is as small
             # as the rounding of the rest is no direction of it.
-            basis, triangle = jnp.linalg.qr(scaled @ probes)
-            pivots = jnp.abs(jnp.diagonal(triangle))
-            kept = pivots > math.sqrt(eps) * jnp.max(pivots)
-            span = jnp.where(kept, basis, 0)
+            basis, triangle = xp.linalg.qr(scaled @ probes)
+            pivots = xp.abs(xp.diagonal(triangle))
+            kept = pivots > math.sqrt(eps) * xp.max(pivots)
+            span = xp.where(kept, basis, 0)
             left = size(scaled - span @ (span.T @ scaled))
             finished = finished | (left < 4 * math.sqrt(n) * eps)
         return scaled @ scaled, span, kept, logarithm, weight / 2, finished
 
-    zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
-    start = (A, probes, jnp.zeros(count, bool), zero, one, jnp.asarray(False))
-    _, span, kept, logarithm, _, finished = lax.while_loop(more, body, start)
-    return logarithm, finished & jnp.isfinite(logarithm), span, kept
+    zero, one = xp.zeros((), dtype), xp.ones((), dtype)
+    start = (A, probes, xp.zeros(count, bool), zero, one, xp.asarray(False))
+    _, span, kept, logarithm, _, finished = while_loop(more, body, start)
+    return logarithm, finished & xp.isfinite(logarithm), span, kept
 
 
 def balanced(A: Square) -> Square:
@@ -129,18 +128,18 @@ def balanced(A: Square) -> Square:
     """
 
     def sweep(_, scale):
-        scaled = jnp.abs(A) * scale[None, :] / scale[:, None]
-        off = scaled - jnp.diag(jnp.diagonal(scaled))
-        rows, columns = jnp.sum(off, axis=1), jnp.sum(off, axis=0)
+        scaled = xp.abs(A) * scale[None, :] / scale[:, None]
+        off = scaled - xp.diag(xp.diagonal(scaled))
+        rows, columns = xp.sum(off, axis=1), xp.sum(off, axis=0)
         usable = (rows > 0) & (columns > 0)
         # The square root of this ratio makes a row as large as its column.
-        ratio = jnp.where(usable, rows, 1) / jnp.where(usable, columns, 1)
+        ratio = xp.where(usable, rows, 1) / xp.where(usable, columns, 1)
         # All at once: half of the step that each would take alone.
         scale = scale * ratio**0.25
-        return scale / jnp.exp2(jnp.round(jnp.mean(jnp.log2(scale))))
+        return scale / xp.exp2(xp.round(xp.mean(xp.log2(scale))))
 
     # A fixed number of sweeps: balancing need not be exact.
-    scale = lax.fori_loop(0, 24, sweep, jnp.ones(A.shape[0], A.dtype))
-    usable = jnp.isfinite(scale) & (scale > 0)
-    scale = power_of_two(jnp.where(usable, scale, 1))
+    scale = fori_loop(0, 24, sweep, xp.ones(A.shape[0], A.dtype))
+    usable = xp.isfinite(scale) & (scale > 0)
+    scale = power_of_two(xp.where(usable, scale, 1))
     return A * scale[None, :] / scale[:, None]

@@ -4,10 +4,9 @@ import functools
 
 import equinox as eqx
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._jax import stop_gradient, xp
 from .._results import raise_on_failure, Result
 from .._typing import BoolScalar
 from ..math._linear_solve import (
@@ -100,7 +99,7 @@ class RiccatiSolution(eqx.Module):
         name, bound = ("abscissa", abscissa) if radius is None else ("radius", radius)
         return (
             f"Relative residual {float(self.residual):.1e}, spectral {name} of the "
-            f"closed loop {float(jnp.asarray(bound)):.6g}."
+            f"closed loop {float(xp.asarray(bound)):.6g}."
         )
 
 
@@ -126,9 +125,9 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
     solution = eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
-    data, X = lax.stop_gradient((data, real_form(solution.X)))
+    data, X = stop_gradient((data, real_form(solution.X)))
     bound = riccati_residual(discrete, data, X, True).bounds[0]
-    bound = jnp.where(jnp.isfinite(bound), bound, solution.residual)
+    bound = xp.where(xp.isfinite(bound), bound, solution.residual)
     return eqx.tree_at(lambda s: s.residual, solution, bound)
 
 
@@ -141,7 +140,7 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     solution = _certified(discrete, data, by)
     # The gain is a formula in X and the data, whose derivatives are then its own.
     K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
-    residual, bound = lax.stop_gradient((solution.best.unscaled, solution.best.bound))
+    residual, bound = stop_gradient((solution.best.unscaled, solution.best.bound))
     # Back to the user's units, by powers of two: without rounding.
     return RiccatiSolution(
         X=solution.X * (f[:, None] * f),
@@ -159,7 +158,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
     """The certified search for the stabilising `X`, for data in balanced units, `by`
     times the user's."""
     A, B, Q, R, S, E = data
-    n, eps = A.shape[0], float(jnp.finfo(A.dtype).eps)
+    n, eps = A.shape[0], float(xp.finfo(A.dtype).eps)
     # The starting points are computed for E^-1 A and E^-1 B.
     explicit = data
     if E is not None:
@@ -170,25 +169,25 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
     for M in explicit[:5]:
-        well_posed = well_posed & jnp.all(jnp.isfinite(M))
+        well_posed = well_posed & xp.all(xp.isfinite(M))
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array, balanced: Array) -> Attempt:
         # From balanced units to those of the attempt.
-        back = state, row = jnp.where(balanced, 1, 1 / by)
+        back = state, row = xp.where(balanced, 1, 1 / by)
         here, size_Q = weights(kind, in_units(back, data))
         start = here
         if E is not None:
             # Without E the rows have the units of the states.
-            plain = in_units(jnp.stack([state, state]), explicit)
+            plain = in_units(xp.stack([state, state]), explicit)
             start = here._replace(A=plain.A, B=plain.B)
         # Discrete time restarts from a higher point, continuous time by doubling in
         # place of the sign iteration.
         second = kind == SECOND
         if discrete:
-            height = size_Q * jnp.where(second, _SECOND_START, 1)
+            height = size_Q * xp.where(second, _SECOND_START, 1)
             X, iterations = discrete_start(start, height)
-            size_G = jnp.zeros_like(size_Q)  # needed in continuous time alone
+            size_G = xp.zeros_like(size_Q)  # needed in continuous time alone
         else:
             X, size_G, iterations = continuous_start(start, second)
         # Residuals in the attempt's, the user's and the balanced units.
@@ -204,8 +203,8 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             bound = spectral_radius(loop)
             # A stable loop may belong to a saddle point of an indefinite cost.
             weight = here.R + here.B.T @ X @ here.B
-            gap = jnp.where(is_semidefinite(weight), 1 - bound, -jnp.inf)
-            rounding, scale = jnp.asarray(n * eps, A.dtype), 1.0
+            gap = xp.where(is_semidefinite(weight), 1 - bound, -xp.inf)
+            rounding, scale = xp.asarray(n * eps, A.dtype), 1.0
             # Eigenvalues come in pairs z, 1/z. Where two meet on the circle, data that
             # change by rounding move them apart by its root.
             reach = 10 * eps**0.5
@@ -214,25 +213,25 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             gap, rounding = -bound, n * eps * scale
             # A change of Q by rounding moves eigenvalues on the axis off it by its
             # root.
-            reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
+            reach = xp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
             scale = size(loop)
         # All else is expressed in balanced units.
         balanced_X = X * (row[:, None] * row)
         size_loop = size(loop * (state / state[:, None]))
         gain = 1 + size_loop**2 if discrete else 2 * size_loop
         # A change dX by rounding causes a residual L'dX L - E'dX E, or E'dX L + L'dX E.
-        terms = jnp.where(left.terms[2] > 0, left.terms[2], jnp.inf)
+        terms = xp.where(left.terms[2] > 0, left.terms[2], xp.inf)
         return Attempt(
             Candidate(balanced_X, left.bounds[2], left.bounds[1], bound, gap),
             rounding=rounding,
-            near=jnp.abs(gap) < reach,
-            around=jnp.abs(gap) < 4 * eps**0.125 * scale,
+            near=xp.abs(gap) < reach,
+            around=xp.abs(gap) < 4 * eps**0.125 * scale,
             attainable=8 * eps * size(balanced_X) * gain * magnified / terms,
             bounded=size(X) * eps**0.5 < size_Q,
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), well_posed, jnp.any(by != 1))
+    return search(attempt, xp.full_like(Q, xp.nan), well_posed, xp.any(by != 1))
 
 
 @_certified.defjvp
@@ -243,17 +242,17 @@ def _certified_jvp(discrete, primals, tangents):
     solution = _certified(discrete, *primals)
     ok = solution.differentiable
     # Masked at input and output, so that a failed member's NaN does not spread.
-    tangent = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents[0])
+    tangent = jax.tree.map(lambda t: xp.where(ok, t, 0), tangents[0])
     safe, X = _harmless(ok, data, solution.X)
     # The derivative of the equation in X is the Lyapunov operator of the closed loop:
     # dX solves a Lyapunov equation whose constant is the derivative in the data.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
     # -I/2 is stable in both times, and its Lyapunov equation converges fast.
-    loop = jnp.where(ok, loop, shifted(-0.5, loop))
-    change = _correction(discrete, data.E, loop, jnp.where(ok, error, 0))
+    loop = xp.where(ok, loop, shifted(-0.5, loop))
+    change = _correction(discrete, data.E, loop, xp.where(ok, error, 0))
     still = no_tangent(solution)
-    best = still.best._replace(X=jnp.where(ok, change, 0))
+    best = still.best._replace(X=xp.where(ok, change, 0))
     return solution, still._replace(best=best)
 
 
@@ -289,7 +288,7 @@ def _feedback(discrete: bool, ok: BoolScalar, data: RiccatiData, X: Array):
 @full_precision
 def _feedback_jvp(discrete, primals, tangents):
     ok, *at = primals
-    if_ok = lambda tree: jax.tree.map(lambda M: jnp.where(ok, M, 0), tree)
+    if_ok = lambda tree: jax.tree.map(lambda M: xp.where(ok, M, 0), tree)
     terms = lambda *at: _terms(discrete, *at)[2:]
     _, tangent = jax.jvp(terms, _harmless(ok, *at), if_ok(tangents[1:]))
     return _feedback(discrete, *primals), if_ok(tangent)
@@ -314,7 +313,7 @@ def _outside(E: Array | None, Y: Array) -> Array:
 
 def is_semidefinite(weight: Array, units: int = 100) -> BoolScalar:
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
-    rounding = weight.shape[0] * jnp.finfo(weight.dtype).eps
+    rounding = weight.shape[0] * xp.finfo(weight.dtype).eps
     # The shift makes a zero eigenvalue positive, as Cholesky's factorisation needs, and
     # leaves a negative one that is more than rounding.
     slack = units * rounding * one_if_zero(size(weight))
@@ -323,4 +322,4 @@ def is_semidefinite(weight: Array, units: int = 100) -> BoolScalar:
 
 def shifted(c, like: Array) -> Array:
     """`c I`."""
-    return c * jnp.eye(like.shape[0], dtype=like.dtype)
+    return c * xp.eye(like.shape[0], dtype=like.dtype)
