@@ -204,41 +204,50 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     """The residual in more digits, and entry by entry the sharper bound.
 
     The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
-    place at which their matrix stands in the equation.
+    place at which their matrix stands in the equation. One product gives all of them
+    and the sum.
     """
     N, L, T, Y, Z = working
     n, m = B.shape
-    eps = xp.finfo(A.dtype).eps
-    stacked = xp.concatenate
+    eps, nothing = xp.finfo(A.dtype).eps, xp.zeros_like(X)
+    right = dict(N=N, L=L, Y=Y, T=T)
+    if E is not None:
+        right |= dict(E=E, Z=Z)
+
+    def row(**factors):
+        """The row of a block matrix with these factors of N, L, ..."""
+        rows = len(next(iter(factors.values())))
+        blocks = (
+            factors.get(name, xp.zeros((rows, len(M)), A.dtype))
+            for name, M in right.items()
+        )
+        return xp.concatenate(list(blocks), axis=1)
+
+    # Each row: its factors, what is added, what is subtracted; and how a rest stands
+    # in the equation.
+    rows = [(row(N=B), A, L, 2 * Y), (row(N=R), S.T, T, N)]
     if discrete:
-        terms, of_X, added = [(L, Y), (S.T, N), (N, T)], [(L, Y, L)], [Q]
-        if E is None:
-            added.append(-X)
-        else:
-            terms.append((-E, Z))
-            of_X.append((E, Z, -E))
+        rows.append((row(L=X), nothing, Y, L))
+    if E is not None:
+        rows.append((row(E=X), nothing, Z, -E if discrete else 2 * L))
+    if not discrete:
+        whole = row(N=S, L=Y.T, Y=L.T, T=N.T)
+    elif E is None:
+        whole = row(N=S, Y=L.T, T=N.T)
     else:
-        terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
-        of_X = [] if E is None else [(E, Z, 2 * L)]
-    # Pairs of a rest and the bound on its error. With S and R stacked under A and B one
-    # product gives the rests of both L and T.
-    pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
-    rests = list(zip(*(xp.split(M, [n]) for M in pair), strict=True))
-    if of_X:
-        rights, wholes, _ = (stacked(M, axis=1) for M in zip(*of_X, strict=True))
-        pair = product(X, rights, -wholes)
-        rests += zip(*(xp.split(M, len(of_X), axis=1) for M in pair), strict=True)
-    factor = stacked([2 * Y, N, *(M for *_, M in of_X)]).T
-    rest, rest_lost = (stacked(M) for M in zip(*rests, strict=True))
+        whole = row(N=S, Y=L.T, T=N.T, Z=-E.T)
+    rows.append((whole, Q, X if discrete and E is None else nothing, nothing))
+    left, added, subtracted, factor = (xp.concatenate(M) for M in zip(*rows, strict=True))
+    value, rounding = product(left, xp.concatenate([*right.values()]), added, -subtracted)
+    rest, rest_lost, factor = value[:-n], rounding[:-n], factor[:-n].T
     sizes = xp.abs(rest)
     most = sizes + rest_lost
-    left, right = (stacked(M) for M in zip(*terms, strict=True))
-    error, lost = product(left.T, right, *added)
-    error += factor @ rest
+    error = value[-n:] + factor @ rest
+    lost = rounding[-n:]
     lost += xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
     # The second-order terms: an error of L times an error of the factor beside it.
     most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * xp.abs(Y)
-    if of_X:
+    if len(most) > n + m:
         most_Y = most[n + m : 2 * n + m]
         around += most_Y
         lost += 2 * most_L.T @ most_Y
