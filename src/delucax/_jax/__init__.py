@@ -17,6 +17,7 @@ from ._derivatives import (
 from ._host import (
     fori_loop as fori_loop,
     host_unless_traced as host_unless_traced,
+    numbers as numbers,
     on_host as on_host,
     scan as scan,
     stop_gradient as stop_gradient,

@@ -122,3 +122,19 @@ def vmap(function: _F) -> _F:
 def stop_gradient(tree: _C) -> _C:
     """`lax.stop_gradient`."""
     return tree if _ON_HOST.get() else lax.stop_gradient(tree)
+
+
+def numbers(*values: Any, dtype: Any) -> Any:
+    """Numbers and flags as one vector.
+
+    XLA compiles each operand of a concatenation as a program of its own, and these
+    selects as one.
+    """
+    if _ON_HOST.get():
+        return np.array([float(value) for value in values], dtype)
+    # A constant: comparisons with an iota would be moved out of a loop, one by one.
+    place = np.arange(len(values))
+    vector = jnp.zeros(len(values), dtype)
+    for k, value in enumerate(values):
+        vector = jnp.where(place == k, jnp.asarray(value, dtype), vector)
+    return vector
