@@ -4,12 +4,13 @@ perturbed problems that tell why there is no solution."""
 from collections.abc import Callable
 from typing import NamedTuple
 
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from .._jax import numbers, stop_gradient, while_loop, xp
+from .._jax import entry, numbers, stop_gradient, while_loop, xp
 from .._results import choose, Result, RESULTS
-from .._typing import BoolScalar, Scalar
+from .._typing import Array, BoolScalar, Scalar
 from ..math._linear_solve import solve
+from ..math._lyapunov import MAX_DOUBLINGS
 from ..math._norms import one_if_zero, power_of_two, size
 from ._arguments import RiccatiData
 from ._residual import tolerance
@@ -141,7 +142,9 @@ def search(
         undecided = undecided & (at.residual <= close) & at.bounded
         # The gap of a robust solution hardly changes with Q; that of a marginal one
         # changes by as much as itself.
+        # So does that of rounding by chance, but no doubling converges to it.
         same = xp.abs(at.gap - before.gap) <= _GAP_TOLERANCE * before.gap
+        same = same & (at.iterations < MAX_DOUBLINGS)
         marginal = (before.marginal > 0) & ~(unchanged & solved)
         marginal = xp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
@@ -151,7 +154,7 @@ def search(
             kind == REGULARISED, survives & at.around, before.on_boundary > 0
         )
         success = xp.where(unchanged, solved, ~marginal & (~unit | survives))
-        following = xp.asarray(_NEXT, dtype)[kind.astype(int), success.astype(int)]
+        following = entry(xp.asarray(_NEXT), kind.astype(int), success.astype(int))
         kept = lambda new, old: xp.where(take, new, old)
         after = Verdict(
             kind=xp.where(unchanged & solved & ~at.near, DONE, following),
@@ -242,7 +245,7 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     start = xp.zeros(n, dtype)
     *_, d = while_loop(more, sweep, (0, start + 1, start))
     # A factor common to all states has no effect: it is removed to avoid overflow.
-    d -= xp.mean(d)
+    d = d - xp.mean(d)
     f = d
     if E is not None:
         f = -xp.max(logarithm(xp.abs(E)) - d, axis=1)

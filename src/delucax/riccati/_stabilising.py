@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-from jaxtyping import Array
 
-from .._jax import stop_gradient, xp
+from .._jax import compiled_unless_on_host, custom_jvp, stop_gradient, xp
 from .._results import raise_on_failure, Result
-from .._typing import BoolScalar, Square
+from .._typing import Array, BoolScalar, Square
 from ..math._linear_solve import (
     factorised,
     full_precision,
@@ -107,7 +106,7 @@ def stabilising_solution(
     return raise_on_failure(solution, where, throw, facts=solution._facts)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
     """The solution in complex form, with a new residual bound: rounding may have left
@@ -123,7 +122,7 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
     return eqx.tree_at(lambda s: s.residual, solution, bound)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     """The solution, computed with states in units that fit."""
@@ -157,7 +156,7 @@ class _Solved(NamedTuple):
         return stable & xp.all(xp.isfinite(self.X)) & self.well_posed
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(custom_jvp, nondiff_argnums=(0,))
 def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
     """The certified search for the stabilising `X`, for data in balanced units, `by`
     times the user's."""
@@ -181,7 +180,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
         # place of the sign iteration.
         second = kind == SECOND
         if discrete:
-            height = size_Q * xp.where(second, _SECOND_START, 1)
+            height = xp.where(second, _SECOND_START * size_Q, size_Q)
             X, iterations = discrete_start(start, height)
             size_G = xp.zeros_like(size_Q)  # needed in continuous time alone
         else:
