@@ -114,7 +114,7 @@ def riccati_residual(
     units = xp.stack([xp.ones(n, dtype), *others])
     relative, sizes = vmap(in_units)(units)
     bounds = _MARGIN * relative[:, 1]
-    relative = xp.where(needed, bounds[0], relative[0, 0])
+    relative = xp.max(xp.where(needed, bounds, relative[:, 0]))
     return Residual(error, relative, bounds, K, closed_loop, sizes)
 
 

@@ -179,7 +179,9 @@ def search(
     return while_loop(going, body, (point, numbers(*nothing, dtype=dtype)))
 
 
-def weights(kind: Scalar, data: RiccatiData) -> tuple[RiccatiData, Scalar]:
+def weights(
+    kind: Scalar, data: RiccatiData, by: Float[Array, " n"]
+) -> tuple[RiccatiData, Scalar]:
     """The data of an attempt of this kind, and the size of the state weight."""
     Q, R, S = data.Q, data.R, data.S
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
@@ -191,7 +193,8 @@ def weights(kind: Scalar, data: RiccatiData) -> tuple[RiccatiData, Scalar]:
     scale_Q = xp.where(size_Q > 0, size_Q, scale_R)
     # A change of Q by eps is within the rounding of the data. One by the root of eps
     # moves eigenvalues off the boundary by about eps^(1/4).
-    change = xp.where(kind == PERTURBED, -10 * n * eps * size_Q, 0)
+    users = size(Q * (by[:, None] * by)) / by**2
+    change = xp.where(kind == PERTURBED, -10 * n * eps * users, 0)
     change = xp.where(kind == REGULARISED, eps**0.5 * scale_Q, change)
     unit = kind == UNIT
     Q = xp.where(unit, scale_Q * eye_Q, Q + change * eye_Q)
@@ -218,12 +221,14 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
         return xp.where(xp.isfinite(exponent), exponent, lowest)
 
     # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
-    # each. All in base-2 logarithms.
+    # each, and that of the cost, which is free: one more row and column, of which the
+    # factor balances the two. All in base-2 logarithms.
     effort = xp.sqrt(_diagonal_sizes(R))
     force = xp.max(xp.abs(plain_B) / one_if_zero(effort), axis=1)
-    weight = logarithm(xp.sqrt(_diagonal_sizes(Q)))
-    other = ~xp.eye(n, dtype=bool)
-    inside, force = logarithm(xp.abs(plain_A) * other), logarithm(force)
+    weight = xp.concatenate([xp.sqrt(_diagonal_sizes(Q)), xp.zeros(1, dtype)])
+    table = xp.concatenate([xp.abs(plain_A), force[:, None]], axis=1)
+    table = xp.concatenate([table, weight[None]])
+    table = logarithm(xp.where(xp.eye(n + 1, dtype=bool), 0, table))
 
     def more(carry):
         k, change, _ = carry
@@ -231,21 +236,17 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
 
     def sweep(carry):
         k, _, d = carry
-        moved = inside + d[:, None] - d
-        forced, weighed = force + d, weight - d
-        # The scale of the cost is free: it is chosen to make both blocks alike.
-        rows = xp.maximum(xp.max(moved, axis=1), forced + xp.max(weighed))
-        columns = xp.maximum(xp.max(moved, axis=0), weighed + xp.max(forced))
-        # Half of the step that each state would take alone, as all move at once.
-        change = (columns - rows) / 4
+        moved = table + d[:, None] - d
+        # Half of the step that each would take alone, as all move at once.
+        change = (xp.max(moved, axis=0) - xp.max(moved, axis=1)) / 4
         # A zero row or column, with the logarithm `lowest`, asks for a huge step.
         change = xp.where(xp.abs(change) < -lowest / 8, change, 0)
         return k + 1, change, d + change
 
-    start = xp.zeros(n, dtype)
+    start = xp.zeros(n + 1, dtype)
     *_, d = while_loop(more, sweep, (0, start + 1, start))
     # A factor common to all states has no effect: it is removed to avoid overflow.
-    d = d - xp.mean(d)
+    d = d[:n] - xp.mean(d[:n])
     f = d
     if E is not None:
         f = -xp.max(logarithm(xp.abs(E)) - d, axis=1)
@@ -253,8 +254,7 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     badly_scaled = xp.any(
         xp.max(both, axis=1) - xp.min(both, axis=1) > _BALANCE_THRESHOLD
     )
-    both = xp.where(badly_scaled, both, 0)
-    return power_of_two(xp.exp2(both))
+    return power_of_two(xp.exp2(xp.where(badly_scaled, both, 0)))
 
 
 def _diagonal_sizes(M):

@@ -168,13 +168,13 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
     well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
-    # NaN and infinity, times zero, are NaN, which any sum keeps.
-    finite = sum(xp.sum(0 * M) for M in (*plain, Q, R, S))
-    well_posed = well_posed & (finite == 0)
+    # NaN and infinity, times zero, are NaN, which any sum keeps. R passed a comparison.
+    given = xp.concatenate([plain[0], Q, plain[1].T, S.T])
+    well_posed = well_posed & (xp.sum(0 * given) == 0)
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array) -> Attempt:
-        here, size_Q = weights(kind, data)
+        here, size_Q = weights(kind, data, by)
         start = here._replace(A=plain[0], B=plain[1])
         # Discrete time restarts from a higher point, continuous time by doubling in
         # place of the sign iteration.
