@@ -18,6 +18,9 @@ from ._arguments import RiccatiData
 _MARGIN = 1.01
 """Covers the rounding of the norms that a residual is the quotient of."""
 _NEWTON_STEPS = 8
+_FEW = 2**13
+"""Up to so many scalar products in an accurate residual it is taken at once: it is as
+fast as one in working precision."""
 _FINE = 64
 """Units of rounding in the relative residual that need no correction."""
 
@@ -90,13 +93,22 @@ def riccati_residual(
         terms.append(cross[:, first:] @ K[first:])
 
     working = _working(discrete, data, X, K)
-    left = _evaluated(discrete, *data, X, *working)
     closed_loop = working[1] if E is None else solve(E, working[1])
     needed = xp.asarray(accurately)
-    if accurately is not False:
+    if accurately is True:
+        left = _sharper(discrete, *data, X, *working)
+    else:
+        left = _evaluated(discrete, *data, X, *working)
+    if not isinstance(accurately, bool):
 
-        def sharper(left, X, K):
-            return _sharper(discrete, *data, X, _working(discrete, data, X, K), left)
+        def sharper(wide, X, K):
+            left = _sharper(discrete, *data, X, *_working(discrete, data, X, K))
+            # Where nothing cancels the first bound may be the sharper one.
+            better = left.lost < wide.lost
+            error, lost = (xp.where(better, *pair) for pair in zip(left[:2], wide[:2]))
+            return _Left(
+                error, lost, wide.gap, xp.minimum(left.gap_lost, wide.gap_lost)
+            )
 
         left = if_needed(needed, sharper, left, (X, K))
     error, lost, gap, gap_lost = left
@@ -116,6 +128,12 @@ def riccati_residual(
     bounds = _MARGIN * relative[:, 1]
     relative = xp.max(xp.where(needed, bounds, relative[:, 0]))
     return Residual(error, relative, bounds, K, closed_loop, sizes)
+
+
+def is_small(B: Array) -> bool:
+    """Whether an accurate residual costs no more than one in working precision."""
+    n, m = B.shape
+    return (3 * n + 2 * m) * 2 * (n + m) * n <= _FEW
 
 
 def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tuple):
@@ -209,14 +227,13 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     return _Left(error, lost, B.T @ Y + T, gap_lost)
 
 
-def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
-    """The residual in more digits, and entry by entry the sharper bound.
+def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
+    """The residual in more digits.
 
     The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
     place at which their matrix stands in the equation. One product gives all of them
     and the sum.
     """
-    N, L, T, Y, Z = working
     n, m = B.shape
     eps, nothing = xp.finfo(A.dtype).eps, xp.zeros_like(X)
     right = dict(N=N, L=L, Y=Y, T=T)
@@ -269,15 +286,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
         around = around + from_L
         lost = lost + most_L.T @ from_L
     gap_lost = xp.abs(B.T) @ around + most_T + (n + 4) * eps * xp.abs(T)
-    lost = symmetric(lost)
-    # Where nothing cancels the first bound may be the sharper one.
-    sharper = lost < wide.lost
-    return _Left(
-        xp.where(sharper, symmetric(error), wide.error),
-        xp.where(sharper, lost, wide.lost),
-        wide.gap,
-        xp.minimum(gap_lost, wide.gap_lost),
-    )
+    return _Left(symmetric(error), symmetric(lost), B.T @ Y + T, gap_lost)
 
 
 def _twice(M):

@@ -27,7 +27,13 @@ from ._arguments import (
     where_solved,
 )
 from ._doubling import continuous_start, discrete_start
-from ._residual import matrices_of, newton_refine, riccati_residual, stationary
+from ._residual import (
+    is_small,
+    matrices_of,
+    newton_refine,
+    riccati_residual,
+    stationary,
+)
 from ._search import Attempt, in_units, search, SECOND, units, Verdict, weights
 from ._spectrum import abscissa_and_size, spectral_radius
 
@@ -171,6 +177,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
     # NaN and infinity, times zero, are NaN, which any sum keeps. R passed a comparison.
     given = xp.concatenate([plain[0], Q, plain[1].T, S.T])
     well_posed = well_posed & (xp.sum(0 * given) == 0)
+    small = is_small(B)
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array) -> Attempt:
@@ -187,11 +194,12 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
             X, size_G, iterations = continuous_start(start, second)
         # Residuals in the balanced and in the user's units.
         left = newton_refine(
-            lambda *at: riccati_residual(discrete, here, *at, by),
+            lambda X, flag: riccati_residual(discrete, here, X, small or flag, by),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
             controls=here.B.shape[1],
             units=2,
+            to_working_precision=small,
         )
         X, loop = left.X, left.closed_loop
         if discrete:
