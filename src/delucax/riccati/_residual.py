@@ -105,7 +105,8 @@ def riccati_residual(
             left = _sharper(discrete, *data, X, *_working(discrete, data, X, K))
             # Where nothing cancels the first bound may be the sharper one.
             better = left.lost < wide.lost
-            error, lost = (xp.where(better, *pair) for pair in zip(left[:2], wide[:2]))
+            error = xp.where(better, left.error, wide.error)
+            lost = xp.minimum(left.lost, wide.lost)
             return _Left(
                 error, lost, wide.gap, xp.minimum(left.gap_lost, wide.gap_lost)
             )

@@ -183,15 +183,12 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
     def attempt(kind: Array) -> Attempt:
         here, size_Q = weights(kind, data, by)
         start = here._replace(A=plain[0], B=plain[1])
-        # Discrete time restarts from a higher point, continuous time by doubling in
-        # place of the sign iteration.
-        second = kind == SECOND
         if discrete:
-            height = xp.where(second, _SECOND_START * size_Q, size_Q)
+            height = xp.where(kind == SECOND, _SECOND_START * size_Q, size_Q)
             X, iterations = discrete_start(start, height)
             size_G = xp.zeros_like(size_Q)  # needed in continuous time alone
         else:
-            X, size_G, iterations = continuous_start(start, second)
+            X, size_G, iterations = continuous_start(start, kind)
         # Residuals in the balanced and in the user's units.
         left = newton_refine(
             lambda X, flag: riccati_residual(discrete, here, X, small or flag, by),
