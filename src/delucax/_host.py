@@ -152,23 +152,24 @@ def scan(body: Callable, start: Any, xs: Any, *, reverse: bool = False) -> Any:
     """`lax.scan`, of a given length."""
     if not _ON_HOST.get():
         return jax.lax.scan(body, start, xs, reverse=reverse)
-    leaves, structure = jax.tree.flatten(xs)
-    steps = range(len(leaves[0]))
     rows = []
-    for k in reversed(steps) if reverse else steps:
-        here = jax.tree.unflatten(structure, [leaf[k] for leaf in leaves])
+    for here in reversed(_rows(xs)) if reverse else _rows(xs):
         start, row = body(start, here)
         rows.append(row)
-    if reverse:
-        rows.reverse()
-    return start, _stacked(rows)
+    return start, _stacked(rows[::-1] if reverse else rows)
 
 
 def vmap(function: _F) -> _F:
     """`jax.vmap` over the first axis of every argument."""
     if not _ON_HOST.get():
         return jax.vmap(function)
-    return lambda *args: _stacked([function(*row) for row in zip(*args, strict=True)])
+    return lambda *args: _stacked([function(*row) for row in _rows(args)])
+
+
+def _rows(tree: Any) -> list:
+    """The trees of the rows of all arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    return [jax.tree.unflatten(structure, row) for row in zip(*leaves, strict=True)]
 
 
 def _stacked(rows: list) -> Any:

@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool
 
@@ -163,12 +164,13 @@ def raise_on_failure(
     if not throw:
         return solution
     result = solution.result
-    failed = result != RESULTS.successful
-    if isinstance(failed, Tracer):
+    if isinstance(result._value, Tracer):
+        failed = result != RESULTS.successful
         # As `result.error_if` does, with the name before each message.
         words = [f"{where}: {m}" for m in result._enumeration._index_to_message]
         return eqx.branched_error_if(solution, failed, result._value, words)
-    if failed:
+    # Compared by NumPy: JAX would compile a program.
+    if np.asarray(result._value) != RESULTS.successful._value:
         words = (
             f"{where}: {RESULTS[result]}",
             facts(),

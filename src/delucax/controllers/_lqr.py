@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Float, PyTree
 
 from .._check import as_matrix, check_count, check_instance, check_step
 from .._controller import AbstractController
-from .._module import function_field, parameter, weight
-from .._typing import Difference, Numbers, PRNGKey, RealScalar
+from .._jax import host_unless_traced, xp
+from .._module import as_float_array, function_field, parameter, weight
+from .._typing import Array, Difference, Numbers, PRNGKey, RealScalar
 from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
@@ -136,10 +137,8 @@ class LQR(AbstractController):
         solution = dare(linear.A, linear.B, Q, R, S)
         self.K, self.P, self.feed_forward = solution.K, solution.X, None
         if is_known:
-            B, P = linear.B, solution.X
-            # (R + B'PB)^-1 B', once: the weight of each control by what it does to the
-            # cost to go.
-            M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
+            P = solution.X
+            M = _effect(as_float_array(R), linear.B, P)
             signals = KnownSignals(linear, *given, difference)
             self.feed_forward = Preview(signals, P, M, solution.closed_loop, preview)
 
@@ -267,14 +266,8 @@ class LQI(AbstractController):
         self.u_ref, self.dt, self.difference = dynamics.u_ref, dynamics.dt, difference
         self.output = C.astype(dynamics.A.dtype)
         self.reference = as_signal(where, reference, p, "reference")
-        # `z_next = z - dt C e`, below the plant: the reference drops out of the design.
-        integrals = [-dynamics.dt * C, jnp.eye(p, dtype=C.dtype)]
-        A = jnp.block([[dynamics.A, jnp.zeros((n, p), C.dtype)], integrals])
-        B = jnp.concatenate([dynamics.B, jnp.zeros((p, m), C.dtype)])
-        # z integrates r - C x. Where a textbook integrates C x - r (Åström and Murray,
-        # 2008), its Ki has the other sign.
-        solution = dare(A, B, Q, R, S)
-        self.K, self.Ki, self.P = solution.K[:, :n], solution.K[:, n:], solution.X
+        model = dynamics.A, dynamics.B, C, dynamics.dt
+        self.K, self.Ki, self.P = _with_integral(*model, Q, R, S)
 
     def __check_init__(self):
         check_step(self.dt, "LQI")
@@ -311,3 +304,24 @@ class LQI(AbstractController):
         limited = jnp.any(excess != 0)
         integral = jnp.where(limited, state.integral + change, state.integral)
         return state._replace(integral=integral)
+
+
+@host_unless_traced
+def _effect(R, B, P) -> Array:
+    """`(R + B'PB)^-1 B'`: the weight of each control by what it does to the cost to
+    go."""
+    return solve(R.astype(P.dtype) + B.T @ P @ B, B.T)
+
+
+@host_unless_traced
+def _with_integral(A, B, C, dt, Q, R, S) -> tuple[Array, Array, Array]:
+    """The gains of state and integral, and the solution of the Riccati equation."""
+    (n, m), p = B.shape, len(C)
+    # `z_next = z - dt C e`, below the plant: the reference drops out of the design.
+    integrals = [-dt * C, xp.eye(p, dtype=C.dtype)]
+    A = xp.block([[A, xp.zeros((n, p), C.dtype)], integrals])
+    B = xp.concatenate([B, xp.zeros((p, m), C.dtype)])
+    # z integrates r - C x. Where a textbook integrates C x - r (Åström and Murray,
+    # 2008), its Ki has the other sign.
+    solution = dare(A, B, Q, R, S)
+    return solution.K[:, :n], solution.K[:, n:], solution.X

@@ -6,11 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._check import check_instance, check_time_invariant, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._typing import Difference
+from .._jax import compiled_unless_on_host, host_unless_traced, xp
+from .._typing import Array, Difference
 from ..dynamics import LinearDynamics, linearize, OperatingPoint
 from ..math._norms import relative_drift
 from ..systems import LinearSystem
@@ -78,19 +79,23 @@ def operating_state(
         if x_ref.shape[0] == 1:
             return x_ref
         rule = f"{where}: dynamics must go from each operating point to the next"
-        off = jax.vmap(lambda a, b: deviation(a, b, difference))
-        drift = off(x_next[:-1], x_ref[1:])
+        x_next, after = x_next[:-1], x_ref[1:]
         A, B, x, u_ref = (a[:-1] for a in (A, B, x_ref, u_ref))
     else:
         rule = f"{where}: dynamics must rest at their operating point (x_next = x_ref)"
         hint = "`delucax.trim(system, x=..., u=...)` computes one that does; "
-        drift = deviation(x_next, x_ref, difference)
-    moved = _relative_drift(drift, A, B, x, u_ref)
-    # Negated, so that a NaN counts as motion.
-    moves = ~(moved <= _EQUILIBRIUM_TOLERANCE)
-    if not is_concrete(moves):
+        after = x_ref
+    if difference is None:
+        moved = _relative_drift(x_next, after, A, B, x, u_ref)
+    else:
+        off = difference if x_ref.ndim == 1 else jax.vmap(difference)
+        drift = off(x_next, after)
+        moved = _relative_drift(drift, jnp.zeros_like(drift), A, B, x, u_ref)
+    if not is_concrete(moved):
+        # Negated, so that a NaN counts as motion.
+        moves = ~(moved <= _EQUILIBRIUM_TOLERANCE)
         return eqx.error_if(x_ref, moves, f"{rule}.")
-    if moves:
+    if not float(moved) <= _EQUILIBRIUM_TOLERANCE:
         raise ValueError(
             f"{rule}, to {_EQUILIBRIUM_TOLERANCE:g} of the terms that move them; the "
             f"residual is {float(moved):.1e}. {hint}got x_ref {x_ref}, x_next {x_next}."
@@ -98,12 +103,13 @@ def operating_state(
     return x_ref
 
 
-@jax.jit
-def _relative_drift(drift, A, B, x, u):
+@host_unless_traced
+@compiled_unless_on_host
+def _relative_drift(x_next, after, A, B, x, u):
     """The residual of an equilibrium, relative to its terms."""
     # The derivative of x_next - x: what moves the state is J (x, u).
-    J = jnp.concatenate([A - jnp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
-    return relative_drift(drift, J, x, u, is_map=True)
+    J = xp.concatenate([A - xp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
+    return relative_drift(x_next - after, J, x, u, is_map=True)
 
 
 def deviation(x: Array, x_ref: Array, difference: Difference | None) -> Array:

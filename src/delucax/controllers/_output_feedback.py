@@ -5,13 +5,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import ArrayLike, Float, PyTree
 
 from .._check import check_instance
 from .._controller import AbstractController, check_controller, Tally
-from .._module import parameter
+from .._jax import host_unless_traced, xp
+from .._module import as_float_array, parameter
 from .._results import RESULTS
-from .._typing import Difference, Numbers, PRNGKey, RealScalar
+from .._typing import Array, Difference, Numbers, PRNGKey, RealScalar
 from ..dynamics import LinearDynamics
 from ..estimators import AbstractEstimator, KalmanFilter
 from ._lqr import LQR
@@ -188,16 +189,9 @@ class LQG(AbstractController):
         sensor: Any = dict(y_ref=y_ref, observation_difference=observation_difference)
         self.estimator = KalmanFilter(dynamics, W, V, **start, **sensor)
         self.average_cost = None
-        covariance = self.estimator.updated_covariance
-        if covariance is not None:
-            # Separation: the first term is the cost with the state known, the second
-            # that of the control du = -K (mean - x) which acts on the error of the
-            # estimate.
-            noise = self.estimator._noise(dynamics)
-            K, P, B = self.regulator.K, self.regulator.P, dynamics.B
-            # The weight of an error of the estimate.
-            weight = K.T @ (jnp.asarray(R) + B.T @ P @ B) @ K
-            self.average_cost = jnp.trace(P @ noise) + jnp.trace(weight @ covariance)
+        if self.estimator.updated_covariance is not None:
+            R = as_float_array(R)
+            self.average_cost = _average_cost(self.regulator, self.estimator, R)
 
     def __check_init__(self):
         check_instance(self.regulator, LQR, "regulator", "LQG")
@@ -222,3 +216,14 @@ class LQG(AbstractController):
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         return self._feedback.applied(u, cost, state)
+
+
+@host_unless_traced
+def _average_cost(regulator: LQR, estimator: KalmanFilter, R: Array) -> Array:
+    """The cost of a step of the linear-quadratic-Gaussian regulator on average."""
+    K, P, dynamics = regulator.K, regulator.P, estimator.dynamics
+    # Separation: the first term is the cost with the state known, the second that of
+    # the control du = -K (mean - x) which acts on the error of the estimate.
+    weight = K.T @ (R + dynamics.B.T @ P @ dynamics.B) @ K
+    error = estimator.updated_covariance
+    return xp.trace(P @ estimator._noise(dynamics)) + xp.trace(weight @ error)

@@ -75,8 +75,8 @@ class LinearDynamics(AbstractDynamics):
         n, m = B.shape[-2:]
         # What is constant is repeated along the time axis of A, so that one scan or one
         # index serves all.
-        x_ref = jnp.zeros(n, A.dtype) if self.x_ref is None else self.x_ref
-        u_ref = jnp.zeros(m, A.dtype) if self.u_ref is None else self.u_ref
+        x_ref = np.zeros(n, A.dtype) if self.x_ref is None else self.x_ref
+        u_ref = np.zeros(m, A.dtype) if self.u_ref is None else self.u_ref
         x_next = x_ref if self.x_next is None else self.x_next
         points = (as_float_array(point) for point in (x_ref, u_ref, x_next))
         self.x_ref, self.u_ref, self.x_next = (_over_time(p, 1, A) for p in points)

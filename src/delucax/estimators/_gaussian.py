@@ -7,7 +7,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float, PyTree
+import numpy as np
+from jaxtyping import Bool, Float, PyTree
 
 from .._check import (
     as_vector,
@@ -16,7 +17,16 @@ from .._check import (
     symmetric_matrix,
 )
 from .._controller import wrong_observation
-from .._typing import Control, Difference, Observation, PRNGKey, RealScalar, Scalar
+from .._jax import xp
+from .._typing import (
+    Array,
+    Control,
+    Difference,
+    Observation,
+    PRNGKey,
+    RealScalar,
+    Scalar,
+)
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._linear_solve import (
@@ -91,7 +101,7 @@ class Joint(eqx.Module):
         # Joseph's form, a sum of congruences: it stays semidefinite in rounding, where
         # the shorter P - G S G' may not, and it is stationary in G, so that an error of
         # the gain counts to second order only.
-        X = jnp.eye(len(G), dtype=self.P.dtype) if self.X is None else self.X
+        X = xp.eye(len(G), dtype=self.P.dtype) if self.X is None else self.X
         rest = X - G @ self.Z
         return symmetric(self._form(rest, rest) + G @ self.noise @ G.T)
 
@@ -102,6 +112,11 @@ def congruence(E: Float[Array, "n k"], W: Float[Array, "k k"]) -> Float[Array, "
     return symmetric(E @ W @ E.T)
 
 
+def noise_of_state(E: Array | None, W: Array) -> Array:
+    """The covariance of `E w`, `E` being the identity by default."""
+    return W if E is None else congruence(E, W)
+
+
 def _regular(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
     """A covariance made definite, and which of its entries vary.
 
@@ -109,10 +124,10 @@ def _regular(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, "
     does not vary is given the variance 1: nothing is correlated with it, so its gain
     is 0.
     """
-    variances = jnp.diagonal(S)
+    variances = xp.diagonal(S)
     varies = variances != 0
-    slack = S.shape[0] * float(jnp.finfo(S.dtype).eps)
-    return S + jnp.diag(jnp.where(varies, slack * variances, 1)), varies
+    slack = S.shape[0] * float(xp.finfo(S.dtype).eps)
+    return S + xp.diag(xp.where(varies, slack * variances, 1)), varies
 
 
 def square_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -161,10 +176,10 @@ class AbstractGaussianFilter(AbstractEstimator):
         k = dynamics.disturbance_size
         W = _covariance_matrix(self.W, k, "W", "the disturbance", where)
         V = _covariance_matrix(self.V, p, "V", "the observation", where)
-        default = jnp.zeros(n, W.dtype) if default is None else default
+        default = np.zeros(n, W.dtype) if default is None else default
         mean = default if mean is None else as_vector(mean, n, "mean", where)
         check_finite(mean, "mean", where)
-        P = jnp.eye(n, dtype=mean.dtype) if self.covariance is None else self.covariance
+        P = np.eye(n, dtype=mean.dtype) if self.covariance is None else self.covariance
         P = _covariance_matrix(P, n, "covariance", "the state", where)
         # One precision for all, because loops carry the belief and keep its types.
         dtype = jnp.result_type(mean, P, default, W, V)

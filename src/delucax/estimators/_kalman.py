@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._check import (
     as_vector,
@@ -18,10 +18,10 @@ from .._check import (
     check_time_invariant,
     is_concrete,
 )
-from .._jax import jacobian
+from .._jax import host_unless_traced, jacobian, xp
 from .._module import function_field, parameter, positive, weight
 from .._results import raise_on_failure, RESULTS
-from .._typing import Difference, Numbers, Real
+from .._typing import Array, Difference, Numbers, Real
 from ..dynamics import AbstractDynamics, LinearDynamics
 from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
@@ -29,6 +29,7 @@ from ._gaussian import (
     AbstractGaussianFilter,
     congruence,
     Joint,
+    noise_of_state,
     square_root,
 )
 
@@ -129,17 +130,9 @@ class KalmanFilter(AbstractGaussianFilter):
                 f"{where}: covariance must not be given with steady_state, of which it "
                 "follows."
             )
-        C, noise = self._C, self._noise(dynamics)
-        # The dual of the regulator's equation. Its X is the covariance before the
-        # observation, P_{k|k-1} in the textbooks, and L is the gain of the update on
-        # it, not the predictor's A L.
-        solution = filter_dare(dynamics.A, C, noise, self.V, throw=False)
-        what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
-        solution = raise_on_failure(solution, what, facts=solution._facts)
-        self.covariance = symmetric(solution.X).astype(self.mean.dtype)
-        joint = Joint(C @ self.mean, None, C, self.covariance, self.V)
-        self.L = joint.gain()
-        self.updated_covariance = joint.remainder(self.L)
+        self.covariance, self.L, self.updated_covariance = _steady_state(
+            dynamics.A, dynamics.C, dynamics.E, self.W, self.V, self.mean
+        )
 
     def __check_init__(self):
         _check_linear(self.dynamics)
@@ -158,7 +151,7 @@ class KalmanFilter(AbstractGaussianFilter):
 
     def _noise(self, here: LinearDynamics) -> Array:
         """The covariance that a step adds to that of the state."""
-        return self.W if here.E is None else congruence(here.E, self.W)
+        return noise_of_state(here.E, self.W)
 
     def _observation(self, t, belief):
         dynamics = self.dynamics
@@ -185,6 +178,22 @@ class KalmanFilter(AbstractGaussianFilter):
 def _check_linear(dynamics: Any) -> None:
     hint = " (ExtendedKalmanFilter and UnscentedKalmanFilter take any)"
     check_instance(dynamics, LinearDynamics, "dynamics", "KalmanFilter", hint)
+
+
+@host_unless_traced
+def _steady_state(A, C, E, W, V, mean) -> tuple[Array, Array, Array]:
+    """The covariance before an observation, the gain, and the covariance after it."""
+    C = xp.eye(len(A), dtype=A.dtype) if C is None else C
+    # The dual of the regulator's equation. Its X is the covariance before the
+    # observation, P_{k|k-1} in the textbooks, and L is the gain of the update on it,
+    # not the predictor's A L.
+    solution = filter_dare(A, C, noise_of_state(E, W), V, throw=False)
+    what = "KalmanFilter: there is no steady state. Of A', C' in the places of A, B"
+    solution = raise_on_failure(solution, what, facts=solution._facts)
+    covariance = symmetric(solution.X).astype(mean.dtype)
+    joint = Joint(C @ mean, None, C, covariance, V)
+    L = joint.gain()
+    return covariance, L, joint.remainder(L)
 
 
 class _AbstractNonlinearFilter(AbstractGaussianFilter):

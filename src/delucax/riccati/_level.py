@@ -204,7 +204,7 @@ def bisect_level(
         # The cost of a unit disturbance, trace D'XD: the square of a typical level, at
         # which the bracket starts.
         X = game.X[1:] if D.ndim == 3 else game.X
-        effect = xp.einsum("...ik,...ij,...jk->", D, X, D)
+        effect = xp.sum(D * (X @ D))
         size = xp.linalg.norm(X) * xp.sum(D**2)
         slack = 10 * A.shape[-1] * xp.finfo(A.dtype).eps * size
         at_first = now._replace(
