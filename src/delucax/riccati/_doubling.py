@@ -7,11 +7,7 @@ from .._jax import while_loop, xp
 from .._typing import Array, Scalar, Square
 from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
-from ..math._norms import (
-    one_if_zero,
-    relative_and_total_size,
-    size,
-)
+from ..math._norms import largest, one_if_zero, size
 from ._arguments import RiccatiData
 from ._recursion import composed, Element, without_cross_weight
 from ._search import SECOND, UNIT
@@ -38,13 +34,13 @@ def continuous_start(data: RiccatiData, kind: Scalar) -> tuple[Array, Array, Arr
     """A solution by the sign iteration, for this kind of attempt; the size of
     `B R^-1 B'`; and the steps taken."""
     A, G, Q = without_cross_weight(*data[:5])
-    size_A, size_G, size_Q = size(A), one_if_zero(size(G)), one_if_zero(size(Q))
+    size_A, size_G, size_Q = (one_if_zero(size(M)) for M in (A, G, Q))
     # In a unit of X that makes the two quadratic blocks alike. If that fails, in the
     # size of X where the control is weak, and set by the unstable modes alone.
     unit = xp.where(kind == SECOND, size_A / size_G, xp.sqrt(size_Q / size_G))
     unit = xp.where(kind == UNIT, 1, one_if_zero(unit))
     X, steps = _by_sign(A, unit * G, Q / unit)
-    return unit * X, size(G), steps
+    return unit * X, size_G, steps
 
 
 def _by_sign(A, G, Q):
@@ -69,15 +65,16 @@ def _by_sign(A, G, Q):
     def body(carry):
         W, before, _, k = carry
         turned = J(solve(W, J(both)))
-        ratio = size(turned) / size(W)
+        ratio = largest(turned) / largest(W)
         # Scaling speeds up the way to the neighbourhood of the limit, where it would
         # keep the iteration from settling.
         scale = xp.where(before < 1e-2, 1, xp.sqrt(ratio))
         new = symmetric(scale * W + turned / scale) / 2
-        change = size(new - W) / size(new)
+        change = largest(new - W) / largest(new)
         # Convergence is quadratic: a small change that is not halved is rounding.
         stalled = (change < 1e-6) & (change > before / 2)
-        # A NaN compares false, so that a lane that diverges stops.
+        # A NaN compares false: at a singular W the iteration ends.
+        new = xp.where(change < xp.inf, new, W)
         going = (change > 10 * eps) & ~stalled
         return new, change, going, k + 1
 
@@ -106,17 +103,18 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
     def body(carry):
         before, _, k = carry
         after = composed(before, before)
-        finite = xp.all(xp.stack([xp.all(xp.isfinite(M)) for M in after]))
+        # NaN and infinity, times zero, are NaN, which a sum keeps.
+        finite = xp.sum(0 * sum(after)) == 0
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
             lambda new, old: xp.where(finite, new, old), after, before
         )
         # In units of X = X0 + J, of which J may be a small part.
-        changes = xp.stack([J - before[2], J])
-        (change, whole), _ = relative_and_total_size(changes, (X0 + J)[None])
+        change, whole = largest(J - before[2]), largest(J)
         # The next change is at most |A|^2 |J|.
-        relative = xp.minimum(change, size(A) ** 2 * whole)
+        next_change = (len(A) * largest(A)) ** 2 * whole
+        relative = xp.minimum(change, next_change) / one_if_zero(largest(X0 + J))
         return after, xp.where(finite, relative, 0), k + 1
 
     start = element, xp.asarray(xp.inf, X0.dtype), xp.asarray(0)

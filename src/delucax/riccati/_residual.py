@@ -320,7 +320,7 @@ class Refined(NamedTuple):
     """The best point of a refinement: `X`, its gain and closed loop one below the
     other; and its residual, as of `Residual`."""
 
-    point: Float[Array, "2*n+m n"]
+    point: Float[Array, "rows n"]
     relative: Scalar
     bounds: Float[Array, " units"]
     terms: Float[Array, " units"]
@@ -330,7 +330,7 @@ class Refined(NamedTuple):
     closed_loop = property(lambda self: matrices_of(self.point)[2])
 
 
-def matrices_of(point: Float[Array, "2*n+m n"]) -> tuple[Square, Array, Square]:
+def matrices_of(point: Float[Array, "rows n"]) -> tuple[Square, Array, Square]:
     """`X`, `K` and the closed loop."""
     n = point.shape[1]
     return point[:n], point[n:-n], point[-n:]
