@@ -98,58 +98,41 @@ class _Elimination(lx.AbstractLinearSolver):
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         del options
-        matrix = operator.as_matrix()
-        rows = xp.arange(len(matrix))
-
-        def step(carry, k):
-            matrix, done = carry
-            column = _entry(matrix, k, axis=1)
-            # The pivot is the largest entry in a row that has had none.
-            pivot = xp.argmax(xp.where(done, -1, xp.abs(column)))
-            here = rows == pivot
-            row = _entry(matrix, pivot) / _entry(column, pivot)
-            matrix = xp.where(here[:, None], row, matrix - column[:, None] * row)
-            return (matrix, done | here), (column, pivot)
-
-        _, steps = lax.scan(step, (matrix, xp.zeros(len(matrix), bool)), rows)
-        return steps, False
+        return operator.as_matrix()
 
     def compute(self, state, vector, options):
         del options
-        steps, transposed = state
-        _, pivots = steps
-        rows = xp.arange(len(vector))
+        n = len(vector)
+        rows = xp.arange(n)
 
-        def forward(x, step):
-            column, pivot = step
-            value = _entry(x, pivot) / _entry(column, pivot)
-            return xp.where(rows == pivot, value, x - column * value), None
-
-        def backward(x, step):
-            # The transposed steps, in reverse order.
-            column, pivot = step
+        # Of a batch of vectors with one matrix, the matrix is eliminated once.
+        def step(k, carry):
+            matrix, x, order = carry
+            column = _entry(matrix, k, axis=1)
+            # The pivot is the largest entry in a row that has had none.
+            pivot = xp.argmax(xp.where(order < n, -1, xp.abs(column)))
             here = rows == pivot
-            others = xp.sum(xp.where(here, 0, column * x))
-            value = (_entry(x, pivot) - others) / _entry(column, pivot)
-            return xp.where(here, value, x), None
+            value = _entry(column, pivot)
+            row, entry = _entry(matrix, pivot) / value, _entry(x, pivot) / value
+            matrix = xp.where(here[:, None], row, matrix - column[:, None] * row)
+            x = xp.where(here, entry, x - column * entry)
+            return matrix, x, xp.where(here, k, order)
 
-        if transposed:
-            x = xp.zeros_like(vector).at[pivots].set(vector, unique_indices=True)
-            x, _ = lax.scan(backward, x, steps, reverse=True)
-        else:
-            x, _ = lax.scan(forward, vector, steps)
-            x = x.at[pivots].get(mode="promise_in_bounds", unique_indices=True)
+        _, x, order = lax.fori_loop(0, n, step, (state, vector, xp.full(n, n)))
+        x = (
+            xp.zeros_like(x)
+            .at[order]
+            .set(x, mode="promise_in_bounds", unique_indices=True)
+        )
         return x, lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
         del options
-        steps, transposed = state
-        return (steps, not transposed), {}
+        return state.T, {}
 
     def conj(self, state, options):
         del options
-        (columns, pivots), transposed = state
-        return ((columns.conj(), pivots), transposed), {}
+        return state.conj(), {}
 
     def assume_full_rank(self):
         return True

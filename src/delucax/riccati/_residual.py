@@ -11,7 +11,7 @@ from .._jax import numbers, vmap, while_loop, xp
 from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts, units_of_sum
 from ..math._linear_solve import solve, symmetric
-from ..math._norms import relative_and_total_size
+from ..math._norms import largest, relative_and_total_size
 from ._arguments import RiccatiData
 
 
@@ -276,17 +276,16 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     error = value[-n:] + factor @ rest
     lost = rounding[-n:]
     lost = lost + xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
-    # The second-order terms: an error of L times an error of the factor beside it.
-    most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * xp.abs(Y)
-    if len(most) > n + m:
-        most_Y = most[n + m : 2 * n + m]
-        around = around + most_Y
-        lost = lost + 2 * most_L.T @ most_Y
+    # The second-order terms, an error of L times one of the factor beside it, are far
+    # below those of the first order: the largest entries will do.
+    error_L, around = largest(most[:n]), (n + 4) * eps * xp.abs(Y)
     if discrete:
-        from_L = xp.abs(X) @ most_L
-        around = around + from_L
-        lost = lost + most_L.T @ from_L
-    gap_lost = xp.abs(B.T) @ around + most_T + (n + 4) * eps * xp.abs(T)
+        beside = largest(most[n + m : 2 * n + m]) + n * largest(X) * error_L
+        lost, around = lost + 2 * n * error_L * beside, around + beside
+    elif E is not None:
+        beside = largest(most[n + m :])
+        lost, around = lost + 2 * n * error_L * beside, around + beside
+    gap_lost = xp.abs(B.T) @ around + most[n : n + m] + (n + 4) * eps * xp.abs(T)
     return _Left(symmetric(error), symmetric(lost), B.T @ Y + T, gap_lost)
 
 
