@@ -1,6 +1,6 @@
 """Performance on CPU and derivatives by JAX internals: jaxprs, custom primitives."""
 
-from ._batches import by_lanes as by_lanes, fence as fence
+from ._batches import by_lanes as by_lanes, fence as fence, matmul as matmul
 from ._components import (
     by_components as by_components,
     COMPONENTS_UP_TO as COMPONENTS_UP_TO,

@@ -7,7 +7,7 @@ import jax.lax as lax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._jax import scan, xp
+from .._jax import matmul, scan, xp
 from ._norms import power_of_two
 
 
@@ -118,7 +118,7 @@ def product_in_parts(
     """
     k = left.shape[1]
     if k < _LONG:
-        return left @ right, k
+        return matmul(left, right), k
     length = -(-k // _PARTS)
     pad = _PARTS * length - k
     left = xp.pad(left, ((0, 0), (0, pad))).reshape(len(left), _PARTS, length)

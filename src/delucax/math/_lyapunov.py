@@ -5,7 +5,7 @@ import jax.lax as lax
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-from .._jax import scan, stop_gradient, while_loop, xp
+from .._jax import matmul, scan, stop_gradient, while_loop, xp
 from .._typing import Scalar, Square
 from ._linear_solve import factorised, full_precision, symmetric
 from ._norms import relative_size
@@ -53,11 +53,11 @@ def smith(
     def body(carry):
         X, powers, _, k = carry
         left, right = powers if len(powers) == 2 else (powers[0], powers[0].T)
-        change = left @ X @ right
+        change = matmul(matmul(left, X), right)
         X = X + change
         # A NaN compares false, so that a lane that diverges stops.
         relative = relative_size(change, X)
-        return X, tuple(power @ power for power in powers), relative, k + 1
+        return X, tuple(matmul(power, power) for power in powers), relative, k + 1
 
     start = (C, powers, xp.asarray(xp.inf, C.dtype), xp.asarray(0))
     X, *_, iterations = while_loop(more, body, start)

@@ -9,7 +9,7 @@ import jax
 import jax.lax as lax
 from jaxtyping import Array, Float
 
-from .._jax import fori_loop, scan, stop_gradient, vmap, xp
+from .._jax import fori_loop, matmul, scan, stop_gradient, vmap, xp
 from .._typing import BoolScalar, Square
 from ..math._linear_solve import full_precision, solve, symmetric
 from ._arguments import where_solved
@@ -160,10 +160,11 @@ def composed(first: Element, second: Element) -> Element:
     # One inverse serves all: J2 (I + C1 J2)^-1 and (I + C1 J2)^-1 C1 are symmetric.
     n = A1.shape[0]
     eye = xp.eye(n, dtype=A1.dtype)
-    solved = solve(eye + C1 @ J2, xp.concatenate([A1, C1], axis=1))
+    solved = solve(eye + matmul(C1, J2), xp.concatenate([A1, C1], axis=1))
     moved, weighted = solved[:, :n], solved[:, n:]
-    C = symmetric(C2 + A2 @ weighted @ A2.T)
-    return A2 @ moved, C, J1 + symmetric(A1.T @ (J2 @ moved))
+    C = symmetric(C2 + matmul(matmul(A2, weighted), A2.T))
+    J = J1 + symmetric(matmul(A1.T, matmul(J2, moved)))
+    return matmul(A2, moved), C, J
 
 
 def linear_recursion(loop, added, final, parallel: bool, product):
