@@ -144,9 +144,9 @@ def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
     n = A.shape[0]
     solved = solve(R, xp.concatenate([S.T, B.T], axis=1))
     K = solved[:, :n]
-    closed_loop, G = A - B @ K, symmetric(B @ solved[:, n:])
+    closed_loop, G = A - matmul(B, K), symmetric(matmul(B, solved[:, n:]))
     # The difference of like terms first: rounding of `added` would hide it.
-    Q = Q - S @ K
+    Q = Q - matmul(S, K)
     return closed_loop, G, symmetric(Q if added is None else Q + added)
 
 

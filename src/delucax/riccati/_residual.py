@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from .._jax import vmap, while_loop, xp
+from .._jax import matmul, vmap, while_loop, xp
 from .._typing import BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts
 from ..math._linear_solve import solve, symmetric
@@ -82,10 +82,15 @@ def riccati_residual(
     # The terms of the equation, for their norms. A game's two quadratic terms have
     # opposite signs: their sum would hide how large they are.
     first = m - maximisers
-    moved = moved @ A
+    moved = matmul(moved, A)
     if discrete and E is not None:
         weighted = weighted @ E
-    terms = [moved, weighted if discrete else moved, Q, cross[:, :first] @ K[:first]]
+    terms = [
+        moved,
+        weighted if discrete else moved,
+        Q,
+        matmul(cross[:, :first], K[:first]),
+    ]
     if maximisers:
         terms.append(cross[:, first:] @ K[first:])
 
@@ -98,7 +103,7 @@ def riccati_residual(
     error, lost, gap, gap_lost = left
     gap = xp.abs(gap) + gap_lost
     # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
-    bound = xp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
+    bound = xp.abs(error) + lost + 2 * matmul(gap.T, matmul(inverse, gap))
 
     both, terms = xp.stack([error, bound]), xp.stack(terms)
 
@@ -138,10 +143,10 @@ def stationary(
     of the last two follows the best gain."""
     A, B, _, R, S, E = data
     if discrete:
-        moved, weight = A.T @ X, R + symmetric(B.T @ (X @ B))
+        moved, weight = matmul(A.T, X), R + symmetric(matmul(B.T, matmul(X, B)))
     else:
         moved, weight = X if E is None else E.T @ X, R
-    return moved, moved @ B + S, weight
+    return moved, matmul(moved, B) + S, weight
 
 
 class _Left(NamedTuple):
@@ -164,9 +169,9 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     # From here on the rounded gain -N is taken for exact: any gain gives a valid bound.
     N = -K
     BN, units_BN = product_in_parts(B, N)
-    L, T = A + BN, S.T + R @ N
-    lost_L = (units_BN + 1) * unit * (xp.abs(A) + size_B @ size_N)
-    lost_T = (m + 1) * unit * (size_S.T + xp.abs(R) @ size_N)
+    L, T = A + BN, S.T + matmul(R, N)
+    lost_L = (units_BN + 1) * unit * (xp.abs(A) + matmul(size_B, size_N))
+    lost_T = (m + 1) * unit * (size_S.T + matmul(xp.abs(R), size_N))
     most_L, size_T = xp.abs(L) + lost_L, xp.abs(T)
     Z, lost_Z = X, xp.zeros_like(X)
     if E is not None:
@@ -174,30 +179,32 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
         lost_Z = units * unit * (size_X @ xp.abs(E))
     if discrete:
         Y, units = product_in_parts(X, L)
-        lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
+        lost_Y = units * unit * matmul(size_X, most_L)
+        from_L = matmul(size_X, lost_L)
         subtracted = Z if E is None else E.T @ Z
     else:
         Y, lost_Y, from_L = Z, lost_Z, xp.zeros_like(X)
         subtracted = xp.zeros_like(X)
     size_Y = xp.abs(Y)
     square, units = product_in_parts(L.T, Y)
-    SN, NT = S @ N, N.T @ T
-    lost = most_L.T @ (units * unit * size_Y + lost_Y)
+    SN, NT = matmul(S, N), matmul(N.T, T)
+    lost = matmul(most_L.T, units * unit * size_Y + lost_Y)
     # In discrete time an error of L is in both factors, as the second one is XL.
-    both = lost_L.T @ (size_Y + from_L / 2)
+    both = matmul(lost_L.T, size_Y + from_L / 2)
     if discrete:
         lost += _twice(both)
         if E is not None:
             lost += xp.abs(E).T @ (n * unit * xp.abs(Z) + lost_Z)
     else:
         square, lost = _twice(square), _twice(lost + both)
-    lost += m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
+    lost += m * unit * matmul(size_S, size_N)
+    lost += matmul(size_N.T, m * unit * size_T + lost_T)
     # Four additions, each of a sum no larger than that of the sizes, and a margin.
     lost += 5 * unit * sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
-    gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
+    gap_lost = matmul(size_B.T, (n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost += lost_T + 2 * unit * size_T
     error = square - subtracted + Q + SN + NT
-    return (N, L, T, Y, Z), _Left(error, lost, B.T @ Y + T, gap_lost)
+    return (N, L, T, Y, Z), _Left(error, lost, matmul(B.T, Y) + T, gap_lost)
 
 
 def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
@@ -234,19 +241,20 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     most = sizes + rest_lost
     left, right = (stacked(M) for M in zip(*terms, strict=True))
     error, lost = product(left.T, right, *added)
-    error += factor @ rest
-    lost += xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
+    error += matmul(factor, rest)
+    around = rest_lost + (4 * n + 2 * m + 8) * eps * sizes
+    lost += matmul(xp.abs(factor), around)
     # The second-order terms: an error of L times an error of the factor beside it.
     most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * xp.abs(Y)
     if of_X:
         most_Y = most[n + m : 2 * n + m]
         around += most_Y
-        lost += 2 * most_L.T @ most_Y
+        lost += 2 * matmul(most_L.T, most_Y)
     if discrete:
-        from_L = xp.abs(X) @ most_L
+        from_L = matmul(xp.abs(X), most_L)
         around += from_L
-        lost += most_L.T @ from_L
-    gap_lost = xp.abs(B.T) @ around + most_T + (n + 4) * eps * xp.abs(T)
+        lost += matmul(most_L.T, from_L)
+    gap_lost = matmul(xp.abs(B.T), around) + most_T + (n + 4) * eps * xp.abs(T)
     lost = symmetric(lost)
     # Where nothing cancels the first bound may be the sharper one.
     sharper = lost < wide.lost
