@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_finite, check_instance
+from .._jax import host_unless_traced, xp
 from .._message import shortened
 from .._module import as_float_array, parameter
 from .._typing import RealScalar
@@ -114,6 +115,22 @@ class Start(eqx.Module):
             )
         return Start(*arrays)
 
+    def stacked(self, state_size: int) -> "Start":
+        """One start or several as several, with states and gains.
+
+        **Arguments:** `state_size`: n.
+        """
+        start = self
+        if self.controls.ndim == 2:
+            start = jax.tree.map(lambda a: a[None], self)
+        controls, states, gains = start.controls, start.states, start.gains
+        if states is None or gains is None:
+            # Zero gains make the states irrelevant.
+            c, T, m = controls.shape
+            states = jnp.zeros((c, T + 1, state_size), controls.dtype)
+            gains = jnp.zeros((c, T, m, state_size), controls.dtype)
+        return Start(controls, states, gains)
+
     def cheapest(self, problem: Problem) -> tuple["Start", Array, Array, Array]:
         """The start with the cheapest trajectory.
 
@@ -212,7 +229,8 @@ class Start(eqx.Module):
             # Not differentiable. A planner that needs derivatives says so itself.
             regulator = None
         else:
-            regulator = dare(*matrices, throw=False), posed
+            solution = dare(*matrices, throw=False)
+            regulator = solution.K, solution.spectral_radius, posed
         return _both(point, regulator, controls, T)
 
 
@@ -239,23 +257,24 @@ def _expanded(dynamics, cost, x, u, t0):
     return *safe, jnp.where(posed, S, 0), posed
 
 
-@eqx.filter_jit
-def _both(point, regulator, controls, T):
+@host_unless_traced
+def _both(
+    point: tuple[Array, Array], regulator: Any, controls: Array | None, T: int
+) -> Start:
     """The starts under a regulator, and under the controls alone."""
     x, u = point
-    K = jnp.zeros((u.shape[0], x.shape[0]), x.dtype)
+    K = xp.zeros((u.shape[0], x.shape[0]), x.dtype)
     if regulator is not None:
-        solution, posed = regulator
+        gain, radius, posed = regulator
         # Any stabilising gain is a valid start, also one of large residual.
-        stable = posed & (solution.spectral_radius < 1)
-        stable = stable & jnp.all(jnp.isfinite(solution.K))
-        K = jnp.where(stable, solution.K, K)
+        stable = posed & (radius < 1) & xp.all(xp.isfinite(gain))
+        K = xp.where(stable, gain, K)
     # Both starts are feedback, the second with a gain of zero, so that they stack.
-    held = jnp.tile(u, (T, 1))
+    held = xp.tile(u, (T, 1))
     return Start(
-        jnp.stack([held, held if controls is None else controls]),
-        jnp.tile(x, (2, T + 1, 1)),
-        jnp.stack([jnp.tile(K, (T, 1, 1)), jnp.zeros((T, *K.shape), K.dtype)]),
+        xp.stack([held, held if controls is None else controls]),
+        xp.tile(x, (2, T + 1, 1)),
+        xp.stack([xp.tile(K, (T, 1, 1)), xp.zeros((T, *K.shape), K.dtype)]),
     )
 
 
