@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
 
 from ._files import as_path as as_path
 from ._message import did_you_mean, shortened
@@ -25,7 +24,7 @@ from ._module import (
     mlp,
     names_of,
 )
-from ._typing import Bounds
+from ._typing import Array, Bounds
 
 
 Shape = tuple[int, ...]

@@ -8,7 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
+
+from ._host import on_host
+from ._typing import Array
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -106,6 +109,8 @@ def promote(result: Result) -> Result:
 
 def choose(condition: Array, first: Any, second: Any) -> Result:
     """`first` where the condition holds, else `second`."""
+    if on_host():
+        return first if condition else second
     return RESULTS.where(condition, first, second)
 
 

@@ -1,5 +1,19 @@
 """Performance on CPU and derivatives by JAX internals: jaxprs, custom primitives."""
 
+from .._host import (
+    compiled_unless_on_host as compiled_unless_on_host,
+    custom_jvp as custom_jvp,
+    entry as entry,
+    fori_loop as fori_loop,
+    host_unless_traced as host_unless_traced,
+    lax as lax,
+    on_host as on_host,
+    scan as scan,
+    stop_gradient as stop_gradient,
+    vmap as vmap,
+    while_loop as while_loop,
+    xp as xp,
+)
 from ._batches import by_lanes as by_lanes, fence as fence
 from ._components import (
     by_components as by_components,
@@ -13,15 +27,5 @@ from ._derivatives import (
     is_constant as is_constant,
     jacobian as jacobian,
     nan_tangent as nan_tangent,
-)
-from ._host import (
-    fori_loop as fori_loop,
-    host_unless_traced as host_unless_traced,
-    on_host as on_host,
-    scan as scan,
-    stop_gradient as stop_gradient,
-    vmap as vmap,
-    while_loop as while_loop,
-    xp as xp,
 )
 from ._normal import normal as normal

@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import AbstractArray, Array, jaxtyped
 
+from .._host import on_host
 from .._message import shortened
 
 
@@ -130,6 +131,8 @@ def as_float_array(value: Any) -> Any:
     A weak type follows the precision of what it meets, so one module serves float32
     and float64 alike. Integers become floats; arrays of numbers keep their precision.
     """
+    if on_host():
+        return _as_host_array(value)
     if value is None or isinstance(value, jax.Array) and eqx.is_inexact_array(value):
         return value
     if isinstance(value, bool | int | float | np.number) or (
@@ -144,6 +147,20 @@ def as_float_array(value: Any) -> Any:
             return value
         return array if eqx.is_inexact_array(array) else array.astype(float)
     return value
+
+
+def _as_host_array(value: Any) -> Any:
+    """Numbers as an array of NumPy, in the precision that JAX would give them."""
+    if value is None:
+        return value
+    try:
+        array = np.asarray(value)
+    except ValueError:  # ragged
+        return value
+    if array.dtype.kind not in "biufc":
+        return value
+    dtype = array.dtype if array.dtype.kind in "fc" else float
+    return array.astype(jax.dtypes.canonicalize_dtype(dtype), copy=False)
 
 
 def parameter(

@@ -3,11 +3,11 @@
 import itertools
 import math
 
-import jax.lax as lax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._jax import scan, xp
+from .._jax import lax, on_host, scan, xp
+from .._typing import Array
 from ._norms import power_of_two
 
 
@@ -26,8 +26,8 @@ def product(
     It is accurate even under cancellation. The bounds count all rounding, but no
     underflow.
     """
-    # Static sizes decide: one of the two is compiled.
-    if left.size * right.shape[1] > _SMALL:
+    # Static sizes decide: one of the two is compiled. NumPy is slow at loops.
+    if on_host() or left.size * right.shape[1] > _SMALL:
         return _by_slices(left, right, *added)
     return _term_by_term(left, right, *added)
 
@@ -52,12 +52,12 @@ def _term_by_term(left, right, *added):
         # Products without rounding: no fused operation changes these sums.
         for part in high * high_row, high * low_row, low * high_row:
             total, error = _sum(total, part)
-            off += error
-        off += low * low_row
+            off = off + error
+        off = off + low * low_row
         return (total, off, size + xp.abs(column[:, None] * row)), None
 
     (total, off, size), _ = scan(add, (total, off, size), (left.T, right))
-    total += off
+    total = total + off
     return total, eps * xp.abs(total) + (4 * (k + len(added) + 1) * eps) ** 2 * size
 
 
@@ -78,7 +78,7 @@ def _by_slices(left, right, *added):
     across, down = (xp.max(xp.abs(M), axis=0) for M in (both[:n], both[n:]))
     unit = power_of_two(xp.sqrt(down) / xp.sqrt(xp.where(across > 0, across, 1)))
     unit = xp.where(unit > 0, unit, 1)
-    both *= xp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
+    both = both * xp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
     power = power_of_two(xp.max(xp.abs(both), axis=1, keepdims=True))
     power = lax.max(power, xp.finfo(dtype).tiny)
     # Entries rounded to ever smaller steps, the slices between, and the remainders.
@@ -98,10 +98,10 @@ def _by_slices(left, right, *added):
     total, off = parts[0], 0
     for part in parts[1:]:
         total, error = _sum(total, part)
-        off += error
-    total += off + rows @ columns
+        off = off + error
+    total = total + off + rows @ columns
     lost = (rows.shape[1] + 2) * eps * (xp.abs(rows) @ xp.abs(columns))
-    lost += (len(parts) * eps) ** 2 * sum(xp.abs(part) for part in parts)
+    lost = lost + (len(parts) * eps) ** 2 * sum(xp.abs(part) for part in parts)
     return total, lost + eps * xp.abs(total)
 
 

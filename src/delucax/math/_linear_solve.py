@@ -7,10 +7,11 @@ from typing import Any
 import jax
 import jax.lax as lax
 import lineax as lx
-from jaxtyping import Array, Float, Inexact
+import numpy as np
+from jaxtyping import Float, Inexact
 
-from .._jax import xp
-from .._typing import BoolScalar, Square
+from .._jax import on_host, xp
+from .._typing import Array, BoolScalar, Square
 
 
 SMALL = 5
@@ -29,6 +30,8 @@ def full_precision(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def wrapped(*arguments):
+        if on_host():
+            return function(*arguments)
         with jax.default_matmul_precision("highest"):
             return function(*arguments)
 
@@ -51,6 +54,8 @@ def factorised(
     vector instructions, where LAPACK would be called for each. A `solver` that is given
     may need `tags` of the matrix.
     """
+    if on_host():
+        return functools.partial(_by_lapack, matrix, isinstance(solver, lx.QR))
     if solver is None:
         solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
     # The state is computed once. Lineax differentiates the solve, not the elimination.
@@ -61,6 +66,25 @@ def factorised(
         return lx.linear_solve(operator, b, solver, state=state, throw=False).value
 
     return jax.vmap(column, in_axes=1, out_axes=1)
+
+
+def _by_lapack(matrix, least_squares, right):
+    """The solution on the host, NaN where there is none."""
+    if least_squares:
+        basis, matrix = np.linalg.qr(matrix)
+        right = basis.T @ right
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.full_like(right, np.nan)
+
+
+def cholesky(matrix: Square) -> Square:
+    """The lower factor; NaN where `matrix` is not definite."""
+    try:
+        return xp.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
 class _Elimination(lx.AbstractLinearSolver):
@@ -151,8 +175,8 @@ def _factor(matrix):
 def is_definite(matrix: Square) -> BoolScalar:
     """Whether all pivots of a symmetric matrix are positive."""
     n = matrix.shape[0]
-    if n > SMALL:
-        return xp.all(xp.isfinite(xp.linalg.cholesky(matrix)))
+    if n > SMALL or on_host():
+        return xp.all(xp.isfinite(cholesky(matrix)))
     # Elimination without pivoting, whose pivots are the squares of Cholesky's diagonal.
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
     definite = xp.asarray(True)

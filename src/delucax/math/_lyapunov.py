@@ -1,12 +1,11 @@
 """Lyapunov, Stein and Sylvester equations of stable matrices, and Gramians over a
 finite time, by doubling."""
 
-import jax.lax as lax
 import jax.scipy.linalg as jsl
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._jax import scan, stop_gradient, while_loop, xp
-from .._typing import Scalar, Square
+from .._jax import lax, scan, stop_gradient, while_loop, xp
+from .._typing import Array, Scalar, Square
 from ._linear_solve import factorised, full_precision, symmetric
 from ._norms import relative_size
 

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import jax.lax as lax
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
-from .._jax import xp
+from .._jax import lax, xp
+from .._typing import Array
 
 
 ULPS = 4

@@ -3,11 +3,13 @@
 import equinox as eqx
 
 from .._check import as_matrix
+from .._jax import host_unless_traced
 from .._typing import Numbers
 from ._arguments import riccati_arguments
 from ._stabilising import RiccatiSolution, stabilising_solution
 
 
+@host_unless_traced
 def dare(
     A: Numbers,
     B: Numbers,
@@ -76,6 +78,7 @@ def dare(
     return stabilising_solution(True, data, "dare", throw)
 
 
+@host_unless_traced
 def care(
     A: Numbers,
     B: Numbers,
@@ -128,6 +131,7 @@ def care(
     return stabilising_solution(False, data, "care", throw)
 
 
+@host_unless_traced
 def filter_dare(
     A: Numbers,
     C: Numbers,
@@ -185,6 +189,7 @@ def filter_dare(
     return _filter(True, "filter_dare", A, C, W, V, S, throw)
 
 
+@host_unless_traced
 def filter_care(
     A: Numbers,
     C: Numbers,

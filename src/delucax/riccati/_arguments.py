@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array
 
 from .._check import (
     as_finite,
@@ -17,6 +16,7 @@ from .._check import (
 )
 from .._jax import xp
 from .._module import as_float_array
+from .._typing import Array
 
 
 class RiccatiData(NamedTuple):

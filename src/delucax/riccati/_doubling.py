@@ -2,10 +2,9 @@
 
 import jax
 import lineax as lx
-from jaxtyping import Array
 
 from .._jax import while_loop, xp
-from .._typing import BoolScalar, Scalar, Square
+from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
 from ..math._norms import one_if_zero, relative_and_total_size, size

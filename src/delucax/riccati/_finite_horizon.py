@@ -3,12 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array
 
 from .._check import as_vector
-from .._jax import vmap, xp
+from .._jax import compiled_unless_on_host, host_unless_traced, vmap, xp
 from .._results import choose, raise_on_failure, Result, RESULTS
-from .._typing import Numbers
+from .._typing import Array, Numbers
 from ..math._linear_solve import full_precision, solve
 from ._arguments import (
     constant_matrices,
@@ -71,6 +70,7 @@ class FiniteHorizonSolution(eqx.Module):
     times: Array | None = None
 
 
+@host_unless_traced
 def dre(
     A: Numbers,
     B: Numbers,
@@ -156,7 +156,7 @@ def dre(
     return raise_on_failure(solution, where, throw, facts=step)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parallel):
     X = values(A, B, Q, R, S, final, 0, parallel)
@@ -169,7 +169,7 @@ def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parall
     else:
         p, s, k = (xp.zeros(shape, A.dtype) for shape in ((T + 1, n), T + 1, (T, m)))
     masked = lambda M: xp.where(good.reshape(-1, *(1,) * (M.ndim - 1)), M, xp.nan)
-    p, s = p.at[:-1].set(masked(p[:-1])), s.at[:-1].set(masked(s[:-1]))
+    p, s = (xp.concatenate([masked(M[:-1]), M[-1:]]) for M in (p, s))
     result = choose(xp.all(good), RESULTS.successful, RESULTS.infeasible)
     return FiniteHorizonSolution(X, masked(K), masked(loop), result, p, s, masked(k))
 
@@ -192,6 +192,7 @@ def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     return p, xp.concatenate([s, xp.zeros(1, s.dtype)]), k
 
 
+@host_unless_traced
 def cre(
     A: Numbers,
     B: Numbers,
@@ -261,7 +262,7 @@ def cre(
     return raise_on_failure(solution, where, throw, facts=point)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _continuous_solution(A, B, Q, R, S, final, times):
     # Without a definite R the Hamiltonian has no minimum, whatever X is.

@@ -7,15 +7,21 @@ A game is the Riccati equation of the joint control `[u; w]`, with an indefinite
 import functools
 from typing import Any
 
-import equinox as eqx
 import jax
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from .._check import check_definite
-from .._jax import stop_gradient, vmap, xp
+from .._jax import (
+    compiled_unless_on_host,
+    custom_jvp,
+    host_unless_traced,
+    stop_gradient,
+    vmap,
+    xp,
+)
 from .._results import choose, RESULTS
-from .._typing import Numbers, Scalar, Square
-from ..math._linear_solve import full_precision, solve, symmetric
+from .._typing import Array, Numbers, Scalar, Square
+from ..math._linear_solve import cholesky, full_precision, solve, symmetric
 from ..math._lyapunov import lyapunov
 from ..math._norms import one_if_zero, size
 from ._arguments import constant_matrices, where_solved
@@ -43,6 +49,7 @@ from ._spectrum import spectral_abscissa, spectral_radius
 from ._stabilising import is_semidefinite, left_side, shifted
 
 
+@host_unless_traced
 def hinf_dare(
     A: Numbers,
     B: Numbers,
@@ -113,6 +120,7 @@ def hinf_dare(
     return at_level(_solution, where, True, problem, gamma, tolerance, throw)
 
 
+@host_unless_traced
 def hinf_care(
     A: Numbers,
     B: Numbers,
@@ -179,7 +187,7 @@ def checked_game(where: str, A: Any, B: Any, D: Any, Q: Any, R: Any) -> tuple:
     return tuple(given[name] for name in "ABDQR")
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     end, level, gamma = game_at_level(
@@ -304,14 +312,14 @@ def _correction(discrete, X, loop, error):
     # With X = root root', loop and error become root' loop root'^-1, root^-1 error
     # root'^-1; a singular X is shifted by its rounding.
     slack = xp.finfo(X.dtype).eps * one_if_zero(size(X))
-    root = stop_gradient(xp.linalg.cholesky(X + slack * eye))
+    root = stop_gradient(cholesky(X + slack * eye))
     root = xp.where(xp.all(xp.isfinite(root)), root, eye)
     loop = solve(root, (root.T @ loop).T).T
     error = solve(root, solve(root, error).T)
     return symmetric(root @ lyapunov(False, loop, symmetric(error)) @ root.T)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(custom_jvp, nondiff_argnums=(0,))
 def _with_implicit_derivative(
     discrete: bool, problem: tuple, gamma: Scalar, game: Game
 ) -> Square:
@@ -348,5 +356,5 @@ def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
     X = _with_implicit_derivative(discrete, problem, gamma, end.game)
     total = xp.trace(X)
     if discrete:
-        total += inverse_margins(problem[2][None], X[None], gamma)
+        total = total + inverse_margins(problem[2][None], X[None], gamma)
     return total

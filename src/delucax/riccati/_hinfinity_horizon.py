@@ -3,11 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
-from .._jax import vmap, xp
+from .._jax import compiled_unless_on_host, host_unless_traced, vmap, xp
 from .._results import choose, RESULTS
-from .._typing import Numbers
+from .._typing import Array, Numbers
 from ..math._linear_solve import full_precision, solve, symmetric
 from ._arguments import final_weight, increasing_times, stage_arguments, where_solved
 from ._hinfinity import checked_game
@@ -40,6 +40,7 @@ def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
     return xp.where(definite, X, xp.nan)
 
 
+@host_unless_traced
 def hinf_dre(
     A: Numbers,
     B: Numbers,
@@ -112,6 +113,7 @@ def hinf_dre(
     return at_level(_solution, where, True, problem, gamma, tolerance, throw)
 
 
+@host_unless_traced
 def hinf_cre(
     A: Numbers,
     B: Numbers,
@@ -174,7 +176,7 @@ def hinf_cre(
     return at_level(_solution, where, False, problem, gamma, tolerance, throw)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     A, B, D, Q, R, _, *times = problem

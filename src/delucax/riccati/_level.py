@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._check import check_step
-from .._jax import stop_gradient, vmap, while_loop, xp
+from .._jax import custom_jvp, stop_gradient, vmap, while_loop, xp
 from .._results import raise_on_failure, Result
-from .._typing import Scalar, Square
+from .._typing import Array, Scalar, Square
 from ..math._linear_solve import full_precision, solve
 from ._arguments import RiccatiData
 from ._residual import stationary
@@ -89,10 +89,11 @@ class GameSolution(eqx.Module):
 def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
     """`[B D]`, and the weight of the joint control `[u; w]`."""
     m, k = B.shape[-1], D.shape[-1]
-    weight = xp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
+    nothing = xp.zeros((*R.shape[:-2], m, k), R.dtype)
     # gamma^2 w'w is subtracted from the cost.
     worth = -(gamma**2) * xp.eye(k, dtype=R.dtype)
-    weight = weight.at[..., :m, :m].set(R).at[..., m:, m:].set(worth)
+    worth = xp.broadcast_to(worth, (*R.shape[:-2], k, k))
+    weight = xp.block([[R, nothing], [nothing.mT, worth]])
     return xp.concatenate([B, D], axis=-1), weight
 
 
@@ -225,16 +226,16 @@ def bisect_level(
         )
         return _where(first, at_first, later)._replace(trials=now.trials + 1)
 
-    unknown = jax.eval_shape(solve_game, problem, one, start)
+    no, nothing = xp.zeros((), bool), xp.asarray(0)
     begin = Bisection(
         low=0 * one,
         high=xp.inf * one,
         start=one,
-        solvable=xp.zeros((), bool),
-        affected=xp.zeros((), bool),
+        solvable=no,
+        affected=no,
         base=start,
-        game=jax.tree.map(lambda s: xp.zeros(s.shape, s.dtype), unknown),
-        trials=xp.asarray(0),
+        game=Game(start, one, no, no, nothing),
+        trials=nothing,
     )
     end = while_loop(more, body, begin)
     if gamma is not None:
@@ -260,7 +261,7 @@ def _where(condition, first, second):
     return jax.tree.map(lambda a, b: xp.where(condition, a, b), first, second)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(custom_jvp, nondiff_argnums=(0,))
 def with_derivative(barrier: Barrier, problem: tuple, level: Array):
     """The least level, with its derivative in the problem.
 
@@ -297,7 +298,7 @@ def _with_derivative_jvp(barrier, primals, tangents):
     return primals[1], xp.where(attained, tangent, 0)
 
 
-@jax.custom_jvp
+@custom_jvp
 def once_differentiable(x: Array) -> Array:
     """`x`, which cannot be differentiated twice.
 

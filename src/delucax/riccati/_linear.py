@@ -5,13 +5,19 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.lax as lax
-from jaxtyping import Array
 
 from .._check import as_matrix
-from .._jax import stop_gradient, while_loop, xp
+from .._jax import (
+    compiled_unless_on_host,
+    custom_jvp,
+    host_unless_traced,
+    lax,
+    stop_gradient,
+    while_loop,
+    xp,
+)
 from .._results import choose, raise_on_failure, Result, RESULTS
-from .._typing import Numbers
+from .._typing import Array, Numbers
 from ..math._linear_solve import full_precision, no_tangent, solve
 from ..math._lyapunov import smith, stable_sylvester
 from ._arguments import complex_form, is_complex, real_form, square_matrix
@@ -61,6 +67,7 @@ class MatrixSolution(eqx.Module):
         return f"Relative residual {float(self.residual):.1e}."
 
 
+@host_unless_traced
 def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     r"""The continuous-time Lyapunov equation
 
@@ -103,6 +110,7 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     return _equation("lyap", False, A, None, Q, throw)
 
 
+@host_unless_traced
 def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     r"""The discrete-time Lyapunov equation
 
@@ -137,6 +145,7 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     return _equation("dlyap", True, A, None, Q, throw)
 
 
+@host_unless_traced
 def sylvester(
     A: Numbers, B: Numbers, C: Numbers, *, throw: bool = True
 ) -> MatrixSolution:
@@ -179,6 +188,7 @@ def sylvester(
     return _equation("sylvester", False, A, B, C, throw)
 
 
+@host_unless_traced
 def dsylvester(
     A: Numbers, B: Numbers, C: Numbers, *, throw: bool = True
 ) -> MatrixSolution:
@@ -231,7 +241,7 @@ def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
     return raise_on_failure(solution, where, throw, facts=solution._facts)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _solution(discrete, A, B, C) -> MatrixSolution:
     complex_data = is_complex(A, B, C)
     if complex_data:
@@ -259,7 +269,7 @@ class _Candidate(NamedTuple):
         return self.residual <= tolerance(self.X.dtype)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(custom_jvp, nondiff_argnums=(0,))
 @full_precision
 def _solved(discrete, A, B, C) -> _Candidate:
     """The solution of `A X + X B = C` or `X - A X B = C`; `B` is `A'` by default."""

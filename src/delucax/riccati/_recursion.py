@@ -6,12 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.lax as lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._jax import fori_loop, scan, stop_gradient, vmap, xp
-from .._typing import BoolScalar, Square
-from ..math._linear_solve import full_precision, solve, symmetric
+from .._jax import custom_jvp, fori_loop, lax, scan, stop_gradient, vmap, xp
+from .._typing import Array, BoolScalar, Square
+from ..math._linear_solve import cholesky, full_precision, solve, symmetric
 from ._arguments import where_solved
 
 
@@ -26,7 +25,7 @@ its start."""
 
 def is_clearly_definite(M: Square) -> BoolScalar:
     """Whether a symmetric matrix is positive definite, by more than rounding."""
-    L = xp.linalg.cholesky(stop_gradient(M))
+    L = cholesky(stop_gradient(M))
     # The pivot L_ii^2 is the Schur complement of M_ii, and is compared with it, so that
     # units do not matter. NaN fails the comparison.
     least = M.shape[0] * xp.finfo(M.dtype).eps * xp.abs(xp.diagonal(M))
@@ -70,7 +69,7 @@ def one_step(A, B, Q, R, S, K, X):
     return symmetric(loop.T @ X @ loop + Q + K.T @ R @ K - cross - cross.T)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(6, 7))
+@functools.partial(custom_jvp, nondiff_argnums=(6, 7))
 def values(A, B, Q, R, S, final, maximisers: int, parallel: bool):
     """`X` at steps 0 to T of the recursion from `final`, shape `(T+1, n, n)`.
 
@@ -89,10 +88,11 @@ def values(A, B, Q, R, S, final, maximisers: int, parallel: bool):
         X = xp.concatenate([X, final[None]])
     pivot = R + xp.swapaxes(B, 1, 2) @ X[1:] @ B
     good = vmap(lambda M: is_saddle(M, maximisers))(symmetric(pivot))
-    good &= xp.all(xp.isfinite(X[:-1]), axis=(1, 2))
+    good = good & xp.all(xp.isfinite(X[:-1]), axis=(1, 2))
     # A step without a minimum leaves none to all the steps before it.
     good = lax.cummin(good.astype(xp.int32), reverse=True).astype(bool)
-    return X.at[:-1].set(xp.where(good[:, None, None], X[:-1], xp.nan))
+    before = xp.where(good[:, None, None], X[:-1], xp.nan)
+    return xp.concatenate([before, final[None]])
 
 
 def backwards(step: Callable[[Array, Any], Array], final: Array, steps: Any) -> Array:
@@ -128,10 +128,11 @@ def _in_parallel(A, B, Q, R, S, final):
     last = (nothing, nothing, (final - P)[None])
     elements = jax.tree.map(lambda a, b: xp.concatenate([a, b]), steps, last)
     _, _, J = lax.associative_scan(combine, elements, reverse=True)
-    X = (J + P).at[-1].set(final)
+    after = xp.concatenate([J[1:-1] + P, final[None]])
     # One exact step from each X to the one before removes the scan's rounding.
-    K, _ = vmap(gain)(A, B, R, S, X[1:])
-    return X.at[:-1].set(vmap(one_step)(A, B, Q, R, S, K, X[1:]))
+    K, _ = vmap(gain)(A, B, R, S, after)
+    before = vmap(one_step)(A, B, Q, R, S, K, after)
+    return xp.concatenate([before, final[None]])
 
 
 def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
@@ -274,12 +275,12 @@ def has_solution(C: Array, X: Array, is_game: bool) -> Array:
     size = xp.linalg.norm(inner)
     # I + C X has the eigenvalues of I + root' X root, with C = root root'.
     slack = 100 * n * xp.finfo(X.dtype).eps * xp.where(size > 0, size, 1)
-    root = xp.linalg.cholesky(inner + slack * eye)
-    moved = xp.linalg.cholesky(eye + symmetric(root.T @ outer @ root))
+    root = cholesky(inner + slack * eye)
+    moved = cholesky(eye + symmetric(root.T @ outer @ root))
     return xp.all(xp.isfinite(root)) & xp.all(xp.isfinite(moved))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
+@functools.partial(custom_jvp, nondiff_argnums=(5,))
 def flow_values(A, G, Q, final, times, is_game: bool):
     """`X` at `times`, back from `final`, along `dX/dt = -A'X - XA + XGX - Q`.
 
@@ -291,7 +292,7 @@ def flow_values(A, G, Q, final, times, is_game: bool):
     def twice(_, carry):
         element, good = carry
         # The equation from X = 0 may have a solution over each half and none over both.
-        good &= vmap(reach)(element[1], element[2])
+        good = good & vmap(reach)(element[1], element[2])
         return vmap(composed)(element, element), good
 
     start = (short, xp.ones(len(times) - 1, bool))
@@ -301,9 +302,9 @@ def flow_values(A, G, Q, final, times, is_game: bool):
         X, good = carry
         element, possible = here
         # A finite escape time in the interval: the formula below would step over it.
-        good &= possible & has_solution(element[1], X, is_game)
+        good = good & possible & has_solution(element[1], X, is_game)
         X = passed(element, X)
-        good &= xp.all(xp.isfinite(X))
+        good = good & xp.all(xp.isfinite(X))
         return (X, good), xp.where(good, X, xp.nan)
 
     start = (final / unit, xp.ones((), bool))

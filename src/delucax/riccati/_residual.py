@@ -5,10 +5,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._jax import vmap, while_loop, xp
-from .._typing import BoolScalar, Scalar, Square
+from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts
 from ..math._linear_solve import solve, symmetric
 from ..math._norms import relative_and_total_size
@@ -186,16 +186,18 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     # In discrete time an error of L is in both factors, as the second one is XL.
     both = lost_L.T @ (size_Y + from_L / 2)
     if discrete:
-        lost += _twice(both)
+        lost = lost + _twice(both)
         if E is not None:
-            lost += xp.abs(E).T @ (n * unit * xp.abs(Z) + lost_Z)
+            lost = lost + xp.abs(E).T @ (n * unit * xp.abs(Z) + lost_Z)
     else:
         square, lost = _twice(square), _twice(lost + both)
-    lost += m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
+    lost = lost + m * unit * (size_S @ size_N)
+    lost = lost + size_N.T @ (m * unit * size_T + lost_T)
     # Four additions, each of a sum no larger than that of the sizes, and a margin.
-    lost += 5 * unit * sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
+    added = sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
+    lost = lost + 5 * unit * added
     gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
-    gap_lost += lost_T + 2 * unit * size_T
+    gap_lost = gap_lost + lost_T + 2 * unit * size_T
     error = square - subtracted + Q + SN + NT
     return (N, L, T, Y, Z), _Left(error, lost, B.T @ Y + T, gap_lost)
 
@@ -234,18 +236,18 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     most = sizes + rest_lost
     left, right = (stacked(M) for M in zip(*terms, strict=True))
     error, lost = product(left.T, right, *added)
-    error += factor @ rest
-    lost += xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
+    error = error + factor @ rest
+    lost = lost + xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
     # The second-order terms: an error of L times an error of the factor beside it.
     most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * xp.abs(Y)
     if of_X:
         most_Y = most[n + m : 2 * n + m]
-        around += most_Y
-        lost += 2 * most_L.T @ most_Y
+        around = around + most_Y
+        lost = lost + 2 * most_L.T @ most_Y
     if discrete:
         from_L = xp.abs(X) @ most_L
-        around += from_L
-        lost += most_L.T @ from_L
+        around = around + from_L
+        lost = lost + most_L.T @ from_L
     gap_lost = xp.abs(B.T) @ around + most_T + (n + 4) * eps * xp.abs(T)
     lost = symmetric(lost)
     # Where nothing cancels the first bound may be the sharper one.
@@ -324,7 +326,7 @@ def newton_refine(
         best = jax.tree.map(lambda a, b: xp.where(better, a, b), (X, new), best)
         rest = best[1].relative
         again = helped | patient & (rest > wide)
-        again &= (rest > fine) & (k < _NEWTON_STEPS)
+        again = again & (rest > fine) & (k < _NEWTON_STEPS)
         # The bound is too wide for a certificate: once more, accurately, from the best.
         hidden = ~again & ~accurately & (xp.max(best[1].bounds) > wide)
         X = xp.where(hidden, best[0], X)

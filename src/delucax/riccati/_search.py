@@ -5,12 +5,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from .._jax import stop_gradient, while_loop, xp
+from .._jax import entry, stop_gradient, while_loop, xp
 from .._results import choose, Result, RESULTS
-from .._typing import BoolScalar, Scalar, Square
+from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._linear_solve import solve
+from ..math._lyapunov import MAX_DOUBLINGS
 from ..math._norms import one_if_zero, power_of_two, size
 from ._arguments import RiccatiData
 from ._residual import tolerance
@@ -152,10 +153,12 @@ def search(
         survives = stable & (at.residual <= close**0.5)
         # Stable or not: the gap is smaller than its rounding.
         undecided = ~stable & (at.gap >= -new.rounding)
-        undecided &= (at.residual <= close) & new.bounded
+        undecided = undecided & (at.residual <= close) & new.bounded
         # The gap of a robust solution hardly changes with Q; that of a marginal one
         # changes by as much as itself.
+        # So does that of rounding by chance, but no doubling converges to it.
         same = xp.abs(at.gap - best.gap) <= _GAP_TOLERANCE * best.gap
+        same = same & (new.iterations < MAX_DOUBLINGS)
         marginal = before.marginal & ~(unchanged & solved)
         marginal = xp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
@@ -180,8 +183,7 @@ def search(
         # The column of the table.
         success = xp.where(unchanged, solved, ~marginal & (~unit | survives))
         outcome = xp.where(success, 0, xp.where(unfit, 1, 2))
-        # No index from outside: nothing is clipped, which compiles sooner.
-        following = xp.asarray(_NEXT).at[kind, outcome].get(mode="promise_in_bounds")
+        following = entry(xp.asarray(_NEXT), kind, outcome)
         over = unchanged & solved & ~new.near
         return xp.where(over, DONE, following), after
 
@@ -264,7 +266,7 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     start = xp.zeros(n, dtype)
     *_, d = while_loop(more, sweep, (0, start + 1, start))
     # A factor common to all states has no effect: it is removed to avoid overflow.
-    d -= xp.mean(d)
+    d = d - xp.mean(d)
     f = d
     if E is not None:
         f = -xp.max(logarithm(xp.abs(E)) - d, axis=1)

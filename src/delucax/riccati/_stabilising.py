@@ -4,11 +4,10 @@ import functools
 
 import equinox as eqx
 import jax
-from jaxtyping import Array
 
-from .._jax import stop_gradient, xp
+from .._jax import compiled_unless_on_host, custom_jvp, stop_gradient, xp
 from .._results import raise_on_failure, Result
-from .._typing import BoolScalar
+from .._typing import Array, BoolScalar
 from ..math._linear_solve import (
     factorised,
     full_precision,
@@ -115,7 +114,7 @@ def stabilising_solution(
     return raise_on_failure(solution, where, throw, facts=solution._facts)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
     """The solution in complex form, with a new residual bound: rounding may have left
@@ -131,7 +130,7 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
     return eqx.tree_at(lambda s: s.residual, solution, bound)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     """The solution, computed with states in units that fit."""
@@ -153,7 +152,7 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     )
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(custom_jvp, nondiff_argnums=(0,))
 def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
     """The certified search for the stabilising `X`, for data in balanced units, `by`
     times the user's."""
@@ -185,7 +184,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         # place of the sign iteration.
         second = kind == SECOND
         if discrete:
-            height = size_Q * xp.where(second, _SECOND_START, 1)
+            height = xp.where(second, _SECOND_START * size_Q, size_Q)
             X, iterations = discrete_start(start, height)
             size_G = xp.zeros_like(size_Q)  # needed in continuous time alone
         else:
@@ -277,7 +276,7 @@ def _terms(discrete, data, X):
     return moved, cross, K, closed_loop if E is None else solve(E, closed_loop)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(custom_jvp, nondiff_argnums=(0,))
 def _feedback(discrete: bool, ok: BoolScalar, data: RiccatiData, X: Array):
     """`K` and the closed loop, with derivatives in members that are `ok` alone."""
     *_, K, closed_loop = _terms(discrete, data, X)

@@ -1,0 +1,188 @@
+"""One text for two array libraries: NumPy where nothing is traced, else JAX.
+
+A design such as a Riccati equation is solved once, and compiling it would take a
+thousand times as long as solving it. So what is written with `xp`, `lax` and the loops
+below runs on NumPy when all its arguments are concrete arrays, and compiled under
+`jax.jit`, `jax.vmap` and `jax.grad`.
+
+NumPy differs in two ways from which such a text must keep off. It changes an array in
+place where JAX makes a new one: `a = a + b`, not `a += b`. And of two Python numbers
+`where` makes an array of double precision.
+"""
+
+import functools
+from collections.abc import Callable
+from contextvars import ContextVar
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+
+_ON_HOST: ContextVar[bool] = ContextVar("delucax_on_host", default=False)
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+_C = TypeVar("_C")
+
+_OF_NUMPY = np.ndarray | np.generic
+
+
+def on_host() -> bool:
+    """Whether NumPy computes."""
+    return _ON_HOST.get()
+
+
+def host_unless_traced(function: _F) -> _F:
+    """Run a function on NumPy if none of its arguments is traced.
+
+    Its arguments are NumPy's arrays then, its results JAX's arrays in both cases.
+    """
+
+    @functools.wraps(function)
+    def wrapper(*args, **kwargs):
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if _ON_HOST.get() or any(isinstance(leaf, Tracer) for leaf in leaves):
+            return function(*args, **kwargs)
+        args, kwargs = jax.tree.unflatten(structure, map(_to_host, leaves))
+        token = _ON_HOST.set(True)
+        try:
+            # As in JAX: what overflows is infinite, what is undefined NaN.
+            with np.errstate(all="ignore"):
+                value = function(*args, **kwargs)
+        finally:
+            _ON_HOST.reset(token)
+        return _to_device(value)
+
+    return wrapper  # pyright: ignore[reportReturnType]
+
+
+def _to_host(leaf: Any) -> Any:
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
+
+
+def _to_device(tree: Any) -> Any:
+    """The tree with JAX's arrays for NumPy's."""
+    arrays, others = eqx.partition(tree, lambda x: isinstance(x, _OF_NUMPY))
+    # All at once, and not by `jnp.asarray`, which compiles a program for each shape.
+    # Copies, as JAX may otherwise share the memory of an array that the user changes.
+    copies = jax.tree.map(lambda leaf: leaf.copy(), arrays)
+    return eqx.combine(jax.device_put(copies), others)
+
+
+def compiled_unless_on_host(function: _F) -> _F:
+    """`eqx.filter_jit`."""
+    compiled = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def wrapper(*args, **kwargs):
+        return (function if _ON_HOST.get() else compiled)(*args, **kwargs)
+
+    return wrapper  # pyright: ignore[reportReturnType]
+
+
+class custom_jvp(jax.custom_jvp):
+    """`jax.custom_jvp`; NumPy calls the function itself."""
+
+    def __call__(self, *args: Any) -> Any:
+        return self.fun(*args) if _ON_HOST.get() else super().__call__(*args)
+
+
+class _Operations:
+    """Operations of `jax.lax` on NumPy's arrays."""
+
+    max = staticmethod(np.maximum)
+
+    @staticmethod
+    def reduce_precision(x: Any, exponent_bits: int, mantissa_bits: int) -> Any:
+        """`x` rounded to so many bits of the mantissa."""
+        del exponent_bits
+        # The unit of the last bit that is kept. No power of two loses a digit.
+        unit = np.ldexp(x.dtype.type(1), np.frexp(x)[1] - 1 - mantissa_bits)
+        return np.where(np.isfinite(x), np.rint(x / unit) * unit, x)
+
+    @staticmethod
+    def cummin(x: Any, *, reverse: bool = False) -> Any:
+        """The smallest entry so far, along the first axis."""
+        return np.minimum.accumulate(x[::-1])[::-1] if reverse else np.minimum(x)
+
+    @staticmethod
+    def custom_linear_solve(matvec: Any, b: Any, solve: Any, **_: Any) -> Any:
+        """The solution."""
+        return solve(matvec, b)
+
+
+class _Namespace:
+    """Two modules of the same functions: one for NumPy, one for JAX."""
+
+    def __init__(self, host: Any, device: Any) -> None:
+        self._host, self._device = host, device
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._host if _ON_HOST.get() else self._device, name)
+
+
+xp: Any = _Namespace(np, jnp)
+"""`numpy` or `jax.numpy`, whichever computes."""
+lax: Any = _Namespace(_Operations, jax.lax)
+"""The like of `jax.lax`."""
+
+
+def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C) -> _C:
+    """`lax.while_loop`."""
+    if not _ON_HOST.get():
+        return jax.lax.while_loop(proceed, body, start)
+    while proceed(start):
+        start = body(start)
+    return start
+
+
+def fori_loop(low: int, high: int, body: Callable[[Any, _C], _C], start: _C) -> _C:
+    """`lax.fori_loop`."""
+    if not _ON_HOST.get():
+        return jax.lax.fori_loop(low, high, body, start)
+    for k in range(low, high):
+        start = body(k, start)
+    return start
+
+
+def scan(body: Callable, start: Any, xs: Any, *, reverse: bool = False) -> Any:
+    """`lax.scan`, of a given length."""
+    if not _ON_HOST.get():
+        return jax.lax.scan(body, start, xs, reverse=reverse)
+    leaves, structure = jax.tree.flatten(xs)
+    steps = range(len(leaves[0]))
+    rows = []
+    for k in reversed(steps) if reverse else steps:
+        here = jax.tree.unflatten(structure, [leaf[k] for leaf in leaves])
+        start, row = body(start, here)
+        rows.append(row)
+    if reverse:
+        rows.reverse()
+    return start, _stacked(rows)
+
+
+def vmap(function: _F) -> _F:
+    """`jax.vmap` over the first axis of every argument."""
+    if not _ON_HOST.get():
+        return jax.vmap(function)
+    return lambda *args: _stacked([function(*row) for row in zip(*args, strict=True)])
+
+
+def _stacked(rows: list) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+
+
+def stop_gradient(tree: _C) -> _C:
+    """`lax.stop_gradient`."""
+    return tree if _ON_HOST.get() else jax.lax.stop_gradient(tree)
+
+
+def entry(table: Any, *index: Any) -> Any:
+    """`table[index]`, of an index that is in bounds."""
+    if _ON_HOST.get():
+        return table[index]
+    # Nothing is clipped, which compiles sooner.
+    return table.at[index].get(mode="promise_in_bounds")
