@@ -20,8 +20,8 @@ from ..riccati import dre
 from ._problem import Problem, Values
 
 
-_UNROLL = 16
-"""Products of matrices with an inner dimension up to this are written out."""
+_SMALL_INNER = 16
+"""Products of matrices with an inner dimension up to this are sums."""
 
 
 class Stages(NamedTuple):
@@ -171,20 +171,16 @@ def central(f: Any, spacing: float, deviation: Any) -> Any:
 def product(a: Array, b: Array) -> Array:
     """`a @ b`, as a sum of outer products where it is small.
 
-    XLA on CPU makes one loop of it that vectorises, where a product of small matrices
-    is a loop of its own for each.
+    XLA on CPU makes one loop of it that vectorises, and fuses it with what is around,
+    where a product of small matrices is a call of its own.
     """
-    inner = a.shape[1]
-    if inner > _UNROLL:
+    if a.shape[1] > _SMALL_INNER:
         return a @ b
-    total = a[:, 0, None] * b[0]
-    for i in range(1, inner):
-        total = total + a[:, i, None] * b[i]
-    return total
+    return jnp.sum(a[:, :, None] * b, axis=1)
 
 
 def apply(matrix: Array, vector: Array) -> Array:
-    """`matrix @ vector`, written out likewise."""
+    """`matrix @ vector`, likewise."""
     return product(matrix, vector[:, None])[:, 0]
 
 

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_finite, check_instance
-from .._jax import host_unless_traced, xp
+from .._jax import host_unless_traced, jacobian, xp
 from .._message import shortened
 from .._module import as_float_array, parameter
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..math._linear_solve import is_definite
+from ..math._linear_solve import full_precision, is_definite, symmetric
+from ..math._small import products_whole
 from ..riccati import dare
-from ._lq import model
 from ._problem import Problem
 
 
@@ -231,7 +231,7 @@ class Start(eqx.Module):
         else:
             solution = dare(*matrices, throw=False)
             regulator = solution.K, solution.spectral_radius, posed
-        return _both(point, regulator, controls, T)
+        return Start(*_both(*point, regulator, controls, T))
 
 
 def operating_point(
@@ -243,12 +243,15 @@ def operating_point(
 
 
 @eqx.filter_jit
+@full_precision
 def _expanded(dynamics, cost, x, u, t0):
     """The linear-quadratic problem about a point, and whether it is one."""
-    # The local model of a horizon of one step at the point.
+    n, z = x.shape[0], jnp.concatenate([x, u])
     problem = Problem(dynamics, cost, x, t0)
-    stages = model(problem, jnp.stack([x, x]), u[None], None, False)
-    n, F, H = x.shape[0], stages.F[0], stages.H[0]
+    stage_cost = lambda z: problem.stage_cost(t0, z[:n], z[n:], None)
+    with products_whole():
+        F = jacobian(lambda z: problem.step(t0, z[:n], z[n:], None))(z)
+        H = symmetric(jax.hessian(stage_cost)(z)).astype(x.dtype)
     # z'Hz = x'Qx + 2 x'Su + u'Ru.
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
     posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
@@ -258,11 +261,9 @@ def _expanded(dynamics, cost, x, u, t0):
 
 
 @host_unless_traced
-def _both(
-    point: tuple[Array, Array], regulator: Any, controls: Array | None, T: int
-) -> Start:
-    """The starts under a regulator, and under the controls alone."""
-    x, u = point
+def _both(x, u, regulator, controls, T):
+    """Controls, states and gains of the starts under a regulator, and under the
+    controls alone."""
     K = xp.zeros((u.shape[0], x.shape[0]), x.dtype)
     if regulator is not None:
         gain, radius, posed = regulator
@@ -271,7 +272,7 @@ def _both(
         K = xp.where(stable, gain, K)
     # Both starts are feedback, the second with a gain of zero, so that they stack.
     held = xp.tile(u, (T, 1))
-    return Start(
+    return (
         xp.stack([held, held if controls is None else controls]),
         xp.tile(x, (2, T + 1, 1)),
         xp.stack([xp.tile(K, (T, 1, 1)), xp.zeros((T, *K.shape), K.dtype)]),
