@@ -223,8 +223,9 @@ def _searched(problem, options, starts, count, before: _Progress):
         given = starts.states, starts.controls, starts.gains
         pick = lambda own, given: jnp.where(before.begun, own, given[i])
         length = length_of(i)
-        tracked = jax.tree.map(pick, own, given)
-        states, controls, cost = roll_out(problem, *tracked, policy.k, length, defects)
+        xs, us, K = jax.tree.map(pick, own, given)
+        found = roll_out(problem, xs, us, K, policy.k, length, defects)
+        *_, cost = found
         # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
         # times the defects, of which a step of length a closes that share.
         curvature = length * policy.curvature / 2
@@ -233,7 +234,7 @@ def _searched(problem, options, starts, count, before: _Progress):
         enough = decrease >= LEAST_SHARE * predicted - slack
         enough = enough & jnp.isfinite(cost)
         rank = jnp.where(enough, i.astype(cost.dtype), jnp.inf)
-        return jnp.where(before.begun, rank, cost), (states, controls, cost)
+        return jnp.where(before.begun, rank, cost), found
 
     if options.line_search == "parallel":
         most = jnp.arange(max(HALVINGS, starts.count))
