@@ -350,3 +350,18 @@ def test_learning_online_around_a_plan():
     still = run(learner, 0 * w)
     assert_close(still.controls, plan.controls, atol=1e-8)
     np.testing.assert_allclose(still.total_cost, plan.cost, rtol=1e-9)
+
+
+@once
+def test_nothing_is_compiled_again(caplog):
+    """Neither for the next step nor for a plan of other numbers."""
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
+    mpc = dlx.controllers.MPC(dynamics, cost, 5, bounds=(-2.0, 2.0))
+    x, y = jnp.array([0.1, 0.0]), jnp.array([0.2, 0.1])
+    _, state = mpc(jnp.asarray(0.0), x, mpc.init())
+    dlx.planning.ilqr(dynamics, cost, x, 5)
+    with jax.log_compiles():
+        mpc(jnp.asarray(0.1), y, state)
+        dlx.planning.ilqr(dynamics, cost, y, 5)
+    assert not [r for r in caplog.records if "Compiling" in r.getMessage()]

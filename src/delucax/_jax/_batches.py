@@ -17,8 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
-from jax.extend.core import Primitive
+from jax.extend.core import jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
 
 from .._host import on_host
@@ -134,7 +133,8 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
 
     In a batch each iteration waits for the longest line search and the slowest member,
     and on CPU nothing is gained in return: a sequential run is between equally fast and
-    six times as fast. Accelerators run the batch as one.
+    six times as fast. Accelerators run the batch as one. The function needs a
+    derivative of its own.
     """
     # Arrays that a cost or a constraint of the user closes over are batched as well.
     # Equinox looks into functions with a closure alone, such as this lambda.
@@ -147,19 +147,62 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
         closed, args = eqx.combine(arrays, static)
         return closed(*args)
 
-    run = custom_vmap(evaluate)
+    program, shapes = jax.make_jaxpr(evaluate, return_shape=True)(*leaves)
+    outs = _lanes.bind(*leaves, program=program, batches=())
+    return jax.tree.unflatten(jax.tree.structure(shapes), outs)
 
-    @run.def_vmap
-    def _(_, batched, *leaves):
-        lanes, shared = eqx.partition(list(leaves), list(batched))
-        of = lambda f: lambda lane: f(*eqx.combine(lane, shared))
-        # Which platform it is turns out when the program is lowered, not now.
-        out = lax.platform_dependent(
-            lanes,
-            # `run`, not `evaluate`: an outer `vmap` goes lane by lane as well.
-            cpu=lambda lanes: lax.map(of(run), lanes),
-            default=jax.vmap(of(evaluate)),
-        )
-        return out, jax.tree.map(lambda _: True, out)
 
-    return run(*leaves)
+_lanes = Primitive("lanes")
+"""A program, and the batches that it is in, the outermost first: their sizes, and which
+arguments each of them batches. How they run is decided when the platform is known, so
+that a program is not traced in a way in which it is not run."""
+_lanes.multiple_results = True
+
+
+def _nested(over: Callable[..., Any]) -> Callable[..., Any]:
+    """The program with its batches run by `over`."""
+
+    def run(*values, program, batches):
+        function = jaxpr_as_fun(program)
+        for _, batched in reversed(batches):
+            function = over(function, batched)
+        return function(*values)
+
+    return run
+
+
+def _sequentially(function, batched):
+    def mapped(*values):
+        lanes, shared = eqx.partition(list(values), list(batched))
+        return lax.map(lambda lane: function(*eqx.combine(lane, shared)), lanes)
+
+    return mapped
+
+
+def _together(function, batched):
+    return jax.vmap(function, [0 if b else None for b in batched])
+
+
+def _lanes_batch(values, dims, *, program, batches):
+    size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
+    batched = tuple(d is not None for d in dims)
+    values = [
+        value if d is None else batching.bdim_at_front(value, d, size)
+        for value, d in zip(values, dims, strict=True)
+    ]
+    batches = ((size, batched), *batches)
+    outs = _lanes.bind(*values, program=program, batches=batches)
+    return outs, [0] * len(outs)
+
+
+def _lanes_shapes(*_, program, batches):
+    sizes = tuple(size for size, _ in batches)
+    outs = [out.update(shape=(*sizes, *out.shape)) for out in program.out_avals]
+    return outs, program.effects
+
+
+_lanes.def_impl(_nested(_sequentially))
+_lanes.def_effectful_abstract_eval(_lanes_shapes)
+batching.primitive_batchers[_lanes] = _lanes_batch
+mlir.register_lowering(_lanes, mlir.lower_fun(_nested(_together)))
+mlir.register_lowering(_lanes, mlir.lower_fun(_nested(_sequentially)), platform="cpu")

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+from jax.core import Tracer
 from jaxtyping import Array, Int, PyTree
 
 from .._check import (
@@ -20,13 +21,14 @@ from .._check import (
     check_key,
 )
 from .._controller import AbstractController, Tally
+from .._jax import host_unless_traced, xp
 from .._module import function_field
 from .._results import Result, RESULTS
 from .._typing import Control, Difference, Observation, PRNGKey, RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..planning import AbstractPlanner, Constraints, ILQR, Start
+from ..planning import AbstractPlanner, Constraints, ILQR, Plan, Start
 from ._operating_point import check_state, deviation
 
 
@@ -168,7 +170,7 @@ class MPC(AbstractController):
                 check_finite(start, "start", where)
             start = Start.default(dynamics, cost, horizon, controls=start)
         self.dynamics, self.cost = dynamics, cost
-        self.start = _stacked(start, dynamics.state_size)
+        self.start = start.stacked(dynamics.state_size)
         self.planner = ILQR() if planner is None else planner
         self.constraints, self.difference = constraints, difference
         self.throw = check_bool(throw, "throw", where)
@@ -197,7 +199,7 @@ class MPC(AbstractController):
         if draws:
             check_key(key, "MPC.init")
         return MPCState(
-            last=jax.tree.map(lambda a: a[0], self.start),
+            last=_first(self.start),
             result=jax.tree.map(jnp.asarray, RESULTS.successful),
             failures=Tally("failed_plan"),
             iterations=jnp.zeros((), int),
@@ -209,13 +211,9 @@ class MPC(AbstractController):
         key, draw = state.key, None
         if self.planner.is_stochastic:
             key, draw = jr.split(key)
-        last, starts = state.last, state.last.controls
-        if not self.planner.starts_from_states:
-            # The last plan comes first: of starts of equal cost the first is taken.
-            join = lambda a, b: jnp.concatenate([a[None], b])
-            # One batch: the planner rolls all of them out together and refines the
-            # best.
-            starts = jax.tree.map(join, last, self.start)
+        last = state.last
+        from_states = self.planner.starts_from_states
+        starts = last.controls if from_states else _joined(last, self.start)
         plan = self.planner(
             self.dynamics,
             self.cost,
@@ -229,27 +227,32 @@ class MPC(AbstractController):
             key=draw,
             throw=False,
         )
-        # Usable plans include those that ran out of iterations: the best so far beats
-        # the last one, which is a step older.
-        lost, u = ~plan.is_usable, plan.controls[0]
-        u = jnp.where(lost, self._followed(y, last), u)
-        if self.throw:
+        u, lost, after = self._moved_on(y, plan, state._replace(key=key))
+        if self.throw and (isinstance(lost, Tracer) or lost):
             # Attached to the control, which every caller uses: attached to the state it
             # would be removed as dead code where the state is not read.
             u = plan.result.error_if(u, lost)
+        return u, after
+
+    @eqx.filter_jit
+    def _moved_on(self, y: Observation, plan: Plan, state: MPCState) -> Any:
+        """The control, whether there is no plan to use, and the next state."""
+        # Usable plans include those that ran out of iterations: the best so far beats
+        # the last one, which is a step older.
+        lost, u = ~plan.is_usable, plan.controls[0]
+        u = jnp.where(lost, self._followed(y, state.last), u)
         # The warm start is the plan a step later, its last step held for the new one. A
         # lost plan is forgotten, or the next one would start from what had failed.
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
         later = Start(*(shift(a) for a in (plan.controls, plan.states, plan.gains)))
         renewed = lambda new, old: jnp.where(lost, old[0], new).astype(old.dtype)
-        after = MPCState(
+        after = state._replace(
             last=jax.tree.map(renewed, later, self.start),
             result=plan.result,
             failures=state.failures.add(plan.result != RESULTS.successful),
             iterations=jnp.asarray(plan.iterations, state.iterations.dtype),
-            key=key,
         )
-        return u.astype(y.dtype), after
+        return u.astype(y.dtype), lost, after
 
     def _followed(self, y: Observation, last: Start) -> Control:
         """The first control of the last plan, under its gains."""
@@ -264,14 +267,15 @@ class MPC(AbstractController):
         return jnp.minimum(jnp.maximum(u, low), high)
 
 
-def _stacked(start: Start, n: int) -> Start:
-    """One start or several as several, with states and gains."""
-    if start.controls.ndim == 2:
-        start = jax.tree.map(lambda a: a[None], start)
-    controls, states, gains = start.controls, start.states, start.gains
-    c, T, m = controls.shape
-    if states is None or gains is None:
-        # Zero gains make the states irrelevant; all starts then stack in one shape.
-        states = jnp.zeros((c, T + 1, n), controls.dtype)
-        gains = jnp.zeros((c, T, m, n), controls.dtype)
-    return Start(controls, states, gains)
+@host_unless_traced
+def _first(starts: Start) -> Start:
+    """The first of several starts."""
+    return jax.tree.map(lambda a: a[0], starts)
+
+
+@host_unless_traced
+def _joined(last: Start, starts: Start) -> Start:
+    """All starts as one batch, of which the planner refines the cheapest."""
+    # The last plan comes first: of starts of equal cost the first is taken.
+    join = lambda a, b: xp.concatenate([a[None], b])
+    return jax.tree.map(join, last, starts)

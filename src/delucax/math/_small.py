@@ -1,11 +1,27 @@
 """Products too small to be worth a call into a linear-algebra library."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
 from jaxtyping import Array, ArrayLike
 
 from .._jax import xp
 
 
-_UNROLL = 32
+_UNROLL: ContextVar[int] = ContextVar("delucax_unroll", default=32)
+"""Products of up to as many terms are written out."""
+
+
+@contextmanager
+def products_whole() -> Iterator[None]:
+    """Within, no product is written out: in a program that differentiates it twice, it
+    would be hundreds of operations, and is computed for a whole trajectory at once."""
+    token = _UNROLL.set(0)
+    try:
+        yield
+    finally:
+        _UNROLL.reset(token)
 
 
 def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
@@ -38,7 +54,7 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
         )
     # Entry by entry XLA fuses the product; as `dot` it calls a library for each member.
     m, n = matrix.shape
-    if m * n == 0 or m * n > _UNROLL:
+    if m * n == 0 or m * n > _UNROLL.get():
         return matrix @ vector
     rows = []
     for i in range(m):
@@ -75,7 +91,7 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
 def dot(a: Array, b: Array) -> Array:
     """The sum of the products of two vectors, a few written out."""
     (n,) = a.shape
-    if n == 0 or n > _UNROLL:
+    if n == 0 or n > _UNROLL.get():
         return a @ b
     total = a[0] * b[0]
     for i in range(1, n):

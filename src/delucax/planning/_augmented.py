@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .._results import choose, RESULTS
 from ._descent import optimise, Options, Outcome
 from ._problem import Multipliers, Problem, updated, violated
-from ._start import controls_of, Start
+from ._start import Start
 
 
 FIRST_RHO = 10.0
@@ -24,24 +24,23 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
 
     Source: Bertsekas, 1982; Howell, Jackson and Manchester, 2019 (in this setting).
     """
-    if problem.constraints is None:
-        return optimise(problem, start, options)
-    T, m = controls_of(start).shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
+    starts = start.stacked(n)
+    count, T, m = starts.controls.shape
+    if problem.constraints is None:
+        return optimise(problem, starts, count, options)
     # At a larger weight rounding of the squares exceeds the tolerances.
     most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
 
     def body(carry):
-        before, tolerance, _ = carry
-        # The gains keep an unstable plant on the trajectory that it goes on from.
-        start = Start(before.controls, before.states, before.gains)
+        before, starts, count, tolerance, _ = carry
         now = dataclasses.replace(
             options,
             tolerance=jnp.maximum(tolerance, options.tolerance),
             states=None if options.states is None else before.states,
         )
         with_these = problem.with_multipliers(before.multipliers)
-        after = optimise(with_these, start, now, before)
+        after = optimise(with_these, starts, count, now, before)
         values = problem.constraints_along(after.states, after.controls)
         *y, rho = before.multipliers
         each = [(c, y, rho, equal) for (c, equal), y in zip(values, y, strict=True)]
@@ -68,36 +67,33 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         )
         # Once the constraints hold, the last minimisations are to full precision.
         tolerance = tolerance * jnp.where(holds, 0, 0.1)
-        return after, tolerance, settled | spent | hopeless | lost
+        # The gains keep an unstable plant on the trajectory that it goes on from.
+        on = Start(after.controls, after.states, after.gains)
+        starts = jax.tree.map(lambda all, one: all.at[0].set(one), starts, on)
+        ended = settled | spent | hopeless | lost
+        return after, starts, jnp.ones_like(count), tolerance, ended
 
-    like = jnp.zeros((T + 1, n), dtype)
-    sizes = jax.eval_shape(problem.constraints_along, like, controls_of(start))
+    states = jnp.zeros((T + 1, n), dtype) if options.states is None else options.states
+    sizes = jax.eval_shape(problem.constraints_along, states, starts.controls[0])
     stage, final = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
-    multipliers = Multipliers(stage, final, jnp.full((), FIRST_RHO, dtype))
-    rollouts = 0
-    if start.controls.ndim == 3:
-        rollouts = start.count
-        start = start.cheapest(problem.with_multipliers(multipliers))[0]
-    states = start.states if options.states is None else options.states
-    if states is None:
-        states = jnp.broadcast_to(problem.x0, (T + 1, n))
     zero = jnp.zeros((), dtype)
     first = Outcome(
         states=states,
-        controls=start.controls,
-        gains=jnp.zeros((T, m, n), dtype) if start.gains is None else start.gains,
+        controls=starts.controls[0],
+        gains=jnp.zeros((T, m, n), dtype),
         cost=zero,
         residual=zero,
         trace=jnp.zeros(options.max_iterations + 1, dtype),
         result=RESULTS.not_converged,
-        iterations=jnp.asarray(0),
-        rollouts=jnp.asarray(rollouts),
+        iterations=jnp.zeros((), int),
+        rollouts=jnp.zeros((), int),
         regularisation=zero,
         violation=jnp.full((), jnp.inf, dtype),
-        multipliers=multipliers,
+        multipliers=Multipliers(stage, final, jnp.full((), FIRST_RHO, dtype)),
     )
     # The first minimisations are coarse, because their multipliers are wrong anyway.
-    carry = first, jnp.full((), 1e-2, dtype), jnp.asarray(False)
-    out, *_ = lax.while_loop(lambda carry: ~carry[2], body, carry)
+    coarse = jnp.full((), 1e-2, dtype)
+    carry = first, starts, jnp.asarray(count, int), coarse, jnp.asarray(False)
+    out, *_ = lax.while_loop(lambda carry: ~carry[-1], body, carry)
     # The cost alone, without what the constraints add to it.
     return out._replace(cost=problem.total(out.states, out.controls))

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._results import choose, Result, RESULTS
 from ._lq import in_parallel, in_sequence, model, Policy, predicted_change, Stages
 from ._problem import Multipliers, Problem, roll_out
-from ._start import controls_of, Start
+from ._start import Start
 
 
 SEARCHES = ("parallel", "backtracking")
@@ -63,6 +63,8 @@ class _Progress(NamedTuple):
     """The state of the loop."""
 
     now: Outcome
+    policy: Policy
+    """That of the model about `now`."""
     defects: Array | None
     """How far each step misses the next state, where the states were given."""
     delta: Array
@@ -71,25 +73,30 @@ class _Progress(NamedTuple):
     """Whether second derivatives of the dynamics are taken."""
     penalty: Array
     """The weight of the defects."""
+    rounding: Array
+    """By how much rounding may change the cost."""
+    begun: Array
+    """Whether the starts have been compared."""
     done: Array
 
 
 def optimise(
-    problem: Problem, start: Start, options: Options, before: Outcome | None = None
+    problem: Problem,
+    starts: Start,
+    count: Array | int,
+    options: Options,
+    before: Outcome | None = None,
 ) -> Outcome:
-    """Iterate from the cheapest start, or from its controls and the states of the
-    options if there are any; counting on from `before`, if that is given."""
-    T, m = controls_of(start).shape
+    """Iterate from the cheapest of the first `count` of stacked starts, or from the
+    controls of the first one and the states of the options if there are any; counting
+    on from `before`, if that is given."""
+    _, T, m = starts.controls.shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
-    zero, defects = jnp.zeros((), dtype), None
-    iteration, rollouts = jnp.asarray(0), jnp.asarray(0)
-    if before is not None:
-        iteration, rollouts = before.iterations, before.rollouts
-    if options.states is None:
-        _, states, controls, cost = start.cheapest(problem)
-        rollouts = rollouts + start.count
-    else:
-        controls = jax.vmap(problem.clip)(controls_of(start))
+    zero, infinite = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
+    states, defects = jnp.broadcast_to(problem.x0, (T + 1, n)), None
+    controls, cost = jax.vmap(problem.clip)(starts.controls[0]), infinite
+    if options.states is not None:
+        count = 0
         states = options.states.at[0].set(problem.x0)
         # How far each step of the guess misses its next state, shape (T, n).
         inputs = problem.times(T)[:-1], states[:-1], controls, problem.w
@@ -98,28 +105,28 @@ def optimise(
         cost = problem.total(states, controls)
         good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(defects))
         cost = jnp.where(good, cost, jnp.inf)
-    lost = ~jnp.isfinite(cost)
-    counts = jnp.arange(options.max_iterations + 1)
-    trace = jnp.full(counts.shape, cost)
-    if before is not None:
-        trace = jnp.where(counts < iteration, before.trace, trace)
     now = Outcome(
         states=states,
         controls=controls,
         gains=jnp.zeros((T, m, n), dtype),
         cost=cost,
-        residual=jnp.full((), jnp.inf, dtype),
-        trace=trace,
-        result=choose(lost, RESULTS.diverged, RESULTS.not_converged),
-        iterations=iteration,
-        rollouts=rollouts,
+        residual=infinite,
+        trace=jnp.zeros(options.max_iterations + 1, dtype),
+        result=RESULTS.not_converged,
+        iterations=jnp.zeros((), int),
+        rollouts=jnp.zeros((), int),
         regularisation=zero,
     )
-    first = _Progress(
-        now, defects, jnp.ones((), dtype), jnp.asarray(True), penalty=zero, done=lost
-    )
-    body = functools.partial(_iterate, problem, options)
+    if before is not None:
+        now = now._replace(
+            trace=before.trace, iterations=before.iterations, rollouts=before.rollouts
+        )
+    no, nothing = jnp.asarray(False), jnp.zeros_like(controls)
+    policy = Policy(now.gains, nothing, nothing, zero, zero, zero, no)
+    first = _Progress(now, policy, defects, zero + 1, ~no, zero, zero, no, no)
+    body = functools.partial(_iterate, problem, options, starts, count)
     now = lax.while_loop(lambda progress: ~progress.done, body, first).now
+    counts = jnp.arange(options.max_iterations + 1)
     return now._replace(
         trace=jnp.where(counts <= now.iterations, now.trace, now.cost),
         violation=zero,
@@ -127,105 +134,145 @@ def optimise(
     )
 
 
-def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress:
-    now, defects, tolerance = before.now, before.defects, options.tolerance
-    mu = now.regularisation
-    about = problem, now.states, now.controls, defects, options.second_order
-    stages = model(*about, before.exact, options.finite_difference)
+def _iterate(
+    problem: Problem,
+    options: Options,
+    starts: Start,
+    count: Array | int,
+    before: _Progress,
+) -> _Progress:
+    """A line search, and the model about where it led. The first one compares starts:
+    the loop has one body, so that one roll-out is compiled."""
+    now, begun, tolerance = before.now, before.begun, options.tolerance
+    trajectory, accepted, tried = _searched(problem, options, starts, count, before)
+    states, controls, cost, defects = trajectory
+    lost = ~begun & ~jnp.isfinite(cost)
+    # Fall back to Gauss-Newton if the exact Hessian is indefinite or the search failed.
+    flatten = ~accepted & before.exact & options.second_order
+    mu, delta = now.regularisation, before.delta
+    changed = _schedule(accepted, mu, delta)
+    keep = lambda old, new: jnp.where(flatten | ~begun, old, new)
+    mu, delta = jax.tree.map(keep, (mu, delta), changed)
+    exact = jnp.where(flatten & begun, False, before.exact | accepted)
+    stuck = mu > MOST_MU
+    failed = lost | stuck
+    iteration = now.iterations + begun
     # One linear-quadratic problem about the present trajectory.
-    policy, residual, settled = directions(problem, stages, now.controls, mu, options)
-    penalty = _penalty(before.penalty, defects, policy)
+    about = problem, states, controls, defects, options.second_order
+    stages = model(*about, exact, options.finite_difference)
+    policy, residual, settled = directions(problem, stages, controls, mu, options)
     missed = 0.0 if defects is None else jnp.max(jnp.abs(defects))
-    closed = missed <= tolerance * (1 + jnp.max(jnp.abs(now.states)))
+    closed = missed <= tolerance * (1 + jnp.max(jnp.abs(states)))
     # By how much rounding may change the cost: its own, and that of the states and
     # controls that it is computed from, which weighs more where targets are far from
     # zero.
-    z = jnp.concatenate([now.states[:-1], now.controls], axis=1)
+    z = jnp.concatenate([states[:-1], controls], axis=1)
     terms = jnp.sum(jnp.abs(stages.h * z))
-    terms = terms + jnp.sum(jnp.abs(stages.v * now.states[-1]))
-    rounding = jnp.finfo(z.dtype).eps * (jnp.abs(now.cost) + terms)
+    terms = terms + jnp.sum(jnp.abs(stages.v * states[-1]))
+    rounding = jnp.finfo(z.dtype).eps * (jnp.abs(cost) + terms)
     # The predicted decrease may be below the rounding of the cost. Full steps still
     # lower the gradient then; once they no longer do, the iteration has converged.
     predicted = -policy.slope - policy.curvature / 2
     spent = (jnp.abs(predicted) <= rounding) & (mu == 0) & (tolerance > 0)
     spent = spent & (residual >= now.residual)
-    converged = policy.ok & closed & (settled | spent)
-    out_of_time = now.iterations >= options.max_iterations
-    rest = (now.states, now.controls, now.cost, defects), jnp.asarray(False)
-    given = problem, before, policy, penalty, rounding
-    (states, controls, cost, defects), accepted, tried = lax.cond(
-        converged | out_of_time | ~policy.ok,
-        lambda: (*rest, jnp.asarray(0)),
-        lambda: _searched(options.line_search, *given),
-    )
-    # Fall back to Gauss-Newton if the exact Hessian is indefinite or the search failed.
-    flatten = ~accepted & before.exact & options.second_order
-    changed = _schedule(accepted, mu, before.delta)
-    keep = lambda old, new: jnp.where(flatten, old, new)
-    mu, delta = jax.tree.map(keep, (mu, before.delta), changed)
-    exact = jnp.where(flatten, False, before.exact | accepted)
-    ended = converged | out_of_time
-    stuck = (mu > MOST_MU) & ~ended
-    result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
-    result = choose(converged, RESULTS.successful, result)
-    iteration = now.iterations + jnp.where(ended, 0, 1)
+    converged = policy.ok & closed & (settled | spent) & ~failed
+    result = choose(converged, RESULTS.successful, RESULTS.not_converged)
+    result = choose(stuck, RESULTS.no_descent, result)
     after = now._replace(
         states=states,
         controls=controls,
-        gains=jnp.where(policy.ok, policy.K, now.gains),
+        gains=jnp.where(policy.ok & ~failed, policy.K, now.gains),
         cost=cost,
-        residual=residual,
+        residual=jnp.where(failed, now.residual, residual),
         trace=now.trace.at[iteration].set(cost),
-        result=result,
+        result=choose(lost, RESULTS.diverged, result),
         iterations=iteration,
         rollouts=now.rollouts + tried,
-        # At the end what the last policy was computed with, not what would come next.
-        regularisation=jnp.where(ended, now.regularisation, mu),
+        regularisation=mu,
     )
-    return _Progress(after, defects, delta, exact, penalty, ended | stuck)
+    penalty = _penalty(before.penalty, defects, policy)
+    done = failed | converged | (iteration >= options.max_iterations)
+    begun = jnp.ones_like(begun)
+    return _Progress(
+        after, policy, defects, delta, exact, penalty, rounding, begun, done
+    )
 
 
-def _searched(kind, problem, before: _Progress, policy: Policy, penalty, rounding):
+def _searched(problem, options, starts, count, before: _Progress):
     """Backtracking line search: the states, controls, cost and defects after the
     longest step of sufficient decrease, or as before; whether one was accepted; and how
-    many were tried.
+    many were tried. Before the first iteration, those of the cheapest of the starts.
 
     The merit function is the cost plus `penalty` times the sum of the defects. The cost
     is known to within `rounding`.
     """
-    now, defects = before.now, before.defects
+    now, policy, defects = before.now, before.policy, before.defects
     missed = 0.0 if defects is None else jnp.sum(jnp.abs(defects))
     # A step that only rounding makes worse is taken, or the search would end short of
     # the minimum.
-    slack = rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
-    lengths = 0.5 ** jnp.arange(HALVINGS, dtype=now.cost.dtype)
+    slack = before.rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
+    # Without a policy there is nothing to search along.
+    halvings = jnp.where(policy.ok, HALVINGS, 0)
+    number = jnp.where(before.begun, halvings, count)
+    length_of = lambda i: 0.5 ** i.astype(now.cost.dtype)
 
-    def trial(length):
-        states, controls, cost = roll_out(
-            problem, now.states, now.controls, policy.K, policy.k, length, defects
-        )
+    def trial(i):
+        """The trajectory, and its rank: the lowest one is taken."""
+        # The feedback of a start is followed as it is: the change `k` is zero then.
+        own = now.states, now.controls, policy.K
+        given = starts.states, starts.controls, starts.gains
+        pick = lambda own, given: jnp.where(before.begun, own, given[i])
+        length = length_of(i)
+        xs, us, K = jax.tree.map(pick, own, given)
+        found = roll_out(problem, xs, us, K, policy.k, length, defects)
+        *_, cost = found
         # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
         # times the defects, of which a step of length a closes that share.
         curvature = length * policy.curvature / 2
-        predicted = length * (penalty * missed - policy.slope - curvature)
-        decrease = now.cost - cost + length * penalty * missed
+        predicted = length * (before.penalty * missed - policy.slope - curvature)
+        decrease = now.cost - cost + length * before.penalty * missed
         enough = decrease >= LEAST_SHARE * predicted - slack
-        return (states, controls, cost), enough & jnp.isfinite(cost)
+        enough = enough & jnp.isfinite(cost)
+        rank = jnp.where(enough, i.astype(cost.dtype), jnp.inf)
+        return jnp.where(before.begun, rank, cost), found
 
-    last = now.states, now.controls, now.cost
-    if kind == "parallel":
-        candidates, enough = jax.vmap(trial)(lengths)
-        best = jnp.argmax(enough)  # the first of the largest: the longest step
-        accepted, length, tried = enough[best], lengths[best], jnp.asarray(HALVINGS)
-        candidate = jax.tree.map(lambda a: a[best], candidates)
+    if options.line_search == "parallel":
+        most = jnp.arange(max(HALVINGS, starts.count))
+        ranks, candidates = jax.vmap(trial)(most)
+        best = jnp.argmin(jnp.where(most < number, ranks, jnp.inf))
+        rank, candidate = jax.tree.map(lambda a: a[best], (ranks, candidates))
+        rank, tried = jnp.where(best < number, rank, jnp.inf), number
     else:
-        step = lambda i: trial(lengths[i])
-        tried, candidate, accepted = first_accepted(step, HALVINGS, last)
-        length = lengths[tried - 1]
-    # A step of length a removes that share of the defects.
-    keep = lambda new, old: jnp.where(accepted, new, old)
-    left = None if defects is None else keep((1 - length) * defects, defects)
-    return (*jax.tree.map(keep, candidate, last), left), accepted, tried
+
+        def body(carry):
+            i, best, rank, candidate = carry
+            new, found = trial(i)
+            lower = (new < rank) | (i == 0)
+            keep = lambda new, old: jnp.where(lower, new, old)
+            return i + 1, *jax.tree.map(keep, (i, new, found), (best, rank, candidate))
+
+        # Steps are tried until one is accepted, all starts are compared.
+        going = lambda carry: (
+            (carry[0] < number) & ~(before.begun & jnp.isfinite(carry[2]))
+        )
+        index = jnp.zeros((), int)
+        last = now.states, now.controls, now.cost
+        nothing = index, index, jnp.full_like(now.cost, jnp.inf), last
+        tried, best, rank, candidate = lax.while_loop(going, body, nothing)
+    accepted = jnp.isfinite(rank)
+    # Of starts that all diverge the first one is left, for what it shows.
+    keep = lambda new, old: jnp.where(
+        accepted | (~before.begun & (number > 0)), new, old
+    )
+    last = now.states, now.controls, now.cost
+    states, controls, cost = jax.tree.map(keep, candidate, last)
+    # Its controls are finite at least as given.
+    controls = jnp.where(accepted, controls, now.controls)
+    if defects is not None:
+        # A step of length a removes that share of the defects.
+        left = (1 - length_of(best)) * defects
+        defects = jnp.where(accepted, left, defects)
+    return (states, controls, cost, defects), accepted, tried
 
 
 def first_accepted(

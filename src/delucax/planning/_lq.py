@@ -15,12 +15,13 @@ from jaxtyping import Array
 from .._jax import first_possible
 from ..math import matvec
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
+from ..math._small import products_whole
 from ..riccati import dre
 from ._problem import Problem, Values
 
 
-_UNROLL = 16
-"""Products of matrices with an inner dimension up to this are written out."""
+_SMALL_INNER = 16
+"""Products of matrices with an inner dimension up to this are sums."""
 _ELIMINATED = 5
 """Systems of this many controls are solved entry by entry."""
 
@@ -70,64 +71,75 @@ def model(
     # cross terms.
     z = jnp.concatenate([states[:-1], controls], axis=1)
     step = lambda z, t, w: problem.step(t, z[:size], z[size:], w)
-    stage_cost = lambda z, t, y: problem.stage_cost(t, z[:size], z[size:], y)
-    final_cost = lambda x: problem.final_cost(end, x)
-
-    def stage_hessian(z, t, y):
-        """The Hessian of the cost and of the constraints' squared linear parts."""
-        if problem.multipliers is None:
-            return jax.hessian(stage_cost)(z, t, y)
-        c = lambda z: problem.stage_constraints(t, z[:size], z[size:])
-        cost = jax.hessian(lambda z: problem.cost(t, z[:size], z[size:]))(z)
-        return cost + squared(c, z, y, problem.multipliers.rho)
-
-    y = problem.stage_multipliers
-    v = jax.grad(final_cost)(states[-1])
+    cost = lambda z, t: problem.cost(t, z[:size], z[size:])
+    final_cost = lambda x: problem.cost.final(end, x)
+    constraints = lambda z, t: problem.stage_constraints(t, z[:size], z[size:])
+    final_constraints = lambda x: problem.final_constraints(end, x)
+    y = end_y = rho = None
+    if problem.multipliers is not None:
+        y, end_y, rho = problem.multipliers
     if spacing is None:
         # In reverse mode if possible, because a step has fewer outputs than inputs.
         slopes = first_possible(jax.jacrev(step), jax.jacfwd(step))
     else:
         slopes = central(step, spacing, problem.deviation)
     F = jax.vmap(slopes)(z, t, problem.w)
-    h = jax.vmap(jax.grad(stage_cost))(z, t, y)
-    H = jax.vmap(stage_hessian)(z, t, y)
-    V = jax.hessian(lambda x: problem.cost.final(end, x))(states[-1])
-    # By default Gauss-Newton: exact Hessians of the cost, linear dynamics and
-    # constraints.
-    if problem.multipliers is not None:
-        c = lambda x: problem.final_constraints(end, x)
-        V = V + squared(c, states[-1], *problem.multipliers[1:])
+    each = lambda z, t, y: expanded(cost, constraints, y, rho, z, t)
+    h, H, push = jax.vmap(each)(z, t, y)
+    v, V, end_push = expanded(final_cost, final_constraints, end_y, rho, states[-1])
     if second_order:
         # The Hessian of the Hamiltonian, cost + costate' F: the curvature of the
-        # dynamics is weighted by the costates.
-        def hamiltonian(z, t, w, y, costate):
-            return stage_cost(z, t, y) + costate @ step(z, t, w)
+        # dynamics is weighted by the costates, that of constraints by multipliers.
+        def bent(z, t, w, costate, push):
+            value = costate @ step(z, t, w)
+            return value if push is None else value + push @ constraints(z, t)[0]
 
         # Forward over reverse is cheapest. Implicit solvers inside may have one mode
         # only.
-        slope = jax.grad(hamiltonian)
-        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(hamiltonian))
-        each = z, t, problem.w, y, costates_of(F, h, v)
-        exact = jax.vmap(first_possible(*ways))(*each)
-        at_end = jax.hessian(final_cost)(states[-1])
+        slope = jax.grad(bent)
+        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(bent))
+        given = z, t, problem.w, costates_of(F, h, v), push
         # Both are computed where a flag of the loop decides, because the flag is
         # traced.
-        if use_exact is None:
-            H, V = exact, at_end
-        else:
-            H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
+        used = lambda bend: bend if use_exact is None else jnp.where(use_exact, bend, 0)
+        H = H + used(jax.vmap(first_possible(*ways))(*given))
+        if end_push is not None:
+            at_end = lambda x: end_push @ final_constraints(x)[0]
+            V = V + used(jax.hessian(at_end)(states[-1]))
     # Rounding leaves Hessians not quite symmetric, which the backward pass relies on.
     stages = Stages(F, symmetric(H), h, defects, symmetric(V), v)
     return jax.tree.map(lambda a: a.astype(states.dtype), stages)
 
 
-def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Array:
-    """The Hessian of the active constraints' squares, without second derivatives: that
-    of `rho c'c / 2` by Gauss and Newton, `rho J'J`."""
-    slope = jax.jacfwd(lambda z: c(z)[0])(z)
-    value, equal = c(z)
-    active = equal | (y + rho * value > 0)
-    return rho * slope.T @ jnp.where(active[:, None], slope, 0)
+def expanded(
+    cost: Callable[..., Array],
+    constraints: Callable[..., Values],
+    y: Array | None,
+    rho: Array | None,
+    z: Array,
+    *rest: Array,
+) -> tuple[Array, Array, Array | None]:
+    """The gradient of a cost and of the augmentation by constraints with multipliers
+    `y`; its Hessian by Gauss and Newton, the exact one of the cost and `rho J'J` of the
+    constraints that act; and the force of each, `y + rho c`."""
+
+    def slope(z):
+        h = jax.grad(lambda z: cost(z, *rest) + 0.0)(z)  # also of an integer cost
+        return h, h
+
+    def values(z):
+        c, equal = constraints(z, *rest)
+        return c, (c, equal)
+
+    with products_whole(), jax.default_matmul_precision("highest"):
+        H, h = jax.jacfwd(slope, has_aux=True)(z)
+        if y is None or rho is None:
+            return h, H, None
+        J, (c, equal) = jax.jacfwd(values, has_aux=True)(z)
+        force = y + rho * c
+        active = equal | (force > 0)
+        force, J = jnp.where(active, force, 0), jnp.where(active[:, None], J, 0)
+        return h + force @ J, H + rho * J.T @ J, force
 
 
 def costates_of(F: Array, h: Array, v: Array) -> Array:
@@ -161,20 +173,16 @@ def central(f: Any, spacing: float, deviation: Any) -> Any:
 def product(a: Array, b: Array) -> Array:
     """`a @ b`, as a sum of outer products where it is small.
 
-    XLA on CPU makes one loop of it that vectorises, where a product of small matrices
-    is a loop of its own for each.
+    XLA on CPU makes one loop of it that vectorises, and fuses it with what is around,
+    where a product of small matrices is a call of its own.
     """
-    inner = a.shape[1]
-    if inner > _UNROLL:
+    if a.shape[1] > _SMALL_INNER:
         return a @ b
-    total = a[:, 0, None] * b[0]
-    for i in range(1, inner):
-        total = total + a[:, i, None] * b[i]
-    return total
+    return jnp.sum(a[:, :, None] * b, axis=1)
 
 
 def apply(matrix: Array, vector: Array) -> Array:
-    """`matrix @ vector`, written out likewise."""
+    """`matrix @ vector`, likewise."""
     return product(matrix, vector[:, None])[:, 0]
 
 

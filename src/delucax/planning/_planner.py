@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from .._check import (
@@ -188,12 +190,12 @@ class AbstractPlanner(eqx.Module):
             check_instance(constraints, Constraints, "constraints", where, hint)
         ends: Any = check_control_bounds(bounds, m, where)
         if ends is not None:
-            ends = tuple(jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+            ends = tuple(_cast(end, dtype, (m,)) for end in ends)
         # One precision for all: the loops of the planners carry it unchanged.
-        x0, begin = x0.astype(dtype), begin.astype(dtype)
+        x0, begin = _cast(x0, dtype), _cast(begin, dtype)
         distance = as_module(difference)
         problem = Problem(dynamics, cost, x0, begin, w, ends, distance, constraints)
-        start = jax.tree.map(lambda a: a.astype(dtype), start)
+        start = jax.tree.map(lambda a: _cast(a, dtype), start)
         if fallback is not None:
             T = start.horizon
             spare = [getattr(fallback, name, None) for name in _TRAJECTORY]
@@ -211,6 +213,17 @@ class AbstractPlanner(eqx.Module):
         if fallback is not None:
             plan = _with_fallback(plan, fallback)
         return checked_plan(plan, where, throw)
+
+
+def _cast(array: Array, dtype: Any, shape: tuple[int, ...] | None = None) -> Array:
+    """The array in another precision, and of another shape if one is given."""
+    shape = array.shape if shape is None else shape
+    if isinstance(array, Tracer):
+        return jnp.broadcast_to(array, shape).astype(dtype)
+    if array.dtype == dtype and array.shape == shape and not array.weak_type:
+        return array
+    # By NumPy, for each conversion would be compiled as a program of its own.
+    return jnp.asarray(np.broadcast_to(np.asarray(array, dtype), shape))
 
 
 @eqx.filter_jit

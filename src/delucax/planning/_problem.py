@@ -16,6 +16,7 @@ from .._results import choose, first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
+from ..math._small import products_whole
 from ._plan import Plan
 
 
@@ -252,8 +253,10 @@ class Problem(eqx.Module):
         """
         times = self.times(controls.shape[0])
         each = (times[:-1], states[:-1], controls, self.stage_multipliers)
-        final = self.final_cost(times[-1], states[-1])
-        return (jnp.sum(jax.vmap(self.stage_cost)(*each)) + final).astype(states.dtype)
+        with products_whole():
+            final = self.final_cost(times[-1], states[-1])
+            total = jnp.sum(jax.vmap(self.stage_cost)(*each)) + final
+        return total.astype(states.dtype)
 
     def roll_out(
         self, controls: Array, states: Array | None = None, gains: Array | None = None

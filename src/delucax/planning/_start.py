@@ -9,14 +9,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_finite, check_instance
+from .._jax import host_unless_traced, jacobian, xp
 from .._message import shortened
 from .._module import as_float_array, parameter
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..math._linear_solve import is_definite
+from ..math._linear_solve import full_precision, is_definite, symmetric
+from ..math._small import products_whole
 from ..riccati import dare
-from ._lq import model
 from ._problem import Problem
 
 
@@ -113,6 +114,22 @@ class Start(eqx.Module):
                 f"{where}: {name}.states must be given with {name}.gains, got none."
             )
         return Start(*arrays)
+
+    def stacked(self, state_size: int) -> "Start":
+        """One start or several as several, with states and gains.
+
+        **Arguments:** `state_size`: n.
+        """
+        start = self
+        if self.controls.ndim == 2:
+            start = jax.tree.map(lambda a: a[None], self)
+        controls, states, gains = start.controls, start.states, start.gains
+        if states is None or gains is None:
+            # Zero gains make the states irrelevant.
+            c, T, m = controls.shape
+            states = jnp.zeros((c, T + 1, state_size), controls.dtype)
+            gains = jnp.zeros((c, T, m, state_size), controls.dtype)
+        return Start(controls, states, gains)
 
     def cheapest(self, problem: Problem) -> tuple["Start", Array, Array, Array]:
         """The start with the cheapest trajectory.
@@ -212,8 +229,9 @@ class Start(eqx.Module):
             # Not differentiable. A planner that needs derivatives says so itself.
             regulator = None
         else:
-            regulator = dare(*matrices, throw=False), posed
-        return _both(point, regulator, controls, T)
+            solution = dare(*matrices, throw=False)
+            regulator = solution.K, solution.spectral_radius, posed
+        return Start(*_both(*point, regulator, controls, T))
 
 
 def operating_point(
@@ -225,12 +243,15 @@ def operating_point(
 
 
 @eqx.filter_jit
+@full_precision
 def _expanded(dynamics, cost, x, u, t0):
     """The linear-quadratic problem about a point, and whether it is one."""
-    # The local model of a horizon of one step at the point.
+    n, z = x.shape[0], jnp.concatenate([x, u])
     problem = Problem(dynamics, cost, x, t0)
-    stages = model(problem, jnp.stack([x, x]), u[None], None, False)
-    n, F, H = x.shape[0], stages.F[0], stages.H[0]
+    stage_cost = lambda z: problem.stage_cost(t0, z[:n], z[n:], None)
+    with products_whole():
+        F = jacobian(lambda z: problem.step(t0, z[:n], z[n:], None))(z)
+        H = symmetric(jax.hessian(stage_cost)(z)).astype(x.dtype)
     # z'Hz = x'Qx + 2 x'Su + u'Ru.
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
     posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
@@ -239,23 +260,22 @@ def _expanded(dynamics, cost, x, u, t0):
     return *safe, jnp.where(posed, S, 0), posed
 
 
-@eqx.filter_jit
-def _both(point, regulator, controls, T):
-    """The starts under a regulator, and under the controls alone."""
-    x, u = point
-    K = jnp.zeros((u.shape[0], x.shape[0]), x.dtype)
+@host_unless_traced
+def _both(x, u, regulator, controls, T):
+    """Controls, states and gains of the starts under a regulator, and under the
+    controls alone."""
+    K = xp.zeros((u.shape[0], x.shape[0]), x.dtype)
     if regulator is not None:
-        solution, posed = regulator
+        gain, radius, posed = regulator
         # Any stabilising gain is a valid start, also one of large residual.
-        stable = posed & (solution.spectral_radius < 1)
-        stable = stable & jnp.all(jnp.isfinite(solution.K))
-        K = jnp.where(stable, solution.K, K)
+        stable = posed & (radius < 1) & xp.all(xp.isfinite(gain))
+        K = xp.where(stable, gain, K)
     # Both starts are feedback, the second with a gain of zero, so that they stack.
-    held = jnp.tile(u, (T, 1))
-    return Start(
-        jnp.stack([held, held if controls is None else controls]),
-        jnp.tile(x, (2, T + 1, 1)),
-        jnp.stack([jnp.tile(K, (T, 1, 1)), jnp.zeros((T, *K.shape), K.dtype)]),
+    held = xp.tile(u, (T, 1))
+    return (
+        xp.stack([held, held if controls is None else controls]),
+        xp.tile(x, (2, T + 1, 1)),
+        xp.stack([xp.tile(K, (T, 1, 1)), xp.zeros((T, *K.shape), K.dtype)]),
     )
 
 
