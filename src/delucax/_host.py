@@ -139,7 +139,7 @@ def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C
     return start
 
 
-def fori_loop(low: int, high: int, body: Callable[[Any, _C], _C], start: _C) -> _C:
+def fori_loop(low: Any, high: Any, body: Callable[[Any, _C], _C], start: _C) -> _C:
     """`lax.fori_loop`."""
     if not _ON_HOST.get():
         return jax.lax.fori_loop(low, high, body, start)
