@@ -187,3 +187,19 @@ def entry(table: Any, *index: Any) -> Any:
         return table[index]
     # Nothing is clipped, which compiles sooner.
     return table.at[index].get(mode="promise_in_bounds")
+
+
+def numbers(*values: Any, dtype: Any) -> Any:
+    """Numbers and flags as one vector.
+
+    XLA compiles each operand of a concatenation as a program of its own, and these
+    selects as one.
+    """
+    if _ON_HOST.get():
+        return np.array([float(value) for value in values], dtype)
+    # A constant: comparisons with an iota would be moved out of a loop, one by one.
+    place = np.arange(len(values))
+    vector = jnp.zeros(len(values), dtype)
+    for k, value in enumerate(values):
+        vector = jnp.where(place == k, jnp.asarray(value, dtype), vector)
+    return vector

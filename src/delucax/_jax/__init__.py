@@ -7,6 +7,7 @@ from .._host import (
     fori_loop as fori_loop,
     host_unless_traced as host_unless_traced,
     lax as lax,
+    numbers as numbers,
     on_host as on_host,
     scan as scan,
     stop_gradient as stop_gradient,

@@ -107,18 +107,15 @@ def _by_slices(left, right, *added):
 
 def product_in_parts(
     left: Float[Array, "n k"], right: Float[Array, "k m"]
-) -> tuple[Float[Array, "n m"], int]:
-    """The product of two matrices, and its error bound, in units of rounding of the
-    product of their absolute values.
-
-    The error of a sum of k products is at most k units, in any order; summation in
-    parts reduces it for a long sum.
+) -> Float[Array, "n m"]:
+    """The product of two matrices, whose error is at most `units_of_sum(k)` units of
+    rounding of the product of their absolute values: a long sum is taken in parts.
 
     Source: Higham, 2002, sections 3.1 and 4.2; Jeannerod and Rump, 2013.
     """
     k = left.shape[1]
     if k < _LONG:
-        return left @ right, k
+        return left @ right
     length = -(-k // _PARTS)
     pad = _PARTS * length - k
     left = xp.pad(left, ((0, 0), (0, pad))).reshape(len(left), _PARTS, length)
@@ -128,7 +125,13 @@ def product_in_parts(
         return total + factors[0] @ factors[1], None
 
     total = xp.zeros((len(left), right.shape[2]), left.dtype)
-    return scan(add, total, (xp.swapaxes(left, 0, 1), right))[0], length + _PARTS
+    return scan(add, total, (xp.swapaxes(left, 0, 1), right))[0]
+
+
+def units_of_sum(k: int) -> int:
+    """The most units of rounding by which `product_in_parts` is off, in any order of
+    the sums of `k` products."""
+    return k if k < _LONG else -(-k // _PARTS) + _PARTS
 
 
 def _sum(a: Array, b: Array) -> tuple[Array, Array]:

@@ -6,11 +6,12 @@ from jaxtyping import Float
 
 from .._jax import lax, scan, stop_gradient, while_loop, xp
 from .._typing import Array, Scalar, Square
-from ._linear_solve import factorised, full_precision, symmetric
-from ._norms import relative_size
+from ._linear_solve import full_precision, solve, symmetric
+from ._norms import largest, relative_size
 
 
 _REFINEMENTS = 3
+_SIGN_STEPS = 60
 MAX_DOUBLINGS = 60
 """2**60 steps: a spectral radius closer to 1 is not resolved in float64."""
 
@@ -66,23 +67,13 @@ def smith(
 def stable_sylvester(
     A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
-    """`A X + X B = C` for stable `A` and `B` (default `A'`), and the doublings taken.
+    """`A X + X B = C` for stable `A` and `B` (default `A'`), and the steps taken.
 
-    With `P = (A - c)^-1 (A + c)` and likewise of `B` it is the Stein equation
-    `X = P X P_B - 2c (A - c)^-1 C (B - c)^-1`. Iterative refinement recovers what
-    the transform loses of a wide spectrum.
+    By the sign iteration of `A`, of `B`, and of `C` beside them. Iterative refinement
+    recovers what it loses of a wide spectrum.
     """
-    n, m = C.shape
     eps = xp.finfo(C.dtype).eps
     other = A.T if B is None else B
-    # The geometric mean of the eigenvalues' sizes: the transform maps what is far above
-    # it and far below it towards the circle alike. The determinant gives it without
-    # eigenvalues.
-    logs = xp.linalg.slogdet(A)[1]
-    logs = 2 * logs if B is None else logs + xp.linalg.slogdet(B)[1]
-    c = xp.exp(logs / (2 * n if B is None else n + m))
-    shifted_A, power_A = _cayley(A, c)
-    shifted_B, power_B = (shifted_A, None) if B is None else _cayley(B.T, c)
 
     def more(carry):
         *_, going, k = carry
@@ -90,10 +81,7 @@ def stable_sylvester(
 
     def body(carry):
         X, rest, residual, iterations, _, k = carry
-        scaled = shifted_B(shifted_A(rest).T).T
-        change, doublings = smith(
-            power_A, None if power_B is None else power_B.T, -2 * c * scaled
-        )
+        change, steps = _by_sign(A, B, rest)
         candidate = X + change
         left, right = A @ candidate, candidate @ other
         left_over = C - left - right
@@ -103,7 +91,7 @@ def stable_sylvester(
         X = xp.where(better, candidate, X)
         residual = xp.where(better, relative, residual)
         going = better & (residual > 10 * eps)
-        return X, left_over, residual, iterations + doublings, going, k + 1
+        return X, left_over, residual, iterations + steps, going, k + 1
 
     unknown, zero = xp.asarray(xp.inf, C.dtype), xp.asarray(0)
     start = xp.zeros_like(C), C, unknown, zero, xp.asarray(True), zero
@@ -111,11 +99,42 @@ def stable_sylvester(
     return X, iterations
 
 
-def _cayley(A, c):
-    """The solution with `A - c`, and `(A - c)^-1 (A + c)`."""
-    shift = c * xp.eye(len(A), dtype=A.dtype)
-    solved = factorised(A - shift)
-    return solved, solved(A + shift)
+def _by_sign(A, B, C):
+    """`X` of `A X + X B = C`, and the steps taken.
+
+    The sign iteration `A <- (A + A^-1) / 2` takes `A` and `B` to `-I`, and
+    `C <- (C + A^-1 C B^-1) / 2` to `-2 X`.
+
+    Source: Roberts, 1971; Higham, 2008, section 5 (the scaling).
+    """
+    eps = float(xp.finfo(C.dtype).eps)
+    pair = (A,) if B is None else (A, B)
+    units = [xp.eye(len(M), dtype=M.dtype) for M in pair]
+
+    def more(carry):
+        *_, change, k = carry
+        return (change > eps**0.5 / 10) & (k < _SIGN_STEPS)
+
+    def body(carry):
+        pair, C, _, k = carry
+        inverses = [solve(M, unit) for M, unit in zip(pair, units, strict=True)]
+        right = inverses[0].T if len(pair) == 1 else inverses[1]
+        sizes = [largest(M) for M in pair], [largest(M) for M in inverses]
+        ratio = (sum(sizes[1]) / sum(sizes[0])) ** 0.5
+        # Near the limit, where the scale is one up to a half, it is left out.
+        scale = xp.where(xp.abs(ratio - 1) < 0.5, 1, ratio)
+        after = [
+            (scale * M + inverse / scale) / 2
+            for M, inverse in zip(pair, inverses, strict=True)
+        ]
+        C = (scale * C + inverses[0] @ C @ right / scale) / 2
+        # A NaN compares false, so that a lane that diverges stops.
+        change = sum(largest(M + unit) for M, unit in zip(after, units, strict=True))
+        return tuple(after), C, change, k + 1
+
+    start = pair, C, xp.asarray(xp.inf, C.dtype), xp.asarray(0)
+    _, C, _, steps = while_loop(more, body, start)
+    return -C / 2, steps
 
 
 @full_precision

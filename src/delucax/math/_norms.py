@@ -84,6 +84,11 @@ def size(matrix: Array) -> Array:
     return scale * _norm(matrix / scale)
 
 
+def largest(matrix: Array) -> Array:
+    """The size of the largest entry."""
+    return xp.max(xp.abs(matrix))
+
+
 def relative_size(error: Array, *terms: Array) -> Array:
     """The norm of an equation's residual over the sum of the norms of its terms."""
     return relative_and_total_size(error, xp.stack(terms))[0]

@@ -14,13 +14,15 @@ from jaxtyping import Array
 
 from .._jax import first_possible
 from ..math import matvec
-from ..math._linear_solve import full_precision, is_definite, SMALL, solve, symmetric
+from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..riccati import dre
 from ._problem import Problem, Values
 
 
 _UNROLL = 16
 """Products of matrices with an inner dimension up to this are written out."""
+_ELIMINATED = 5
+"""Systems of this many controls are solved entry by entry."""
 
 
 class Stages(NamedTuple):
@@ -182,7 +184,7 @@ def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
     Where it is not, the solution means nothing, but is finite if its arguments are.
     """
     m = matrix.shape[0]
-    if m > SMALL:
+    if m > _ELIMINATED:
         ok = is_definite(matrix)
         safe = jnp.where(ok, matrix, jnp.eye(m, dtype=matrix.dtype))
         return solve(safe, right), ok

@@ -97,9 +97,9 @@ def care(
     `x'Qx + 2 x'Su + u'Ru` over all time along `E dx/dt = A x + B u`, at cost
     `(Ex)' X (Ex)` from `x`.
 
-    The scaled sign iteration of the Hamiltonian matrix; if that fails, doubling of its
-    Cayley transform. Newton steps, accelerators, batches, derivatives and undetectable
-    modes: as of [`delucax.riccati.dare`][].
+    The scaled sign iteration of the Hamiltonian matrix; if that fails, once more in a
+    unit of `X` for weak controls. Newton steps, accelerators, batches, derivatives and
+    undetectable modes: as of [`delucax.riccati.dare`][].
 
     **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as of
     [`delucax.riccati.dare`][];
@@ -112,8 +112,8 @@ def care(
 
     **Raises:** as there, and `ValueError` on an `R` that is only semidefinite.
 
-    Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Chu, Fan and Lin, 2005
-    (doubling); Kleinman, 1968 (Newton); Benner, 2001 (balancing).
+    Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Kleinman, 1968 (Newton);
+    Benner, 2001 (balancing).
 
     !!! example
 

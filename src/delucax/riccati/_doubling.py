@@ -4,12 +4,13 @@ import jax
 import lineax as lx
 
 from .._jax import while_loop, xp
-from .._typing import Array, BoolScalar, Scalar, Square
+from .._typing import Array, Scalar, Square
 from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
-from ..math._norms import one_if_zero, relative_and_total_size, size
+from ..math._norms import largest, one_if_zero, size
 from ._arguments import RiccatiData
 from ._recursion import composed, Element, without_cross_weight
+from ._search import SECOND, UNIT
 
 
 _SIGN_STEPS = 60
@@ -29,20 +30,20 @@ def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
     return X0 + H, doublings
 
 
-def continuous_start(
-    data: RiccatiData, doubled: BoolScalar
-) -> tuple[Array, Array, Array]:
-    """A solution by the sign iteration, or by doubling if that is wanted; the size of
+def continuous_start(data: RiccatiData, kind: Scalar) -> tuple[Array, Array, Array]:
+    """A solution by the sign iteration, for this kind of attempt; the size of
     `B R^-1 B'`; and the steps taken."""
     A, G, Q = without_cross_weight(*data[:5])
-    # Under vmap both run for all members: the unwanted one ends before its first step.
-    by_sign, sign_steps = _by_sign(A, G, Q, ~doubled)
-    by_doubling, doublings = _by_doubling(A, G, Q, doubled)
-    X = xp.where(doubled, by_doubling, by_sign)
-    return X, size(G), xp.where(doubled, doublings, sign_steps)
+    size_A, size_G, size_Q = (one_if_zero(size(M)) for M in (A, G, Q))
+    # In a unit of X that makes the two quadratic blocks alike. If that fails, in the
+    # size of X where the control is weak, and set by the unstable modes alone.
+    unit = xp.where(kind == SECOND, size_A / size_G, xp.sqrt(size_Q / size_G))
+    unit = xp.where(kind == UNIT, 1, one_if_zero(unit))
+    X, steps = _by_sign(A, unit * G, Q / unit)
+    return unit * X, size_G, steps
 
 
-def _by_sign(A, G, Q, wanted):
+def _by_sign(A, G, Q):
     """`X` from the sign of the Hamiltonian matrix `H = [[A, -G], [-Q, -A']]`.
 
     With `J = [[0, I], [-I, 0]]`, the iteration `H <- (H + H^-1) / 2` is one of the
@@ -64,20 +65,21 @@ def _by_sign(A, G, Q, wanted):
     def body(carry):
         W, before, _, k = carry
         turned = J(solve(W, J(both)))
-        ratio = size(turned) / size(W)
+        ratio = largest(turned) / largest(W)
         # Scaling speeds up the way to the neighbourhood of the limit, where it would
         # keep the iteration from settling.
         scale = xp.where(before < 1e-2, 1, xp.sqrt(ratio))
         new = symmetric(scale * W + turned / scale) / 2
-        change = size(new - W) / size(new)
+        change = largest(new - W) / largest(new)
         # Convergence is quadratic: a small change that is not halved is rounding.
         stalled = (change < 1e-6) & (change > before / 2)
-        # A NaN compares false, so that a lane that diverges stops.
+        # A NaN compares false: at a singular W the iteration ends.
+        new = xp.where(change < xp.inf, new, W)
         going = (change > 10 * eps) & ~stalled
         return new, change, going, k + 1
 
     W = xp.block([[-Q, -A.T], [-A, G]])
-    start = (W, xp.asarray(xp.inf, dtype), xp.asarray(wanted), xp.asarray(0))
+    start = (W, xp.asarray(xp.inf, dtype), xp.asarray(True), xp.asarray(0))
     W, *_, iterations = while_loop(more, body, start)
     # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W. M alone may be
     # singular, so that X is computed by least squares from all 2n columns.
@@ -86,31 +88,9 @@ def _by_sign(A, G, Q, wanted):
     return symmetric(factorised(upper.T, lx.QR())(lower.T).T), iterations
 
 
-def _by_doubling(A, G, Q, wanted):
-    """`X` by doubling of the Cayley transform `(H - c)^-1 (H + c)`, which maps the left
-    half-plane into the circle; `c = |A|`.
-
-    Source: Chu, Fan and Lin, 2005.
-    """
-    n = A.shape[0]
-    # The formulas take 2c. It is at least twice the size of any eigenvalue of A.
-    shift = 2 * one_if_zero(size(A)) * xp.eye(n, dtype=A.dtype)
-    moved = A - shift / 2
-    left = solve(moved, G)
-    mixed = moved.T + Q @ left
-    right = solve(mixed.T, xp.concatenate([mixed.T + shift, left.T], axis=1))
-    # With A_c = A - cI and W = A_c' + Q A_c^-1 G: A = I + 2c W^-T, G = 2c A_c^-1 G W^-1
-    # and H = 2c W^-1 Q A_c^-1, the element to be doubled.
-    H = solve(mixed, solve(moved.T, Q).T)
-    H, G = symmetric(shift @ H), symmetric(shift @ right[:, n:])
-    return double((right[:, :n], G, H), xp.zeros_like(H), wanted)
-
-
-def double(
-    element: Element, X0: Square, wanted: BoolScalar | bool = True
-) -> tuple[Array, Array]:
-    """The limit of joining an interval's element to itself, as `J`, if it is wanted;
-    and the doublings taken.
+def double(element: Element, X0: Square) -> tuple[Array, Array]:
+    """The limit of joining an interval's element to itself, as `J`, and the doublings
+    taken.
 
     `X0` is what `J` is a correction to, for its size alone.
     """
@@ -123,20 +103,20 @@ def double(
     def body(carry):
         before, _, k = carry
         after = composed(before, before)
-        finite = xp.all(xp.stack([xp.all(xp.isfinite(M)) for M in after]))
+        # NaN and infinity, times zero, are NaN, which a sum keeps.
+        finite = xp.sum(0 * sum(after)) == 0
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
             lambda new, old: xp.where(finite, new, old), after, before
         )
         # In units of X = X0 + J, of which J may be a small part.
-        changes = xp.stack([J - before[2], J])
-        (change, whole), _ = relative_and_total_size(changes, (X0 + J)[None])
+        change, whole = largest(J - before[2]), largest(J)
         # The next change is at most |A|^2 |J|.
-        relative = xp.minimum(change, size(A) ** 2 * whole)
+        next_change = (len(A) * largest(A)) ** 2 * whole
+        relative = xp.minimum(change, next_change) / one_if_zero(largest(X0 + J))
         return after, xp.where(finite, relative, 0), k + 1
 
-    relative = xp.where(wanted, xp.asarray(xp.inf, X0.dtype), 0)
-    start = element, relative, xp.asarray(0)
+    start = element, xp.asarray(xp.inf, X0.dtype), xp.asarray(0)
     (_, _, J), _, doublings = while_loop(more, body, start)
     return J, doublings

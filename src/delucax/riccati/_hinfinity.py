@@ -257,7 +257,7 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     # Doubling of the equation of X - X0, from below the solution, to which it rises.
     element, unit = _element(discrete, data, problem, gamma, X0)
     J, iterations = double(element, X0 / unit)
-    X, left = newton_refine(
+    left = newton_refine(
         lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
         functools.partial(_correction, discrete),
         X0 + unit * J,
@@ -265,6 +265,7 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
         units=1,
         to_working_precision=True,
     )
+    X = left.X
     # Both loops must be stable: against the worst disturbance, and without any.
     _, _, weight = stationary(discrete, data, X)
     alone = A - B @ left.K[:m]

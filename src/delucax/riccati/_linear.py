@@ -40,7 +40,7 @@ class MatrixSolution(eqx.Module):
     - `residual`: the norm of the equation's residual over `(|A| + |B|) |X| + |C|`, in
         discrete time over `(|A| |B| + 1) |X| + |C|`: the relative change of the data
         that would make `X` exact.
-    - `iterations`: doublings taken.
+    - `iterations`: doublings, or steps of the sign iteration, taken.
     - `result`: success, or why not; one of `delucax.RESULTS`.
 
     `X` is differentiable; where the solve failed, its derivatives are zero.
@@ -76,7 +76,7 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     whose solution is, for a stable `A`, the covariance of `dx/dt = A x` driven by white
     noise of intensity `Q`.
 
-    Solved by a Cayley transform and doubling if all eigenvalues of `A` are on one side
+    Solved by the sign iteration if all eigenvalues of `A` are on one side
     of the imaginary axis. Otherwise a unique solution is still found, in one dense
     solve, up to `n = 16`; beyond it `result` is `RESULTS.not_separated`.
 
@@ -95,7 +95,7 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
     error at run time as `throw` says.
 
-    Source: Smith, 1968.
+    Source: Roberts, 1971.
 
     !!! example
 
@@ -153,7 +153,7 @@ def sylvester(
 
     `A X + X B = C`.
 
-    Solved by a shift, a Cayley transform and doubling if a line `Re(z) = s` has the
+    Solved by a shift and the sign iteration if a line `Re(z) = s` has the
     eigenvalues of `A` on one side and those of `-B` on the other. Otherwise a unique
     solution is still found, in one dense solve, up to 256 unknowns; beyond it `result`
     is `RESULTS.not_separated`.
@@ -173,7 +173,7 @@ def sylvester(
     **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
     error at run time as `throw` says.
 
-    Source: Smith, 1968.
+    Source: Roberts, 1971.
 
     !!! example
 

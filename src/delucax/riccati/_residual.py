@@ -7,17 +7,20 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Float
 
-from .._jax import vmap, while_loop, xp
+from .._jax import numbers, vmap, while_loop, xp
 from .._typing import Array, BoolScalar, Scalar, Square
-from ..math._accurate import product, product_in_parts
+from ..math._accurate import product, product_in_parts, units_of_sum
 from ..math._linear_solve import solve, symmetric
-from ..math._norms import relative_and_total_size
+from ..math._norms import largest, relative_and_total_size
 from ._arguments import RiccatiData
 
 
 _MARGIN = 1.01
 """Covers the rounding of the norms that a residual is the quotient of."""
 _NEWTON_STEPS = 8
+_FEW = 2**13
+"""Up to so many scalar products in an accurate residual it is taken at once: it is as
+fast as one in working precision."""
 _FINE = 64
 """Units of rounding in the relative residual that need no correction."""
 
@@ -89,12 +92,26 @@ def riccati_residual(
     if maximisers:
         terms.append(cross[:, first:] @ K[first:])
 
-    working, left = _evaluated(discrete, *data, X, K)
+    working = _working(discrete, data, X, K)
     closed_loop = working[1] if E is None else solve(E, working[1])
     needed = xp.asarray(accurately)
-    if accurately is not False:
-        sharper = lambda left, *working: _sharper(discrete, *data, X, working, left)
-        left = if_needed(needed, sharper, left, working)
+    if accurately is True:
+        left = _sharper(discrete, *data, X, *working)
+    else:
+        left = _evaluated(discrete, *data, X, *working)
+    if not isinstance(accurately, bool):
+
+        def sharper(wide, X, K):
+            left = _sharper(discrete, *data, X, *_working(discrete, data, X, K))
+            # Where nothing cancels the first bound may be the sharper one.
+            better = left.lost < wide.lost
+            error = xp.where(better, left.error, wide.error)
+            lost = xp.minimum(left.lost, wide.lost)
+            return _Left(
+                error, lost, wide.gap, xp.minimum(left.gap_lost, wide.gap_lost)
+            )
+
+        left = if_needed(needed, sharper, left, (X, K))
     error, lost, gap, gap_lost = left
     gap = xp.abs(gap) + gap_lost
     # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
@@ -110,8 +127,14 @@ def riccati_residual(
     units = xp.stack([xp.ones(n, dtype), *others])
     relative, sizes = vmap(in_units)(units)
     bounds = _MARGIN * relative[:, 1]
-    relative = xp.where(needed, bounds[0], relative[0, 0])
+    relative = xp.max(xp.where(needed, bounds, relative[:, 0]))
     return Residual(error, relative, bounds, K, closed_loop, sizes)
+
+
+def is_small(B: Array) -> bool:
+    """Whether an accurate residual costs no more than one in working precision."""
+    n, m = B.shape
+    return (3 * n + 2 * m) * 2 * (n + m) * n <= _FEW
 
 
 def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tuple):
@@ -153,34 +176,39 @@ class _Left(NamedTuple):
     gap_lost: Array
 
 
-def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
-    """N, L, T, Y = XL (XE in continuous time), Z = XE, and the residual."""
+def _working(discrete: bool, data: RiccatiData, X: Array, K: Array) -> tuple:
+    """N, L, T, Y = XL (XE in continuous time) and Z = XE."""
+    A, B, _, R, S, E = data
+    N = -K
+    L, T = A + product_in_parts(B, N), S.T + R @ N
+    Z = X if E is None else product_in_parts(X, E)
+    return N, L, T, product_in_parts(X, L) if discrete else Z, Z
+
+
+def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
+    """The residual, in working precision."""
     n, m = B.shape
     # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit, and a product of k
     # terms is off by k units of the product of absolute values. `lost_M` is that bound
-    # for M, `from_L` is what an error of L does to XL.
+    # for M, `from_L` is what an error of L does to XL. The rounded gain -N is taken for
+    # exact: any gain gives a valid bound.
     unit = xp.finfo(A.dtype).eps / 2
-    size_B, size_S, size_X, size_N = (xp.abs(M) for M in (B, S, X, K))
-    # From here on the rounded gain -N is taken for exact: any gain gives a valid bound.
-    N = -K
-    BN, units_BN = product_in_parts(B, N)
-    L, T = A + BN, S.T + R @ N
-    lost_L = (units_BN + 1) * unit * (xp.abs(A) + size_B @ size_N)
+    size_B, size_S, size_X, size_N = (xp.abs(M) for M in (B, S, X, N))
+    lost_L = (units_of_sum(m) + 1) * unit * (xp.abs(A) + size_B @ size_N)
     lost_T = (m + 1) * unit * (size_S.T + xp.abs(R) @ size_N)
     most_L, size_T = xp.abs(L) + lost_L, xp.abs(T)
-    Z, lost_Z = X, xp.zeros_like(X)
+    units = units_of_sum(n)
+    lost_Z = xp.zeros_like(X)
     if E is not None:
-        Z, units = product_in_parts(X, E)
         lost_Z = units * unit * (size_X @ xp.abs(E))
     if discrete:
-        Y, units = product_in_parts(X, L)
         lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
         subtracted = Z if E is None else E.T @ Z
     else:
-        Y, lost_Y, from_L = Z, lost_Z, xp.zeros_like(X)
+        lost_Y, from_L = lost_Z, xp.zeros_like(X)
         subtracted = xp.zeros_like(X)
     size_Y = xp.abs(Y)
-    square, units = product_in_parts(L.T, Y)
+    square = product_in_parts(L.T, Y)
     SN, NT = S @ N, N.T @ T
     lost = most_L.T @ (units * unit * size_Y + lost_Y)
     # In discrete time an error of L is in both factors, as the second one is XL.
@@ -191,73 +219,74 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
             lost = lost + xp.abs(E).T @ (n * unit * xp.abs(Z) + lost_Z)
     else:
         square, lost = _twice(square), _twice(lost + both)
-    lost = lost + m * unit * (size_S @ size_N)
-    lost = lost + size_N.T @ (m * unit * size_T + lost_T)
+    lost = lost + m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
     # Four additions, each of a sum no larger than that of the sizes, and a margin.
-    added = sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
-    lost = lost + 5 * unit * added
+    lost = lost + 5 * unit * sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
     gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost = gap_lost + lost_T + 2 * unit * size_T
     error = square - subtracted + Q + SN + NT
-    return (N, L, T, Y, Z), _Left(error, lost, B.T @ Y + T, gap_lost)
+    return _Left(error, lost, B.T @ Y + T, gap_lost)
 
 
-def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
-    """The residual in more digits, and entry by entry the sharper bound.
+def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
+    """The residual in more digits.
 
     The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
-    place at which their matrix stands in the equation.
+    place at which their matrix stands in the equation. One product gives all of them
+    and the sum.
     """
-    N, L, T, Y, Z = working
     n, m = B.shape
-    eps = xp.finfo(A.dtype).eps
-    stacked = xp.concatenate
+    eps, nothing = xp.finfo(A.dtype).eps, xp.zeros_like(X)
+    right = dict(N=N, L=L, Y=Y, T=T)
+    if E is not None:
+        right |= dict(E=E, Z=Z)
+
+    def row(**factors):
+        """The row of a block matrix with these factors of N, L, ..."""
+        rows = len(next(iter(factors.values())))
+        blocks = (
+            factors.get(name, xp.zeros((rows, len(M)), A.dtype))
+            for name, M in right.items()
+        )
+        return xp.concatenate(list(blocks), axis=1)
+
+    # Each row: its factors, what is added, what is subtracted; and how a rest stands
+    # in the equation.
+    rows = [(row(N=B), A, L, 2 * Y), (row(N=R), S.T, T, N)]
     if discrete:
-        terms, of_X, added = [(L, Y), (S.T, N), (N, T)], [(L, Y, L)], [Q]
-        if E is None:
-            added.append(-X)
-        else:
-            terms.append((-E, Z))
-            of_X.append((E, Z, -E))
+        rows.append((row(L=X), nothing, Y, L))
+    if E is not None:
+        rows.append((row(E=X), nothing, Z, -E if discrete else 2 * L))
+    if not discrete:
+        whole = row(N=S, L=Y.T, Y=L.T, T=N.T)
+    elif E is None:
+        whole = row(N=S, Y=L.T, T=N.T)
     else:
-        terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
-        of_X = [] if E is None else [(E, Z, 2 * L)]
-    # Pairs of a rest and the bound on its error. With S and R stacked under A and B one
-    # product gives the rests of both L and T.
-    pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
-    rests = list(zip(*(xp.split(M, [n]) for M in pair), strict=True))
-    if of_X:
-        rights, wholes, _ = (stacked(M, axis=1) for M in zip(*of_X, strict=True))
-        pair = product(X, rights, -wholes)
-        rests += zip(*(xp.split(M, len(of_X), axis=1) for M in pair), strict=True)
-    factor = stacked([2 * Y, N, *(M for *_, M in of_X)]).T
-    rest, rest_lost = (stacked(M) for M in zip(*rests, strict=True))
+        whole = row(N=S, Y=L.T, T=N.T, Z=-E.T)
+    rows.append((whole, Q, X if discrete and E is None else nothing, nothing))
+    left, added, subtracted, factor = (
+        xp.concatenate(M) for M in zip(*rows, strict=True)
+    )
+    value, rounding = product(
+        left, xp.concatenate([*right.values()]), added, -subtracted
+    )
+    rest, rest_lost, factor = value[:-n], rounding[:-n], factor[:-n].T
     sizes = xp.abs(rest)
     most = sizes + rest_lost
-    left, right = (stacked(M) for M in zip(*terms, strict=True))
-    error, lost = product(left.T, right, *added)
-    error = error + factor @ rest
+    error = value[-n:] + factor @ rest
+    lost = rounding[-n:]
     lost = lost + xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
-    # The second-order terms: an error of L times an error of the factor beside it.
-    most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * xp.abs(Y)
-    if of_X:
-        most_Y = most[n + m : 2 * n + m]
-        around = around + most_Y
-        lost = lost + 2 * most_L.T @ most_Y
+    # The second-order terms, an error of L times one of the factor beside it, are far
+    # below those of the first order: the largest entries will do.
+    error_L, around = largest(most[:n]), (n + 4) * eps * xp.abs(Y)
     if discrete:
-        from_L = xp.abs(X) @ most_L
-        around = around + from_L
-        lost = lost + most_L.T @ from_L
-    gap_lost = xp.abs(B.T) @ around + most_T + (n + 4) * eps * xp.abs(T)
-    lost = symmetric(lost)
-    # Where nothing cancels the first bound may be the sharper one.
-    sharper = lost < wide.lost
-    return _Left(
-        xp.where(sharper, symmetric(error), wide.error),
-        xp.where(sharper, lost, wide.lost),
-        wide.gap,
-        xp.minimum(gap_lost, wide.gap_lost),
-    )
+        beside = largest(most[n + m : 2 * n + m]) + n * largest(X) * error_L
+        lost, around = lost + 2 * n * error_L * beside, around + beside
+    elif E is not None:
+        beside = largest(most[n + m :])
+        lost, around = lost + 2 * n * error_L * beside, around + beside
+    gap_lost = xp.abs(B.T) @ around + most[n : n + m] + (n + 4) * eps * xp.abs(T)
+    return _Left(symmetric(error), symmetric(lost), B.T @ Y + T, gap_lost)
 
 
 def _twice(M):
@@ -286,6 +315,26 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     return xp.where(xp.isfinite(relative), relative, xp.inf)
 
 
+class Refined(NamedTuple):
+    """The best point of a refinement: `X`, its gain and closed loop one below the
+    other; and its residual, as of `Residual`."""
+
+    point: Float[Array, "rows n"]
+    relative: Scalar
+    bounds: Float[Array, " units"]
+    terms: Float[Array, " units"]
+
+    X = property(lambda self: matrices_of(self.point)[0])
+    K = property(lambda self: matrices_of(self.point)[1])
+    closed_loop = property(lambda self: matrices_of(self.point)[2])
+
+
+def matrices_of(point: Float[Array, "rows n"]) -> tuple[Square, Array, Square]:
+    """`X`, `K` and the closed loop."""
+    n = point.shape[1]
+    return point[:n], point[n:-n], point[-n:]
+
+
 def newton_refine(
     residual: Callable[[Array, Array], Residual],
     correction: Callable[[Array, Array, Array], Array],
@@ -294,50 +343,55 @@ def newton_refine(
     controls: int,
     units: int,
     to_working_precision: bool = False,
-) -> tuple[Array, Residual]:
+) -> Refined:
     """Newton refinement while the residual decreases.
 
     `residual(X, accurately)` evaluates the residual, of so many `controls` and in so
     many `units`, and `correction(X, closed_loop, error)` is the Newton step. Where its
     bound is too wide for a certificate the steps go on with accurate residuals, unless
-    they are to end in working precision. Returns the best `X`, and its residual.
+    they are to end in working precision.
 
     Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
     """
-    fine, wide = _FINE * float(xp.finfo(X.dtype).eps), tolerance(X.dtype)
+    n, dtype = len(X), X.dtype
+    fine, wide = _FINE * float(xp.finfo(dtype).eps), tolerance(dtype)
 
     def body(carry):
-        X, last, best, accurately, going, patient, k = carry
-        # The first round measures, those after it step: so there is one residual in
-        # the compiled program, which is most of its size.
+        X, loop, error, best, before = carry
+        going, patient, accurately, k, least = before[:5]
+        # The first step is zero, as its error is: the first round measures.
+        X = symmetric(X + correction(X, loop, error))
+        new = residual(X, (going > 0) & (accurately > 0))
         first = k == 0
-        step = if_needed(
-            going & ~first,
-            lambda _, *at: correction(*at),
-            xp.zeros_like(X),
-            (X, *last),
-        )
-        X = symmetric(X + step)
-        new = residual(X, going & accurately)
-        better = first | (new.relative < best[1].relative)
+        better = first | (new.relative < least)
         # Steps that gain little are at the level of rounding. But far from the solution
         # the residual may rise in the first one.
-        helped = first | (new.relative < best[1].relative / 4)
-        best = jax.tree.map(lambda a, b: xp.where(better, a, b), (X, new), best)
-        rest = best[1].relative
-        again = helped | patient & (rest > wide)
-        again = again & (rest > fine) & (k < _NEWTON_STEPS)
+        helped = first | (new.relative < least / 4)
+        point = xp.concatenate([X, new.K, new.closed_loop])
+        best = xp.where(better, point, best)
+        measured = xp.concatenate([new.bounds, new.terms])
+        measured = xp.where(better, measured, before[5:])
+        least = xp.where(better, new.relative, least)
+        again = helped | (patient > 0) & (least > wide)
+        again = again & (least > fine) & (k < _NEWTON_STEPS)
         # The bound is too wide for a certificate: once more, accurately, from the best.
-        hidden = ~again & ~accurately & (xp.max(best[1].bounds) > wide)
-        X = xp.where(hidden, best[0], X)
-        k = xp.where(hidden, 0, k + 1)
-        last = new.closed_loop, new.error
-        return X, last, best, accurately | hidden, again | hidden, helped, k
+        hidden = ~again & ~(accurately > 0) & (xp.max(measured[:units]) > wide)
+        X = xp.where(hidden, best[:n], X)
+        after = numbers(
+            again | hidden,
+            helped,
+            (accurately > 0) | hidden,
+            xp.where(hidden, 0, k + 1),
+            least,
+            dtype=dtype,
+        )
+        error = xp.where(again, new.error, 0)
+        return X, new.closed_loop, error, best, xp.concatenate([after, measured])
 
-    yes = xp.asarray(True)
-    shapes = X.shape, (), units, (controls, len(X))
-    matrix, number, vector, gain = (xp.zeros(shape, X.dtype) for shape in shapes)
-    unknown = Residual(matrix, number, vector, gain, matrix, vector)
-    accurately = xp.asarray(to_working_precision)
-    start = X, (matrix, matrix), (X, unknown), accurately, yes, yes, xp.asarray(0)
-    return while_loop(lambda carry: carry[4], body, start)[2]
+    eye = xp.eye(n, dtype=dtype)
+    # Of a stable loop without an error the correction is zero.
+    best = xp.zeros((2 * n + controls, n), dtype)
+    begin = numbers(1, 1, to_working_precision, *[0] * (2 + 2 * units), dtype=dtype)
+    start = X, -eye / 2, xp.zeros_like(X), best, begin
+    *_, best, end = while_loop(lambda carry: carry[-1][0] > 0, body, start)
+    return Refined(best, end[4], end[5 : 5 + units], end[5 + units :])

@@ -4,12 +4,11 @@ perturbed problems that tell why there is no solution."""
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 from jaxtyping import Float, Int
 
-from .._jax import entry, stop_gradient, while_loop, xp
+from .._jax import entry, numbers, stop_gradient, while_loop, xp
 from .._results import choose, Result, RESULTS
-from .._typing import Array, BoolScalar, Scalar, Square
+from .._typing import Array, BoolScalar, Scalar
 from ..math._linear_solve import solve
 from ..math._lyapunov import MAX_DOUBLINGS
 from ..math._norms import one_if_zero, power_of_two, size
@@ -17,11 +16,10 @@ from ._arguments import RiccatiData
 from ._residual import tolerance
 
 
-FIRST, BALANCED, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(7)
+FIRST, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(6)
 """The kinds of attempt.
 
 - `FIRST`: the problem as given.
-- `BALANCED`: after diagonal balancing of the states, which later attempts keep.
 - `SECOND`: from another starting point.
 - `PERTURBED`: with `Q` less by rounding. If the closed loop is stable by rounding
     alone, the solution of this problem differs much, or there is none.
@@ -31,23 +29,20 @@ FIRST, BALANCED, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(7)
     boundary of stability, that of the problem is on it.
 """
 _NEXT = (
-    # Following a success, a failure in badly scaled units, and any other failure.
+    # Following a failure, and a success.
     #
-    # FIRST: a success near the boundary is to be confirmed. A failure is attributed
-    # to the scaling if that is bad, else to the starting point.
-    (PERTURBED, BALANCED, SECOND),
-    # BALANCED: likewise, and the scaling is ruled out.
-    (PERTURBED, SECOND, SECOND),
+    # FIRST: a success near the boundary is to be confirmed.
+    (SECOND, PERTURBED),
     # SECOND: the last attempt at a solution. The others find out why there is none.
-    (PERTURBED, UNIT, UNIT),
-    # PERTURBED: the solution is confirmed, or marginal. That may be due to bad scaling;
-    # if not, the question is whether the pair is stabilisable.
-    (DONE, BALANCED, UNIT),
+    (UNIT, PERTURBED),
+    # PERTURBED: the solution is confirmed, or marginal: the question is then whether
+    # the pair is stabilisable.
+    (UNIT, DONE),
     # UNIT: of a stabilisable pair the closed loop may be on the boundary. If that is
     # known already, or the pair is not stabilisable, there is nothing more to find out.
-    (REGULARISED, DONE, DONE),
+    (DONE, REGULARISED),
     # REGULARISED: the last question.
-    (DONE, DONE, DONE),
+    (DONE, DONE),
 )
 """The next attempt. Far from the boundary a solution needs no `PERTURBED`."""
 _GAP_TOLERANCE = 0.3
@@ -58,149 +53,135 @@ _BALANCE_THRESHOLD = 4
 """Units within this many powers of two of each other are left as they are."""
 
 
-class Candidate(NamedTuple):
-    """A candidate for the stabilising solution."""
+class Attempt(NamedTuple):
+    """A candidate for the stabilising solution, and the quantities that decide on it.
 
-    X: Square
-    residual: Scalar  # after balancing
-    unscaled: Scalar  # the residual in the user's units
+    `point` holds the matrices of the candidate, one below the other.
+    """
+
+    point: Array
+    residual: Scalar  # in balanced units
+    unscaled: Scalar  # in the user's units
     bound: Scalar  # spectral radius or abscissa of the closed loop
     gap: Scalar  # its distance from the boundary of stability, positive if stable
-
-
-class Attempt(NamedTuple):
-    """A candidate, and the quantities that decide on it."""
-
-    candidate: Candidate
     rounding: Scalar  # of the gap
     near: BoolScalar  # whether the gap is within reach of rounding of the data
     around: BoolScalar  # the same for the wider margin of `REGULARISED`
-    attainable: Scalar  # the balanced residual that rounding of X alone may cause
+    attainable: Scalar  # the residual that rounding of X alone may cause
     bounded: BoolScalar  # whether |X| is well below |Q| / sqrt(eps)
     iterations: Int[Array, ""]
 
 
-class SearchResult(NamedTuple):
-    """The best candidate, and the diagnosis of the other attempts."""
+class Verdict(NamedTuple):
+    """The best candidate in numbers, and the diagnosis of the other attempts.
 
-    best: Candidate
-    solved: BoolScalar
-    stable: BoolScalar
-    marginal: BoolScalar  # whether rounding of the data changes or removes the solution
-    stabilisable: BoolScalar
-    on_boundary: BoolScalar
-    balanced: BoolScalar
-    well_posed: BoolScalar
-    iterations: Int[Array, ""]
+    Flags are 0 or 1: one array of numbers is carried and selected at once, which
+    compiles sooner than one for each.
+    """
 
-    @property
-    def X(self) -> Square:
-        return self.best.X
+    kind: Scalar  # of the next attempt
+    residual: Scalar
+    unscaled: Scalar
+    bound: Scalar
+    gap: Scalar
+    solved: Scalar
+    stable: Scalar
+    marginal: Scalar  # whether rounding of the data changes or removes the solution
+    stabilisable: Scalar
+    on_boundary: Scalar
+    iterations: Scalar
 
-    @property
-    def differentiable(self) -> BoolScalar:
-        return self.stable & xp.all(xp.isfinite(self.X)) & self.well_posed
-
-    @property
-    def result(self) -> Result:
+    def result(self, well_posed: BoolScalar) -> Result:
         """The status."""
-        good = self.solved & ~self.marginal
-        close = self.stable & (self.best.residual <= tolerance(self.X.dtype) ** 0.5)
+        stable, marginal = self.stable > 0, self.marginal > 0
+        close = stable & (self.residual <= tolerance(self.residual.dtype) ** 0.5)
         result = choose(close, RESULTS.not_converged, RESULTS.not_stabilising)
-        result = choose(self.marginal | self.on_boundary, RESULTS.on_boundary, result)
-        result = choose(self.stabilisable, result, RESULTS.not_stabilisable)
+        on_boundary = marginal | (self.on_boundary > 0)
+        result = choose(on_boundary, RESULTS.on_boundary, result)
+        result = choose(self.stabilisable > 0, result, RESULTS.not_stabilisable)
+        good = (self.solved > 0) & ~marginal
         result = choose(good, RESULTS.successful, result)
-        return choose(self.well_posed, result, RESULTS.ill_posed)
+        return choose(well_posed, result, RESULTS.ill_posed)
 
 
 def search(
-    attempt: Callable[[Int[Array, ""], BoolScalar], Attempt],
-    X: Square,
-    well_posed: BoolScalar,
-    badly_scaled: BoolScalar,
-) -> SearchResult:
-    """Make attempts of the kinds above, as few as are needed.
+    attempt: Callable[[Int[Array, ""]], Attempt], point: Array, well_posed: BoolScalar
+) -> tuple[Array, Array]:
+    """Make attempts of the kinds above, as few as are needed; the best point, and the
+    numbers of the verdict. `point` is one that stands for no solution.
 
-    `attempt(kind, balanced)` is in balanced or in the user's units, which may be
-    `badly_scaled`. Most problems are solved by the first attempt. In a batch, the
-    others are made if any member needs them.
+    Most problems are solved by the first attempt. In a batch, the others are made if
+    any member needs them.
     """
-    dtype = X.dtype
+    dtype = point.dtype
     close = tolerance(dtype)
 
     def body(carry):
-        kind, before = carry
+        best, so_far = carry
         # One attempt, whose kind is data: a branch for each would be compiled for each,
         # and under vmap all of them run.
-        best = before.best
-        balanced = before.balanced | (kind == BALANCED)
-        new = attempt(kind, balanced)
-        at = new.candidate
-        stable = at.gap > new.rounding
+        before = Verdict(*so_far)
+        kind = before.kind
+        at = attempt(kind)
+        stable = at.gap > at.rounding
         # Rounding of X may not allow a smaller residual: up to a hundred times the
         # tolerance is accepted then.
-        enough = xp.clip(new.attainable, close, 100 * close)
-        # With bad scaling a wrong X can have a small balanced residual.
-        unfit = badly_scaled & ~balanced
-        solved = stable & (at.residual <= enough) & (~unfit | (at.unscaled <= close))
+        enough = xp.clip(at.attainable, close, 100 * close)
+        solved = stable & (at.residual <= enough)
         unchanged = kind <= SECOND  # the user's problem, not a perturbed one
         # Between two solutions the smaller residual decides. Between two failures the
         # first is kept, unless only the second is stable.
-        take = solved & (~before.solved | (at.unscaled < best.unscaled))
-        take = unchanged & (take | (kind == FIRST) | stable & ~before.stable)
+        take = solved & (~(before.solved > 0) | (at.unscaled < before.unscaled))
+        take = take | (kind == FIRST) | stable & ~(before.stable > 0)
+        take = unchanged & take
 
         # For a perturbed problem a rough solution is enough.
         survives = stable & (at.residual <= close**0.5)
         # Stable or not: the gap is smaller than its rounding.
-        undecided = ~stable & (at.gap >= -new.rounding)
-        undecided = undecided & (at.residual <= close) & new.bounded
+        undecided = ~stable & (at.gap >= -at.rounding)
+        undecided = undecided & (at.residual <= close) & at.bounded
         # The gap of a robust solution hardly changes with Q; that of a marginal one
         # changes by as much as itself.
         # So does that of rounding by chance, but no doubling converges to it.
-        same = xp.abs(at.gap - best.gap) <= _GAP_TOLERANCE * best.gap
-        same = same & (new.iterations < MAX_DOUBLINGS)
-        marginal = before.marginal & ~(unchanged & solved)
+        same = xp.abs(at.gap - before.gap) <= _GAP_TOLERANCE * before.gap
+        same = same & (at.iterations < MAX_DOUBLINGS)
+        marginal = (before.marginal > 0) & ~(unchanged & solved)
         marginal = xp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
-        solved_now, stable_now, kept = jax.tree.map(
-            lambda now, then: xp.where(take, now, then),
-            (solved, stable, at),
-            (before.solved, before.stable, best),
-        )
+        stable_now = xp.where(take, stable, before.stable > 0)
         stabilisable = survives | undecided | stable_now
-        near_it = survives & new.around
-        on_boundary = xp.where(kind == REGULARISED, near_it, before.on_boundary)
-        after = before._replace(
-            best=kept,
-            solved=solved_now,
+        on_boundary = xp.where(
+            kind == REGULARISED, survives & at.around, before.on_boundary > 0
+        )
+        success = xp.where(unchanged, solved, ~marginal & (~unit | survives))
+        following = entry(xp.asarray(_NEXT), kind.astype(int), success.astype(int))
+        kept = lambda new, old: xp.where(take, new, old)
+        after = Verdict(
+            kind=xp.where(unchanged & solved & ~at.near, DONE, following),
+            residual=kept(at.residual, before.residual),
+            unscaled=kept(at.unscaled, before.unscaled),
+            bound=kept(at.bound, before.bound),
+            gap=kept(at.gap, before.gap),
+            solved=kept(solved, before.solved),
             stable=stable_now,
             marginal=marginal,
             stabilisable=xp.where(unit, stabilisable, before.stabilisable),
             on_boundary=xp.where(unit, undecided, on_boundary),
-            balanced=balanced,
-            iterations=before.iterations + xp.where(unchanged, new.iterations, 0),
+            iterations=before.iterations + xp.where(unchanged, at.iterations, 0),
         )
-        # The column of the table.
-        success = xp.where(unchanged, solved, ~marginal & (~unit | survives))
-        outcome = xp.where(success, 0, xp.where(unfit, 1, 2))
-        following = entry(xp.asarray(_NEXT), kind, outcome)
-        over = unchanged & solved & ~new.near
-        return xp.where(over, DONE, following), after
+        return kept(at.point, best), numbers(*after, dtype=dtype)
 
-    most, no = xp.asarray(xp.inf, dtype), xp.asarray(False)
-    flags = "solved", "stable", "marginal", "on_boundary", "balanced"
-    nothing = SearchResult(
-        Candidate(X, residual=most, unscaled=most, bound=most, gap=-most),
-        **dict.fromkeys(flags, no),
-        stabilisable=xp.asarray(True),
-        well_posed=well_posed,
-        iterations=xp.asarray(0),
+    most = xp.asarray(xp.inf, dtype)
+    nothing = Verdict(
+        xp.where(well_posed, FIRST, DONE), most, most, most, -most, 0, 0, 0, 1, 0, 0
     )
-    start = xp.where(well_posed, FIRST, DONE)
-    return while_loop(lambda carry: carry[0] != DONE, body, (start, nothing))[1]
+    going = lambda carry: carry[1][0] != DONE
+    return while_loop(going, body, (point, numbers(*nothing, dtype=dtype)))
 
 
-def weights(kind: Int[Array, ""], data: RiccatiData) -> tuple[RiccatiData, Scalar]:
+def weights(
+    kind: Scalar, data: RiccatiData, by: Float[Array, " n"]
+) -> tuple[RiccatiData, Scalar]:
     """The data of an attempt of this kind, and the size of the state weight."""
     Q, R, S = data.Q, data.R, data.S
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
@@ -212,7 +193,8 @@ def weights(kind: Int[Array, ""], data: RiccatiData) -> tuple[RiccatiData, Scala
     scale_Q = xp.where(size_Q > 0, size_Q, scale_R)
     # A change of Q by eps is within the rounding of the data. One by the root of eps
     # moves eigenvalues off the boundary by about eps^(1/4).
-    change = xp.where(kind == PERTURBED, -10 * n * eps * size_Q, 0)
+    users = size(Q * (by[:, None] * by)) / by**2
+    change = xp.where(kind == PERTURBED, -10 * n * eps * users, 0)
     change = xp.where(kind == REGULARISED, eps**0.5 * scale_Q, change)
     unit = kind == UNIT
     Q = xp.where(unit, scale_Q * eye_Q, Q + change * eye_Q)
@@ -239,12 +221,14 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
         return xp.where(xp.isfinite(exponent), exponent, lowest)
 
     # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
-    # each. All in base-2 logarithms.
+    # each, and that of the cost, which is free: one more row and column, of which the
+    # factor balances the two. All in base-2 logarithms.
     effort = xp.sqrt(_diagonal_sizes(R))
     force = xp.max(xp.abs(plain_B) / one_if_zero(effort), axis=1)
-    weight = logarithm(xp.sqrt(_diagonal_sizes(Q)))
-    other = ~xp.eye(n, dtype=bool)
-    inside, force = logarithm(xp.abs(plain_A) * other), logarithm(force)
+    weight = xp.concatenate([xp.sqrt(_diagonal_sizes(Q)), xp.zeros(1, dtype)])
+    table = xp.concatenate([xp.abs(plain_A), force[:, None]], axis=1)
+    table = xp.concatenate([table, weight[None]])
+    table = logarithm(xp.where(xp.eye(n + 1, dtype=bool), 0, table))
 
     def more(carry):
         k, change, _ = carry
@@ -252,21 +236,17 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
 
     def sweep(carry):
         k, _, d = carry
-        moved = inside + d[:, None] - d
-        forced, weighed = force + d, weight - d
-        # The scale of the cost is free: it is chosen to make both blocks alike.
-        rows = xp.maximum(xp.max(moved, axis=1), forced + xp.max(weighed))
-        columns = xp.maximum(xp.max(moved, axis=0), weighed + xp.max(forced))
-        # Half of the step that each state would take alone, as all move at once.
-        change = (columns - rows) / 4
+        moved = table + d[:, None] - d
+        # Half of the step that each would take alone, as all move at once.
+        change = (xp.max(moved, axis=0) - xp.max(moved, axis=1)) / 4
         # A zero row or column, with the logarithm `lowest`, asks for a huge step.
         change = xp.where(xp.abs(change) < -lowest / 8, change, 0)
         return k + 1, change, d + change
 
-    start = xp.zeros(n, dtype)
+    start = xp.zeros(n + 1, dtype)
     *_, d = while_loop(more, sweep, (0, start + 1, start))
     # A factor common to all states has no effect: it is removed to avoid overflow.
-    d = d - xp.mean(d)
+    d = d[:n] - xp.mean(d[:n])
     f = d
     if E is not None:
         f = -xp.max(logarithm(xp.abs(E)) - d, axis=1)
@@ -274,8 +254,7 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     badly_scaled = xp.any(
         xp.max(both, axis=1) - xp.min(both, axis=1) > _BALANCE_THRESHOLD
     )
-    both = xp.where(badly_scaled, both, 0)
-    return power_of_two(xp.exp2(both))
+    return power_of_two(xp.exp2(xp.where(badly_scaled, both, 0)))
 
 
 def _diagonal_sizes(M):

@@ -36,23 +36,22 @@ def spectral_radius(A: Square) -> Scalar:
 
 def spectral_abscissa(A: Square) -> Scalar:
     """The largest real part of an eigenvalue, up to rounding of the balanced matrix."""
-    return abscissa_and_size(A)[0]
+    return abscissa_and_size(balanced(A))[0]
 
 
 def abscissa_and_size(
     A: Square,
 ) -> tuple[Scalar, Scalar]:
-    """The spectral abscissa, and the norm of the balanced matrix that it came from.
+    """The spectral abscissa, up to rounding of the matrix, and its norm.
 
     `h^-1 log` of the spectral radius of `exp(h A)`, with `h` small enough for a series.
     """
-    A = balanced(A)
     value, is_narrow, span, kept = _slowest(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         part = span.T @ A @ span
         # Directions left out come last.
         part = part - xp.diag(xp.where(kept, 0, size(part)))
-        within, *_ = _slowest(balanced(part), False)
+        within, *_ = _slowest(part, False)
         value = xp.where(is_narrow, within, value)
     return value, size(A)
 

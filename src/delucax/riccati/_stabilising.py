@@ -1,13 +1,14 @@
 """The stabilising solution of an algebraic Riccati equation, in either time."""
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 
 from .._jax import compiled_unless_on_host, custom_jvp, stop_gradient, xp
 from .._results import raise_on_failure, Result
-from .._typing import Array, BoolScalar
+from .._typing import Array, BoolScalar, Square
 from ..math._linear_solve import (
     factorised,
     full_precision,
@@ -26,17 +27,14 @@ from ._arguments import (
     where_solved,
 )
 from ._doubling import continuous_start, discrete_start
-from ._residual import newton_refine, riccati_residual, stationary
-from ._search import (
-    Attempt,
-    Candidate,
-    in_units,
-    search,
-    SearchResult,
-    SECOND,
-    units,
-    weights,
+from ._residual import (
+    is_small,
+    matrices_of,
+    newton_refine,
+    riccati_residual,
+    stationary,
 )
+from ._search import Attempt, in_units, search, SECOND, units, Verdict, weights
 from ._spectrum import abscissa_and_size, spectral_radius
 
 
@@ -135,69 +133,72 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
 def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     """The solution, computed with states in units that fit."""
     by = d, f = units(data)
-    data = in_units(by, data)
-    solution = _certified(discrete, data, by)
-    # The gain is a formula in X and the data, whose derivatives are then its own.
-    K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
-    residual, bound = stop_gradient((solution.best.unscaled, solution.best.bound))
+    solved = _certified(discrete, in_units(by, data), d)
+    verdict = Verdict(*stop_gradient(solved.numbers))
     # Back to the user's units, by powers of two: without rounding.
     return RiccatiSolution(
-        X=solution.X * (f[:, None] * f),
-        K=K * d,
-        residual=residual,
-        closed_loop=closed_loop / (d[:, None] / d),
-        iterations=solution.iterations,
-        result=solution.result,
-        **{"spectral_radius" if discrete else "spectral_abscissa": bound},
+        X=solved.X * (f[:, None] * f),
+        K=solved.K * d,
+        residual=verdict.unscaled,
+        closed_loop=solved.closed_loop / (d[:, None] / d),
+        iterations=verdict.iterations.astype(int),
+        result=verdict.result(solved.well_posed),
+        **{"spectral_radius" if discrete else "spectral_abscissa": verdict.bound},
     )
 
 
+class _Solved(NamedTuple):
+    """The best `X`, its gain and loop, and the verdict on it in numbers."""
+
+    X: Square
+    K: Array
+    closed_loop: Square
+    numbers: Array
+    well_posed: BoolScalar
+
+    @property
+    def differentiable(self) -> BoolScalar:
+        stable = Verdict(*self.numbers).stable > 0
+        return stable & xp.all(xp.isfinite(self.X)) & self.well_posed
+
+
 @functools.partial(custom_jvp, nondiff_argnums=(0,))
-def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
+def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
     """The certified search for the stabilising `X`, for data in balanced units, `by`
     times the user's."""
     A, B, Q, R, S, E = data
     n, eps = A.shape[0], float(xp.finfo(A.dtype).eps)
     # The starting points are computed for E^-1 A and E^-1 B.
-    explicit = data
-    if E is not None:
-        solved = factorised(E)
-        explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
+    plain = (A, B) if E is None else tuple(map(factorised(E), (A, B)))
     # In discrete time R + B'XB is inverted, in continuous time R alone.
     well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
-    for M in explicit[:5]:
-        well_posed = well_posed & xp.all(xp.isfinite(M))
+    # NaN and infinity, times zero, are NaN, which any sum keeps. R passed a comparison.
+    given = xp.concatenate([plain[0], Q, plain[1].T, S.T])
+    well_posed = well_posed & (xp.sum(0 * given) == 0)
+    small = is_small(B)
     magnified = 1 if E is None else size(E) ** 2
 
-    def attempt(kind: Array, balanced: Array) -> Attempt:
-        # From balanced units to those of the attempt.
-        back = state, row = xp.where(balanced, 1, 1 / by)
-        here, size_Q = weights(kind, in_units(back, data))
-        start = here
-        if E is not None:
-            # Without E the rows have the units of the states.
-            plain = in_units(xp.stack([state, state]), explicit)
-            start = here._replace(A=plain.A, B=plain.B)
-        # Discrete time restarts from a higher point, continuous time by doubling in
-        # place of the sign iteration.
-        second = kind == SECOND
+    def attempt(kind: Array) -> Attempt:
+        here, size_Q = weights(kind, data, by)
+        start = here._replace(A=plain[0], B=plain[1])
         if discrete:
-            height = xp.where(second, _SECOND_START * size_Q, size_Q)
+            height = xp.where(kind == SECOND, _SECOND_START * size_Q, size_Q)
             X, iterations = discrete_start(start, height)
             size_G = xp.zeros_like(size_Q)  # needed in continuous time alone
         else:
-            X, size_G, iterations = continuous_start(start, second)
-        # Residuals in the attempt's, the user's and the balanced units.
-        X, left = newton_refine(
-            lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
+            X, size_G, iterations = continuous_start(start, kind)
+        # Residuals in the balanced and in the user's units.
+        left = newton_refine(
+            lambda X, flag: riccati_residual(discrete, here, X, small or flag, by),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
             controls=here.B.shape[1],
-            units=3,
+            units=2,
+            to_working_precision=small,
         )
-        loop = left.closed_loop
+        X, loop = left.X, left.closed_loop
         if discrete:
             bound = spectral_radius(loop)
             # A stable loop may belong to a saddle point of an indefinite cost.
@@ -214,23 +215,26 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             # root.
             reach = xp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
             scale = size(loop)
-        # All else is expressed in balanced units.
-        balanced_X = X * (row[:, None] * row)
-        size_loop = size(loop * (state / state[:, None]))
+        size_X, size_loop = size(X), size(loop)
         gain = 1 + size_loop**2 if discrete else 2 * size_loop
         # A change dX by rounding causes a residual L'dX L - E'dX E, or E'dX L + L'dX E.
-        terms = xp.where(left.terms[2] > 0, left.terms[2], xp.inf)
+        terms = xp.where(left.terms[0] > 0, left.terms[0], xp.inf)
         return Attempt(
-            Candidate(balanced_X, left.bounds[2], left.bounds[1], bound, gap),
+            left.point,
+            *left.bounds,
+            bound,
+            gap,
             rounding=rounding,
             near=xp.abs(gap) < reach,
             around=xp.abs(gap) < 4 * eps**0.125 * scale,
-            attainable=8 * eps * size(balanced_X) * gain * magnified / terms,
-            bounded=size(X) * eps**0.5 < size_Q,
+            attainable=8 * eps * size_X * gain * magnified / terms,
+            bounded=size_X * eps**0.5 < size_Q,
             iterations=iterations,
         )
 
-    return search(attempt, xp.full_like(Q, xp.nan), well_posed, xp.any(by != 1))
+    unknown = xp.full((2 * n + B.shape[1], n), xp.nan, A.dtype)
+    point, numbers = search(attempt, unknown, well_posed)
+    return _Solved(*matrices_of(point), numbers, well_posed)
 
 
 @_certified.defjvp
@@ -238,21 +242,27 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
 def _certified_jvp(discrete, primals, tangents):
     """By the implicit function theorem; zero in unsolved members."""
     data, _ = primals
-    solution = _certified(discrete, *primals)
-    ok = solution.differentiable
+    solved = _certified(discrete, *primals)
+    ok = solved.differentiable
     # Masked at input and output, so that a failed member's NaN does not spread.
-    tangent = jax.tree.map(lambda t: xp.where(ok, t, 0), tangents[0])
-    safe, X = _harmless(ok, data, solution.X)
+    if_ok = lambda tree: jax.tree.map(lambda M: xp.where(ok, M, 0), tree)
+    tangent = if_ok(tangents[0])
+    A, B, Q, R, S, E = data
+    (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, solved.X), (R, E))
+    safe = RiccatiData(A, B, Q, R, S, E)
     # The derivative of the equation in X is the Lyapunov operator of the closed loop:
     # dX solves a Lyapunov equation whose constant is the derivative in the data.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
     # -I/2 is stable in both times, and its Lyapunov equation converges fast.
     loop = xp.where(ok, loop, shifted(-0.5, loop))
-    change = _correction(discrete, data.E, loop, xp.where(ok, error, 0))
-    still = no_tangent(solution)
-    best = still.best._replace(X=xp.where(ok, change, 0))
-    return solution, still._replace(best=best)
+    dX = if_ok(_correction(discrete, E, loop, if_ok(error)))
+    # The gain is a formula in X and the data, whose derivatives are then its own.
+    feedback = lambda *at: _terms(discrete, *at)[2:]
+    _, (dK, d_loop) = jax.jvp(feedback, (safe, X), (tangent, dX))
+    return solved, no_tangent(solved)._replace(
+        X=dX, K=if_ok(dK), closed_loop=if_ok(d_loop)
+    )
 
 
 def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array]:
@@ -274,30 +284,6 @@ def _terms(discrete, data, X):
     K = solve(weight, cross.T)
     closed_loop = A - B @ K
     return moved, cross, K, closed_loop if E is None else solve(E, closed_loop)
-
-
-@functools.partial(custom_jvp, nondiff_argnums=(0,))
-def _feedback(discrete: bool, ok: BoolScalar, data: RiccatiData, X: Array):
-    """`K` and the closed loop, with derivatives in members that are `ok` alone."""
-    *_, K, closed_loop = _terms(discrete, data, X)
-    return K, closed_loop
-
-
-@_feedback.defjvp
-@full_precision
-def _feedback_jvp(discrete, primals, tangents):
-    ok, *at = primals
-    if_ok = lambda tree: jax.tree.map(lambda M: xp.where(ok, M, 0), tree)
-    terms = lambda *at: _terms(discrete, *at)[2:]
-    _, tangent = jax.jvp(terms, _harmless(ok, *at), if_ok(tangents[1:]))
-    return _feedback(discrete, *primals), if_ok(tangent)
-
-
-def _harmless(ok: BoolScalar, data: RiccatiData, X: Array):
-    """The data and `X`, with finite placeholders in members that are not `ok`."""
-    A, B, Q, R, S, E = data
-    (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, X), (R, E))
-    return RiccatiData(A, B, Q, R, S, E), X
 
 
 def _correction(discrete: bool, E: Array | None, loop: Array, error: Array) -> Array:
