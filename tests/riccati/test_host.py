@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from delucax.riccati import _stabilising
 
 
 riccati, controllers = dlx.riccati, dlx.controllers
+linear: Any = dlx.LinearDynamics
 A = np.array([[1.1, 0.3], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
 Q, R, C = np.eye(2), np.eye(1), np.eye(2)[:1]
@@ -46,10 +48,10 @@ EQUATIONS = {
     ),
 }
 DESIGNS = {
-    "LQR": lambda A: controllers.LQR(dlx.LinearDynamics(A, B), Q, R),
-    "LQI": lambda A: controllers.LQI(dlx.LinearDynamics(A, B), np.eye(3), R, output=C),
-    "LQG": lambda A: controllers.LQG(dlx.LinearDynamics(A, B, C), Q, R, Q, R),
-    "HInfinity": lambda A: controllers.HInfinity(dlx.LinearDynamics(A, B), Q, R),
+    "LQR": lambda A: controllers.LQR(linear(A, B), Q, R),
+    "LQI": lambda A: controllers.LQI(linear(A, B), np.eye(3), R, output=C),
+    "LQG": lambda A: controllers.LQG(linear(A, B, C), Q, R, Q, R),
+    "HInfinity": lambda A: controllers.HInfinity(linear(A, B), Q, R),
 }
 
 
@@ -58,8 +60,9 @@ def counted_programs():
     """The events of compilation within."""
     events = []
 
-    def listen(name, _, **others):
-        if name == "/jax/core/compile/backend_compile_duration":
+    def listen(event, duration_secs, **others):
+        del duration_secs
+        if event == "/jax/core/compile/backend_compile_duration":
             events.append(others)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
