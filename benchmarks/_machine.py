@@ -20,6 +20,18 @@ def limit_cores(count: int) -> None:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
 
 
+PINNED = "One core, no threads for products"
+"""The setting that says what the arithmetic costs; users run with the defaults."""
+
+
+def pinned_environment() -> dict[str, str]:
+    """The environment of a process whose products have no threads; the process calls
+    `limit_cores(1)`."""
+    names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"
+    return os.environ | dict.fromkeys(names, "1") | {"XLA_FLAGS": flags.strip()}
+
+
 def describe() -> dict[str, Any]:
     """Processor, cores, device, versions, load and date; no host name."""
     import cpuinfo

@@ -1,4 +1,5 @@
-"""Speed of batches on CPU: a barrier against recomputation, and a sequential `vmap`.
+"""Speed of batches on CPU: a barrier against recomputation, small products without
+calls of a library, and a sequential `vmap`.
 
 XLA on CPU compiles each component of a loop's state into a program of its own and
 repeats in it all that the component depends on: both components of a pendulum's next
@@ -7,15 +8,20 @@ stages. For a batch it is about twice as fast to store such a value once, in cac
 barrier does nothing without a batch or on accelerators, where it would be slower.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+
+from .._host import on_host
 
 
 _fence = Primitive("fence")
@@ -64,6 +70,62 @@ ad.primitive_transposes[_fence] = _transpose
 mlir.register_lowering(_fence, mlir.lower_fun(_same, multiple_results=True))
 mlir.register_lowering(
     _fence, mlir.lower_fun(_stored, multiple_results=True), platform="cpu"
+)
+
+
+_matmul = Primitive("matmul")
+_OUTER = 16
+
+
+def matmul(left: Any, right: Any) -> Any:
+    """The product of two matrices; a batch of small ones, on CPU, is one loop.
+
+    XLA gives each product of a batch to its pool of threads, unless a flag turns the
+    pool off. For matrices of a few rows that takes ten times as long as the product.
+    """
+    if on_host() or left.shape[1] > _OUTER:
+        return left @ right
+    precision = jax.config.jax_default_matmul_precision  # pyright: ignore
+    return _matmul.bind(left, right, batched=False, precision=precision)
+
+
+def _product(left, right, *, precision, **_):
+    return jnp.matmul(left, right, precision=precision)
+
+
+def _sum_of_products(left, right, *, batched, precision):
+    if not batched:
+        return jnp.matmul(left, right, precision=precision)
+    # Barriers, or what is fused with the sum is computed for each of its terms.
+    left, right = lax.optimization_barrier((left, right))
+    terms = (
+        left[..., :, k, None] * right[..., None, k, :] for k in range(left.shape[-1])
+    )
+    return lax.optimization_barrier(functools.reduce(operator.add, terms))
+
+
+def _matmul_shape(left, right, **_):
+    return left.update(shape=(*left.shape[:-1], right.shape[-1]))
+
+
+def _matmul_batch(values, dims, **params):
+    pairs = list(zip(values, dims, strict=True))
+    (size,) = {v.shape[d] for v, d in pairs if d is not None}
+    left, right = (batching.bdim_at_front(v, d, size) for v, d in pairs)
+    return _matmul.bind(left, right, **params | {"batched": True}), 0
+
+
+_matmul.def_impl(_product)
+_matmul.def_abstract_eval(_matmul_shape)
+batching.primitive_batchers[_matmul] = _matmul_batch
+ad.defbilinear(
+    _matmul,
+    lambda t, left, right, **params: _matmul.bind(t, right.mT, **params),
+    lambda t, left, right, **params: _matmul.bind(left.mT, t, **params),
+)
+mlir.register_lowering(_matmul, mlir.lower_fun(_product, multiple_results=False))
+mlir.register_lowering(
+    _matmul, mlir.lower_fun(_sum_of_products, multiple_results=False), platform="cpu"
 )
 
 

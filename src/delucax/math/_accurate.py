@@ -6,7 +6,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from .._jax import lax, on_host, scan, xp
+from .._jax import lax, matmul, on_host, scan, xp
 from .._typing import Array
 from ._norms import power_of_two
 
@@ -115,7 +115,7 @@ def product_in_parts(
     """
     k = left.shape[1]
     if k < _LONG:
-        return left @ right
+        return matmul(left, right)
     length = -(-k // _PARTS)
     pad = _PARTS * length - k
     left = xp.pad(left, ((0, 0), (0, pad))).reshape(len(left), _PARTS, length)

@@ -4,7 +4,7 @@ finite time, by doubling."""
 import jax.scipy.linalg as jsl
 from jaxtyping import Float
 
-from .._jax import lax, scan, stop_gradient, while_loop, xp
+from .._jax import lax, matmul, scan, stop_gradient, while_loop, xp
 from .._typing import Array, Scalar, Square
 from ._linear_solve import full_precision, solve, symmetric
 from ._norms import largest, relative_size
@@ -53,11 +53,11 @@ def smith(
     def body(carry):
         X, powers, _, k = carry
         left, right = powers if len(powers) == 2 else (powers[0], powers[0].T)
-        change = left @ X @ right
+        change = matmul(matmul(left, X), right)
         X = X + change
         # A NaN compares false, so that a lane that diverges stops.
         relative = relative_size(change, X)
-        return X, tuple(power @ power for power in powers), relative, k + 1
+        return X, tuple(matmul(power, power) for power in powers), relative, k + 1
 
     start = (C, powers, xp.asarray(xp.inf, C.dtype), xp.asarray(0))
     X, *_, iterations = while_loop(more, body, start)
@@ -83,7 +83,7 @@ def stable_sylvester(
         X, rest, residual, iterations, _, k = carry
         change, steps = _by_sign(A, B, rest)
         candidate = X + change
-        left, right = A @ candidate, candidate @ other
+        left, right = matmul(A, candidate), matmul(candidate, other)
         left_over = C - left - right
         relative = relative_size(left_over, left, right, C)
         # The first round solves, those after it refine.
@@ -127,7 +127,8 @@ def _by_sign(A, B, C):
             (scale * M + inverse / scale) / 2
             for M, inverse in zip(pair, inverses, strict=True)
         ]
-        C = (scale * C + inverses[0] @ C @ right / scale) / 2
+        product = matmul(matmul(inverses[0], C), right)
+        C = (scale * C + product / scale) / 2
         # A NaN compares false, so that a lane that diverges stops.
         change = sum(largest(M + unit) for M, unit in zip(after, units, strict=True))
         return tuple(after), C, change, k + 1

@@ -3,7 +3,7 @@
 import jax
 import lineax as lx
 
-from .._jax import while_loop, xp
+from .._jax import matmul, while_loop, xp
 from .._typing import Array, Scalar, Square
 from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
@@ -23,9 +23,9 @@ def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
     A, B, Q, R, S, _ = data
     X0 = height * xp.eye(A.shape[0], dtype=A.dtype)
     # The data of the equation of H = X - X0.
-    cross = height * (A.T @ B) + S
-    weight = symmetric(R + height * (B.T @ B))
-    linear = height * (A.T @ A) - X0
+    cross = height * matmul(A.T, B) + S
+    weight = symmetric(R + height * matmul(B.T, B))
+    linear = height * matmul(A.T, A) - X0
     H, doublings = double(without_cross_weight(A, B, linear, weight, cross, Q), X0)
     return X0 + H, doublings
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 from jaxtyping import Float
 
-from .._jax import custom_jvp, fori_loop, lax, scan, stop_gradient, vmap, xp
+from .._jax import custom_jvp, fori_loop, lax, matmul, scan, stop_gradient, vmap, xp
 from .._typing import Array, BoolScalar, Square
 from ..math._linear_solve import cholesky, full_precision, solve, symmetric
 from ._arguments import where_solved
@@ -145,9 +145,9 @@ def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
     n = A.shape[0]
     solved = solve(R, xp.concatenate([S.T, B.T], axis=1))
     K = solved[:, :n]
-    closed_loop, G = A - B @ K, symmetric(B @ solved[:, n:])
+    closed_loop, G = A - matmul(B, K), symmetric(matmul(B, solved[:, n:]))
     # The difference of like terms first: rounding of `added` would hide it.
-    Q = Q - S @ K
+    Q = Q - matmul(S, K)
     return closed_loop, G, symmetric(Q if added is None else Q + added)
 
 
@@ -161,10 +161,11 @@ def composed(first: Element, second: Element) -> Element:
     # One inverse serves all: J2 (I + C1 J2)^-1 and (I + C1 J2)^-1 C1 are symmetric.
     n = A1.shape[0]
     eye = xp.eye(n, dtype=A1.dtype)
-    solved = solve(eye + C1 @ J2, xp.concatenate([A1, C1], axis=1))
+    solved = solve(eye + matmul(C1, J2), xp.concatenate([A1, C1], axis=1))
     moved, weighted = solved[:, :n], solved[:, n:]
-    C = symmetric(C2 + A2 @ weighted @ A2.T)
-    return A2 @ moved, C, J1 + symmetric(A1.T @ (J2 @ moved))
+    C = symmetric(C2 + matmul(matmul(A2, weighted), A2.T))
+    J = J1 + symmetric(matmul(A1.T, matmul(J2, moved)))
+    return matmul(A2, moved), C, J
 
 
 def linear_recursion(loop, added, final, parallel: bool, product):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Float
 
-from .._jax import numbers, vmap, while_loop, xp
+from .._jax import matmul, numbers, vmap, while_loop, xp
 from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts, units_of_sum
 from ..math._linear_solve import solve, symmetric
@@ -85,10 +85,15 @@ def riccati_residual(
     # The terms of the equation, for their norms. A game's two quadratic terms have
     # opposite signs: their sum would hide how large they are.
     first = m - maximisers
-    moved = moved @ A
+    moved = matmul(moved, A)
     if discrete and E is not None:
         weighted = weighted @ E
-    terms = [moved, weighted if discrete else moved, Q, cross[:, :first] @ K[:first]]
+    terms = [
+        moved,
+        weighted if discrete else moved,
+        Q,
+        matmul(cross[:, :first], K[:first]),
+    ]
     if maximisers:
         terms.append(cross[:, first:] @ K[first:])
 
@@ -115,7 +120,7 @@ def riccati_residual(
     error, lost, gap, gap_lost = left
     gap = xp.abs(gap) + gap_lost
     # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
-    bound = xp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
+    bound = xp.abs(error) + lost + 2 * matmul(gap.T, matmul(inverse, gap))
 
     both, terms = xp.stack([error, bound]), xp.stack(terms)
 
@@ -161,10 +166,10 @@ def stationary(
     of the last two follows the best gain."""
     A, B, _, R, S, E = data
     if discrete:
-        moved, weight = A.T @ X, R + symmetric(B.T @ (X @ B))
+        moved, weight = matmul(A.T, X), R + symmetric(matmul(B.T, matmul(X, B)))
     else:
         moved, weight = X if E is None else E.T @ X, R
-    return moved, moved @ B + S, weight
+    return moved, matmul(moved, B) + S, weight
 
 
 class _Left(NamedTuple):
@@ -180,7 +185,7 @@ def _working(discrete: bool, data: RiccatiData, X: Array, K: Array) -> tuple:
     """N, L, T, Y = XL (XE in continuous time) and Z = XE."""
     A, B, _, R, S, E = data
     N = -K
-    L, T = A + product_in_parts(B, N), S.T + R @ N
+    L, T = A + product_in_parts(B, N), S.T + matmul(R, N)
     Z = X if E is None else product_in_parts(X, E)
     return N, L, T, product_in_parts(X, L) if discrete else Z, Z
 
@@ -194,38 +199,40 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     # exact: any gain gives a valid bound.
     unit = xp.finfo(A.dtype).eps / 2
     size_B, size_S, size_X, size_N = (xp.abs(M) for M in (B, S, X, N))
-    lost_L = (units_of_sum(m) + 1) * unit * (xp.abs(A) + size_B @ size_N)
-    lost_T = (m + 1) * unit * (size_S.T + xp.abs(R) @ size_N)
+    lost_L = (units_of_sum(m) + 1) * unit * (xp.abs(A) + matmul(size_B, size_N))
+    lost_T = (m + 1) * unit * (size_S.T + matmul(xp.abs(R), size_N))
     most_L, size_T = xp.abs(L) + lost_L, xp.abs(T)
     units = units_of_sum(n)
     lost_Z = xp.zeros_like(X)
     if E is not None:
         lost_Z = units * unit * (size_X @ xp.abs(E))
     if discrete:
-        lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
+        lost_Y = units * unit * matmul(size_X, most_L)
+        from_L = matmul(size_X, lost_L)
         subtracted = Z if E is None else E.T @ Z
     else:
         lost_Y, from_L = lost_Z, xp.zeros_like(X)
         subtracted = xp.zeros_like(X)
     size_Y = xp.abs(Y)
     square = product_in_parts(L.T, Y)
-    SN, NT = S @ N, N.T @ T
-    lost = most_L.T @ (units * unit * size_Y + lost_Y)
+    SN, NT = matmul(S, N), matmul(N.T, T)
+    lost = matmul(most_L.T, units * unit * size_Y + lost_Y)
     # In discrete time an error of L is in both factors, as the second one is XL.
-    both = lost_L.T @ (size_Y + from_L / 2)
+    both = matmul(lost_L.T, size_Y + from_L / 2)
     if discrete:
         lost = lost + _twice(both)
         if E is not None:
             lost = lost + xp.abs(E).T @ (n * unit * xp.abs(Z) + lost_Z)
     else:
         square, lost = _twice(square), _twice(lost + both)
-    lost = lost + m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
+    lost = lost + m * unit * matmul(size_S, size_N)
+    lost = lost + matmul(size_N.T, m * unit * size_T + lost_T)
     # Four additions, each of a sum no larger than that of the sizes, and a margin.
     lost = lost + 5 * unit * sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
-    gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
+    gap_lost = matmul(size_B.T, (n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost = gap_lost + lost_T + 2 * unit * size_T
     error = square - subtracted + Q + SN + NT
-    return _Left(error, lost, B.T @ Y + T, gap_lost)
+    return _Left(error, lost, matmul(B.T, Y) + T, gap_lost)
 
 
 def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
@@ -273,9 +280,9 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     rest, rest_lost, factor = value[:-n], rounding[:-n], factor[:-n].T
     sizes = xp.abs(rest)
     most = sizes + rest_lost
-    error = value[-n:] + factor @ rest
-    lost = rounding[-n:]
-    lost = lost + xp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
+    error = value[-n:] + matmul(factor, rest)
+    lost = rest_lost + (4 * n + 2 * m + 8) * eps * sizes
+    lost = rounding[-n:] + matmul(xp.abs(factor), lost)
     # The second-order terms, an error of L times one of the factor beside it, are far
     # below those of the first order: the largest entries will do.
     error_L, around = largest(most[:n]), (n + 4) * eps * xp.abs(Y)
@@ -285,8 +292,8 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     elif E is not None:
         beside = largest(most[n + m :])
         lost, around = lost + 2 * n * error_L * beside, around + beside
-    gap_lost = xp.abs(B.T) @ around + most[n : n + m] + (n + 4) * eps * xp.abs(T)
-    return _Left(symmetric(error), symmetric(lost), B.T @ Y + T, gap_lost)
+    gap_lost = matmul(xp.abs(B.T), around) + most[n : n + m] + (n + 4) * eps * xp.abs(T)
+    return _Left(symmetric(error), symmetric(lost), matmul(B.T, Y) + T, gap_lost)
 
 
 def _twice(M):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from .._jax import fori_loop, while_loop, xp
+from .._jax import fori_loop, matmul, while_loop, xp
 from .._typing import BoolScalar, Scalar, Square
 from ..math._norms import power_of_two, size
 
@@ -133,7 +133,7 @@ def _growth(A, probing, limit=None):
             span = xp.where(kept, basis, 0)
             left = size(scaled - span @ (span.T @ scaled))
             finished = finished | (left < 4 * math.sqrt(n) * eps)
-        return scaled @ scaled, span, kept, logarithm, weight / 2, finished
+        return matmul(scaled, scaled), span, kept, logarithm, weight / 2, finished
 
     zero, one = xp.zeros((), dtype), xp.ones((), dtype)
     start = (A, probes, xp.zeros(count, bool), zero, one, xp.asarray(False))
