@@ -11,6 +11,8 @@ import mpmath
 import numpy as np
 import scipy.linalg
 
+import delucax as dlx
+
 
 def scipy_cases(name):
     """The cases of one class of SciPy's own tests of its solvers.
@@ -173,6 +175,43 @@ def continuous_residual(A, B, Q, R, X):
     terms = X @ A, H(A) @ X, X @ B @ gain, Q
     left = terms[0] + terms[1] - terms[2] + terms[3]
     return np.linalg.norm(left) / sum(map(np.linalg.norm, terms)), A - B @ gain
+
+
+def sensitivity(discrete, A, B, Q, R, X):
+    """How many times rounding of the equation's terms changes `X`, relatively.
+
+    A residual `dR` changes it by at most `|P| |dR|`, `P` being the solution of the
+    closed loop's Lyapunov equation with the constant `I` (Kenney and Hewer, 1990).
+    """
+    H = lambda M: M.conj().T
+    if discrete:
+        moved, weight = H(A) @ X, R + H(B) @ X @ B
+    else:
+        moved, weight = X, R
+    cross = moved @ B
+    gain = np.linalg.solve(weight, H(cross) @ A if discrete else H(cross))
+    loop, eye = A - B @ gain, np.eye(len(A))
+    terms = moved @ A, X if discrete else moved @ A, Q, cross @ gain
+    if discrete:
+        P = scipy.linalg.solve_discrete_lyapunov(H(loop), eye)
+    else:
+        P = scipy.linalg.solve_continuous_lyapunov(H(loop), -eye)
+    sizes = sum(np.linalg.norm(term) for term in terms)
+    return np.linalg.norm(P, 2) * sizes / np.linalg.norm(X)
+
+
+def check_both_ways(discrete, data, compiled):
+    """NumPy's solution has the status of the compiled one, and is as close to it as
+    rounding allows."""
+    solve = dlx.riccati.dare if discrete else dlx.riccati.care
+    at_once = solve(*data, throw=False)
+    assert at_once.result == compiled.result
+    if compiled.result == dlx.RESULTS.successful:
+        eps = np.finfo(compiled.X.dtype).eps
+        wide = lambda M: np.asarray(M, np.result_type(M, np.float64))
+        X, data = wide(compiled.X), [wide(M) for M in data]
+        change = np.linalg.norm(wide(at_once.X) - X) / np.linalg.norm(X)
+        assert change < 100 * sensitivity(discrete, *data, X) * eps
 
 
 DIGITS = 60

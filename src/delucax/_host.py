@@ -106,7 +106,8 @@ class _Operations:
     @staticmethod
     def cummin(x: Any, *, reverse: bool = False) -> Any:
         """The smallest entry so far, along the first axis."""
-        return np.minimum.accumulate(x[::-1])[::-1] if reverse else np.minimum(x)
+        step = -1 if reverse else 1
+        return np.minimum.accumulate(x[::step])[::step]
 
     @staticmethod
     def custom_linear_solve(matvec: Any, b: Any, solve: Any, **_: Any) -> Any:
@@ -139,7 +140,7 @@ def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C
     return start
 
 
-def fori_loop(low: int, high: int, body: Callable[[Any, _C], _C], start: _C) -> _C:
+def fori_loop(low: Any, high: Any, body: Callable[[Any, _C], _C], start: _C) -> _C:
     """`lax.fori_loop`."""
     if not _ON_HOST.get():
         return jax.lax.fori_loop(low, high, body, start)
@@ -163,7 +164,8 @@ def vmap(function: _F) -> _F:
     """`jax.vmap` over the first axis of every argument."""
     if not _ON_HOST.get():
         return jax.vmap(function)
-    return lambda *args: _stacked([function(*row) for row in _rows(args)])
+    mapped: Any = lambda *args: _stacked([function(*row) for row in _rows(args)])
+    return mapped
 
 
 def _rows(tree: Any) -> list:

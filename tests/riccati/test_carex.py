@@ -24,6 +24,7 @@ SYSTEMS = riccati_systems.carex()
 def exam(name, *problem):
     A, B, Q, R = (np.asarray(M, float) for M in problem)
     solution = solve(A, B, Q, R)
+    riccati_systems.check_both_ways(False, (A, B, Q, R), solution)
     X = np.asarray(solution.X)
     residual, loop = riccati_systems.continuous_residual(A, B, Q, R, X)
     if len(A) < 10:

@@ -23,6 +23,7 @@ def as_floats(*problem):
 def exam(name, *problem):
     A, B, Q, R = as_floats(*problem)
     solution = solve(A, B, Q, R)
+    riccati_systems.check_both_ways(True, (A, B, Q, R), solution)
     residual, loop = riccati_systems.discrete_residual(A, B, Q, R, solution.X)
     assert solution.result == dlx.RESULTS.successful, name
     assert residual < 1e-12 and solution.residual < 1e-12, name
@@ -69,7 +70,9 @@ def test_single_precision():
     for name, *data in riccati_systems.darex():
         if any(map(np.iscomplexobj, data)):
             continue
-        solution = solve(*(np.asarray(M, np.float32) for M in data))
+        single = [np.asarray(M, np.float32) for M in data]
+        solution = solve(*single)
+        riccati_systems.check_both_ways(True, single, solution)
         X = np.asarray(solution.X, np.float64)
         residual, _ = riccati_systems.discrete_residual(*data, X)
         if name == "DAREX 14":

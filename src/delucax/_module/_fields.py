@@ -138,8 +138,11 @@ def as_float_array(value: Any) -> Any:
     if isinstance(value, bool | int | float | np.number) or (
         isinstance(value, np.ndarray) and value.ndim == 0
     ):
-        # Of a Python number, as an array of NumPy would have a strong type.
-        return jnp.asarray(float(value))
+        # Of a Python number, as an array of NumPy would have a strong type. And not by
+        # `jnp.asarray`, which would compile a program; while something else is traced,
+        # the number is known nevertheless.
+        with jax.ensure_compile_time_eval():
+            return jax.device_put(float(value))
     if isinstance(value, np.ndarray | list | tuple | jax.Array):
         try:
             array = _as_array(value)

@@ -190,8 +190,8 @@ class LQG(AbstractController):
         self.estimator = KalmanFilter(dynamics, W, V, **start, **sensor)
         self.average_cost = None
         if self.estimator.updated_covariance is not None:
-            R = as_float_array(R)
-            self.average_cost = _average_cost(self.regulator, self.estimator, R)
+            designed = self.regulator, self.estimator
+            self.average_cost = _average_cost(*designed, as_float_array(R))
 
     def __check_init__(self):
         check_instance(self.regulator, LQR, "regulator", "LQG")
@@ -225,5 +225,5 @@ def _average_cost(regulator: LQR, estimator: KalmanFilter, R: Array) -> Array:
     # Separation: the first term is the cost with the state known, the second that of
     # the control du = -K (mean - x) which acts on the error of the estimate.
     weight = K.T @ (R + dynamics.B.T @ P @ dynamics.B) @ K
-    error = estimator.updated_covariance
+    error: Any = estimator.updated_covariance
     return xp.trace(P @ estimator._noise(dynamics)) + xp.trace(weight @ error)

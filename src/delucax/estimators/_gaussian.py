@@ -171,18 +171,19 @@ class AbstractGaussianFilter(AbstractEstimator):
         """`W`, `V`, and the mean and covariance of the first state, checked, and in the
         precision of all; where they are not given, `default` or zero and the identity.
         """
-        where, dynamics, mean = type(self).__name__, self.dynamics, self.mean
+        where, dynamics = type(self).__name__, self.dynamics
+        mean: Any = self.mean
         n, p = dynamics.state_size, dynamics.observation_size
         k = dynamics.disturbance_size
         W = _covariance_matrix(self.W, k, "W", "the disturbance", where)
         V = _covariance_matrix(self.V, p, "V", "the observation", where)
-        default = np.zeros(n, W.dtype) if default is None else default
-        mean = default if mean is None else as_vector(mean, n, "mean", where)
+        start: Any = np.zeros(n, W.dtype) if default is None else default
+        mean = start if mean is None else as_vector(mean, n, "mean", where)
         check_finite(mean, "mean", where)
         P = np.eye(n, dtype=mean.dtype) if self.covariance is None else self.covariance
         P = _covariance_matrix(P, n, "covariance", "the state", where)
         # One precision for all, because loops carry the belief and keep its types.
-        dtype = jnp.result_type(mean, P, default, W, V)
+        dtype = jnp.result_type(mean, P, start, W, V)
         return W, V, mean.astype(dtype), P.astype(dtype)
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:

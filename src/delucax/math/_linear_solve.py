@@ -80,7 +80,7 @@ def _by_lapack(matrix, least_squares, right):
         return np.full_like(right, np.nan)
 
 
-def cholesky(matrix: Square) -> Square:
+def cholesky(matrix: Any) -> Any:
     """The lower factor; NaN where `matrix` is not definite."""
     try:
         return xp.linalg.cholesky(matrix)

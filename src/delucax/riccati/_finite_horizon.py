@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 
 from .._check import as_vector
-from .._jax import compiled_unless_on_host, host_unless_traced, vmap, xp
+from .._jax import compiled_unless_on_host, host_unless_traced, on_host, vmap, xp
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Array, Numbers
 from ..math._linear_solve import full_precision, solve
@@ -140,6 +140,8 @@ def dre(
         ```
     """
     where = "dre"
+    # NumPy gains nothing from the longer way that is parallel.
+    parallel = bool(parallel) and not on_host()
     stage = stage_arguments(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
     A = stage["A"]
     final, n = final_weight(final, A, where), A.shape[-1]
@@ -147,9 +149,7 @@ def dre(
     # Without linear terms p, s and k are zero, and are not computed.
     final_q = xp.zeros(n) if final_q is None else final_q
     final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
-    solution = _discrete_solution(
-        *stage.values(), final, final_q, is_affine, bool(parallel)
-    )
+    solution = _discrete_solution(*stage.values(), final, final_q, is_affine, parallel)
     step = lambda: (
         f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
     )

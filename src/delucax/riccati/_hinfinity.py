@@ -45,7 +45,7 @@ from ._recursion import (
     without_cross_weight,
 )
 from ._residual import newton_refine, riccati_residual, stationary
-from ._spectrum import spectral_abscissa, spectral_radius
+from ._spectrum import is_stable, spectral_abscissa, spectral_radius
 from ._stabilising import is_semidefinite, left_side, shifted
 
 
@@ -271,12 +271,12 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     alone = A - B @ left.K[:m]
     loops = xp.stack([left.closed_loop, alone])
     if discrete:
-        stable = vmap(spectral_radius)(loops) < 1 - n * eps
+        margin = xp.asarray(n * eps, A.dtype)
         decided = is_saddle(symmetric(weight), D.shape[1])
     else:
-        slack = n * eps * xp.linalg.norm(A)
-        stable = vmap(spectral_abscissa)(loops) < -slack
+        margin = n * eps * xp.linalg.norm(A)
         decided = is_clearly_definite(R)
+    stable = vmap(lambda loop: is_stable(discrete, loop, margin))(loops)
     # The equation alone also has solutions above the level of any controller, at which
     # X is not semidefinite or a loop not stable (Doyle et al., 1989).
     holds = is_semidefinite(X, 1000) & decided & xp.all(stable)

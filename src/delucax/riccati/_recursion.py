@@ -256,7 +256,7 @@ def _short_elements(A, G, Q, times):
     sizes = xp.maximum(2 * xp.linalg.norm(H) * lengths, 1)
     count = xp.max(stop_gradient(xp.ceil(xp.log2(sizes))).astype(xp.int32))
     count = xp.minimum(count, _MAX_HALVINGS)
-    short = lengths * 0.5**count
+    short = (lengths * 0.5**count).astype(lengths.dtype)
     return unit, count, vmap(lambda time: short_element(H, time))(short)
 
 

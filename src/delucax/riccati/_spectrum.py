@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from .._jax import fori_loop, matmul, while_loop, xp
-from .._typing import Scalar, Square
+from .._typing import BoolScalar, Scalar, Square
 from ..math._norms import power_of_two, size
 
 
@@ -57,11 +57,28 @@ def abscissa_and_size(
 
 
 def _slowest(A, probing):
-    scale = size(A)
-    # |exp(hA)^N|^(1/N) tends to exp(h abscissa), h > 0.
-    h = 0.25 / xp.where(scale > 0, scale, 1)
-    logarithm, *rest = _growth(_exponential(h * A), probing)
+    flow, h = _short_flow(A)
+    logarithm, *rest = _growth(flow, probing)
     return logarithm / h, *rest
+
+
+def _short_flow(A):
+    """`exp(hA)`, and `h`: `|exp(hA)^N|^(1/N)` tends to `exp(h abscissa)`, `h > 0`."""
+    scale = size(A)
+    h = 0.25 / xp.where(scale > 0, scale, 1)
+    return _exponential(h * A), h
+
+
+def is_stable(discrete: bool, A: Square, margin: Scalar | float) -> BoolScalar:
+    """Whether the spectral radius is below one, or the abscissa below zero, by a
+    margin. As the bounds hold for every power, a few squarings tell of most matrices.
+    """
+    if discrete:
+        flow, limit = A, xp.log1p(-xp.asarray(margin, A.dtype))
+    else:
+        flow, h = _short_flow(balanced(A))
+        limit = -margin * h
+    return _growth(flow, False, limit)[0] < limit
 
 
 def _exponential(A):
@@ -79,9 +96,11 @@ def _exponential(A):
     return total
 
 
-def _growth(A, probing):
-    """`log |A^N| / N` for a large `N`. If `probing`, also whether an earlier power has
-    few directions left, a basis of them, and which of its columns are used."""
+def _growth(A, probing, limit=None):
+    """`log |A^N| / N` for a large `N`; with a `limit`, for one that tells on which
+    side of it the value for all larger `N` is. If `probing`, also whether an earlier
+    power has few directions left, a basis of them, and which of its columns are used.
+    """
     n, dtype = A.shape[0], A.dtype
     eps = float(xp.finfo(dtype).eps)
     # Probes with a fixed seed: equal problems have equal results.
@@ -93,6 +112,8 @@ def _growth(A, probing):
         *_, logarithm, weight, finished = carry
         # N = 1 / weight: for a log cond of up to 64 the bound is this close.
         rough = 64 * weight > _DIGITS * xp.maximum(xp.abs(logarithm), eps)
+        if limit is not None:
+            rough = rough & (logarithm >= limit) & (logarithm - 64 * weight <= limit)
         return ~finished & rough & (weight > 0.5**_SQUARINGS)
 
     def body(carry):

@@ -1,0 +1,205 @@
+"""Concrete matrices are solved by NumPy, traced ones by compiled programs."""
+
+import contextlib
+import threading
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import once, thorough, tolerance
+
+import delucax as dlx
+from delucax._host import on_host
+from delucax.riccati import _stabilising
+
+
+riccati, controllers = dlx.riccati, dlx.controllers
+linear: Any = dlx.LinearDynamics
+A = np.array([[1.1, 0.3], [0.0, 0.7]])
+B = np.array([[0.0], [1.0]])
+Q, R, C = np.eye(2), np.eye(1), np.eye(2)[:1]
+TIMES = np.linspace(0.0, 2.0, 5)
+NO_THROW = dict(throw=False)
+EQUATIONS = {
+    "dare": lambda A: riccati.dare(A, B, Q, R, **NO_THROW),
+    "care": lambda A: riccati.care(A, B, Q, R, **NO_THROW),
+    "descriptor": lambda A: riccati.care(A, B, Q, R, E=2 * np.eye(2), **NO_THROW),
+    "complex": lambda A: riccati.dare(A + 0j, B, Q, R, **NO_THROW),
+    "filter_dare": lambda A: riccati.filter_dare(A, C, Q, R, **NO_THROW),
+    "filter_care": lambda A: riccati.filter_care(A, C, Q, R, **NO_THROW),
+    "lyap": lambda A: riccati.lyap(A - 2 * Q, Q, **NO_THROW),
+    "lyap, not stable": lambda A: riccati.lyap(A - Q, Q, **NO_THROW),
+    "dlyap": lambda A: riccati.dlyap(A / 2, Q, **NO_THROW),
+    "dlyap, not stable": lambda A: riccati.dlyap(A, Q, **NO_THROW),
+    "sylvester": lambda A: riccati.sylvester(A, R, B, **NO_THROW),
+    "dsylvester": lambda A: riccati.dsylvester(A / 2, R, B, **NO_THROW),
+    "hinf_dare": lambda A: riccati.hinf_dare(A, B, None, Q, R, **NO_THROW),
+    "hinf_care": lambda A: riccati.hinf_care(A, B, None, Q, R, gamma=20.0, **NO_THROW),
+    "dre": lambda A: riccati.dre(A, B, Q, R, horizon=5, d=np.ones(2), **NO_THROW),
+    "dre, parallel": lambda A: riccati.dre(
+        A, B, Q, R, horizon=5, parallel=True, **NO_THROW
+    ),
+    "cre": lambda A: riccati.cre(A, B, Q, R, times=TIMES, **NO_THROW),
+    "hinf_dre": lambda A: riccati.hinf_dre(A, B, None, Q, R, horizon=5, **NO_THROW),
+    "hinf_cre": lambda A: riccati.hinf_cre(
+        A, B, None, Q, R, times=TIMES, gamma=9.0, **NO_THROW
+    ),
+}
+DESIGNS = {
+    "LQR": lambda A: controllers.LQR(linear(A, B), Q, R),
+    "LQI": lambda A: controllers.LQI(linear(A, B), np.eye(3), R, output=C),
+    "LQG": lambda A: controllers.LQG(linear(A, B, C), Q, R, Q, R),
+    "HInfinity": lambda A: controllers.HInfinity(linear(A, B), Q, R),
+}
+
+
+@contextlib.contextmanager
+def counted_programs():
+    """The events of compilation within."""
+    events = []
+
+    def listen(event, duration_secs, **others):
+        del duration_secs
+        if event == "/jax/core/compile/backend_compile_duration":
+            events.append(others)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield events
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_programs_are_counted():
+    with counted_programs() as events:
+        jax.jit(lambda x: x + 17)(jnp.zeros(())).block_until_ready()
+    assert events
+
+
+@pytest.mark.parametrize("name", EQUATIONS | DESIGNS)
+def test_nothing_is_compiled(name):
+    jax.clear_caches()
+    with counted_programs() as events:
+        solution = (EQUATIONS | DESIGNS)[name](A)
+    assert not events
+    leaves = [leaf for leaf in jax.tree.leaves(solution) if hasattr(leaf, "dtype")]
+    assert leaves
+    bits = jnp.finfo(jnp.result_type(float)).bits
+    for leaf in leaves:
+        assert isinstance(leaf, jax.Array)
+        if jnp.issubdtype(leaf.dtype, jnp.inexact):
+            assert jnp.finfo(leaf.dtype).bits == bits
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=thorough if "hinf" in name else ())
+        for name in EQUATIONS
+    ],
+)
+def test_both_ways_agree(name):
+    at_once, compiled = EQUATIONS[name](A), jax.jit(EQUATIONS[name])(A)
+    assert at_once.result == compiled.result
+    rtol = tolerance(3e-4, 1e-11)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol),
+        (at_once.X, getattr(at_once, "K", None)),
+        (compiled.X, getattr(compiled, "K", None)),
+    )
+
+
+@once
+def test_single_precision_of_data_is_kept():
+    with jax.enable_x64(True):
+        single = [M.astype(np.float32) for M in (A, B, Q, R)]
+        assert riccati.dare(*single).X.dtype == jnp.float32
+        assert riccati.hinf_care(*single[:2], None, *single[2:]).X.dtype == jnp.float32
+        assert riccati.dare(*single[:3], R).X.dtype == jnp.float64
+
+
+@once
+def test_constants_of_a_program_are_solved_when_it_is_traced():
+    def program(x):
+        return riccati.dare(A, B, Q, R).X @ x
+
+    assert "while" not in str(jax.make_jaxpr(program)(jnp.ones(2)))
+    expected = EQUATIONS["dare"](A).X @ np.ones(2)
+    np.testing.assert_allclose(jax.jit(program)(jnp.ones(2)), expected, rtol=1e-6)
+    # And what is not constant is compiled with the program.
+    assert "while" in str(jax.make_jaxpr(EQUATIONS["dare"])(A))
+
+
+@once
+def test_transformations_and_threads():
+    expected = EQUATIONS["dare"](A).X
+    with jax.ensure_compile_time_eval():
+        np.testing.assert_array_equal(EQUATIONS["dare"](A).X, expected)
+    # The choice is one of a thread.
+    solutions = []
+
+    def solve():
+        for _ in range(5):
+            solutions.append(EQUATIONS["dare"](A).X)
+        solutions.append(jax.jit(EQUATIONS["dare"])(A).X)
+        assert not on_host()
+
+    threads = [threading.Thread(target=solve) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(solutions) == 18
+    for X in solutions:
+        np.testing.assert_allclose(X, expected, rtol=1e-5)
+
+    # A derivative, of which a part is a constant, in a batch.
+    def cost(A, scale):
+        return scale * jnp.trace(EQUATIONS["dare"](A).X) + jnp.trace(expected)
+
+    slopes = jax.vmap(jax.grad(cost), (None, 0))(jnp.asarray(A), jnp.arange(1.0, 3.0))
+    change = np.array([[0.3, -0.1], [0.2, 0.5]])
+    up, down = (cost(A + h * change, 1.0) for h in (1e-2, -1e-2))
+    slope = np.sum(np.asarray(slopes[0]) * change)
+    np.testing.assert_allclose(slope, (up - down) / 2e-2, rtol=5e-3)
+    np.testing.assert_allclose(slopes[1], 2 * slopes[0], rtol=1e-5)
+
+
+def test_the_errors():
+    with pytest.raises(RuntimeError) as error:
+        riccati.dare(A, 0 * B, Q, R)
+    assert str(error.value).startswith(
+        f"dare: {dlx.RESULTS[dlx.RESULTS.not_stabilisable]} Relative residual "
+    )
+    assert str(error.value).endswith("Pass throw=False to look at the solution.")
+    with pytest.raises(ValueError, match="care: R must be positive definite"):
+        riccati.care(A, B, Q, -R)
+    with pytest.raises(ValueError, match="dare: A must be finite"):
+        riccati.dare(np.nan * A, B, Q, R)
+    assert not on_host()
+
+
+@pytest.mark.parametrize("wrong_by_numpy", [True, False])
+def test_the_certificate_decides(wrong_by_numpy, monkeypatch):
+    # One of the ways is given an error that its Newton steps do not remove.
+    right, step = _stabilising.discrete_start, _stabilising._correction
+
+    def start(data, height):
+        X, steps = right(data, height)
+        return (1.01 * X if on_host() == wrong_by_numpy else X), steps
+
+    def correction(*args):
+        return (0 if on_host() == wrong_by_numpy else 1) * step(*args)
+
+    monkeypatch.setattr(_stabilising, "discrete_start", start)
+    monkeypatch.setattr(_stabilising, "_correction", correction)
+    jax.clear_caches()
+    by_numpy = EQUATIONS["dare"](A)
+    compiled = jax.jit(EQUATIONS["dare"])(A)
+    jax.clear_caches()
+    wrong, good = (by_numpy, compiled) if wrong_by_numpy else (compiled, by_numpy)
+    assert good.result == dlx.RESULTS.successful
+    assert wrong.result != dlx.RESULTS.successful
+    assert wrong.residual > 100 * good.residual
