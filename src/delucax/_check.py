@@ -163,8 +163,11 @@ def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Arr
         array = np.asarray(matrix)
         largest = functools.partial(np.max, axis=(-2, -1), initial=0.0)
         slack = 100 * np.finfo(array.dtype).eps * largest(np.abs(array))
-        if np.any(largest(np.abs(array - np.swapaxes(array, -2, -1))) > slack):
+        asymmetry = largest(np.abs(array - np.swapaxes(array, -2, -1)))
+        if np.any(asymmetry > slack):
             raise _error(array, name, where, "be symmetric")
+        if not np.any(asymmetry):
+            return matrix
     return (matrix + matrix.mT) / 2
 
 

@@ -3,7 +3,14 @@
 from collections.abc import Callable
 from typing import Any, Generic, Literal, TYPE_CHECKING, TypeAlias, TypeVar
 
-from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
+from jaxtyping import ArrayLike, Bool, Float, Key, Num, UInt32
+
+
+if TYPE_CHECKING:
+    from jaxtyping import Array
+else:
+    # Of NumPy where it computes.
+    Array = Any
 
 
 Numbers: TypeAlias = ArrayLike | list[Any] | tuple[Any, ...]

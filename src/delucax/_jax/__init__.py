@@ -13,6 +13,7 @@ from ._derivatives import (
     is_constant as is_constant,
     jacobian as jacobian,
     nan_tangent as nan_tangent,
+    value_and_jacobians as value_and_jacobians,
 )
 from ._host import (
     fori_loop as fori_loop,

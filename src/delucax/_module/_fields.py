@@ -139,11 +139,24 @@ def as_float_array(value: Any) -> Any:
         return jnp.asarray(float(value))
     if isinstance(value, np.ndarray | list | tuple | jax.Array):
         try:
-            array = jnp.asarray(value)
+            array = _as_array(value)
         except (TypeError, ValueError):  # ragged, or not of numbers
             return value
         return array if eqx.is_inexact_array(array) else array.astype(float)
     return value
+
+
+def _as_array(value: Any) -> Array:
+    """`jnp.asarray(value)`, which would compile a program for each shape."""
+    leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
+    if isinstance(value, jax.Array) or any(isinstance(leaf, Tracer) for leaf in leaves):
+        return jnp.asarray(value)
+    # None would be NaN, and a string may name a dtype.
+    if any(leaf is None or isinstance(leaf, str) for leaf in leaves):
+        raise TypeError
+    dtype = jnp.result_type(float, *leaves)
+    # A copy, as JAX may share the memory of an array that is changed later.
+    return jax.device_put(np.array(value, dtype))
 
 
 def parameter(

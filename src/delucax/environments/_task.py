@@ -7,9 +7,9 @@ from typing import Annotated, Any, get_args, TypeAlias
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array
 
 from .._check import (
     as_bounds,
@@ -22,8 +22,9 @@ from .._check import (
     check_step,
     keywords_of,
 )
+from .._jax import host_unless_traced, xp
 from .._module import parameter
-from .._typing import PRNGKey, Real
+from .._typing import Array, PRNGKey, Real
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
@@ -61,6 +62,14 @@ class UniformState(eqx.Module):
         check_key(key, "UniformState")
         unit = jr.uniform(key, self.low.shape, self.low.dtype)
         return self.low + (self.high - self.low) * unit
+
+
+@host_unless_traced
+def box(spread: Any, centre: Any = 0.0) -> tuple[Array, Array]:
+    """The corners of the box within `spread` of `centre`, numbers or lists of them."""
+    dtype = jnp.result_type(float)
+    spread, centre = xp.asarray(spread, dtype), xp.asarray(centre, dtype)
+    return centre - spread, centre + spread
 
 
 _CHANGES_OBSERVATIONS = frozenset(
