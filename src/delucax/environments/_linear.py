@@ -21,7 +21,6 @@ from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
-from ._registry import register
 from ._task import Fields, UniformState
 
 
@@ -188,10 +187,6 @@ def lds(
     cost = Quadratic([1.0] * n, [1.0] * m)
     fields: Fields = dict(dynamics=dynamics, cost=cost, horizon=horizon)
     return Environment(**(fields | others))
-
-
-for _name in ("cartpole_linear", "lds"):
-    register(_name, f"{__package__}:{_name}")
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

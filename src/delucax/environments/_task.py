@@ -28,7 +28,6 @@ from .._typing import Array, PRNGKey, Real
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
-from ._registry import register
 
 
 class UniformState(eqx.Module):
@@ -97,8 +96,7 @@ def task(
     arguments: Callable[..., dict[str, Any]] = lambda: {},
     accepts: type[AbstractSystem] | None = None,
 ) -> Callable[[Callable[..., Fields]], Callable[..., Environment]]:
-    """A decorator that turns a function into a task, which returns an `Environment`,
-    and registers it.
+    """A decorator that turns a function into a task, which returns an `Environment`.
 
     The decorated function maps the system (with `gym`, the dynamics) and options to
     arguments of `Environment`. The task takes a system or its arguments, the options,
@@ -213,7 +211,6 @@ def task(
         own, source, rest = (inspect.getdoc(build) or "").partition("\n\nSource:")
         make.__doc__ = f"{own}\n{shared}{source}{rest}"
         vars(make)["__signature__"] = signature.replace(parameters=parameters)
-        register(where, f"{__package__}:{where}")
         return make
 
     return decorate
