@@ -344,7 +344,7 @@ class Trajectory(eqx.Module):
 
 
 @host_unless_traced
-def _is_none_of(index: Array, known: list[Array]) -> Array:
+def _is_none_of(index: Array, known: list[Any]) -> Array:
     return xp.all(xp.stack(known) != index[..., None], axis=-1)
 
 
