@@ -197,6 +197,25 @@ case("HInfinity of the pendulum", 1.5)(
 )
 
 
+@case("make and linearize a quadrotor", 1.5)
+def hover():
+    import delucax as dlx
+
+    return (lambda: dlx.linearize(dlx.make("quadrotor").dynamics).A,)
+
+
+@case("make every task", 3.0)
+def every_task():
+    import jax
+
+    import delucax as dlx
+
+    key = jax.random.key(0)
+    drawn = dict.fromkeys(("lds", "neural"), dict(key=key))
+    names = [name for name in dlx.environments.registered() if "/" not in name]
+    return (lambda: [dlx.make(name, **drawn.get(name, {})) for name in names],)
+
+
 def compiled(solve: str, gradient: bool) -> Callable[[], tuple[Thunk, ...]]:
     """A Riccati equation of four states under `jit`, at the user's arrays."""
 
@@ -227,59 +246,85 @@ case("jit of care", 1.5)(compiled("care", False))
 case("jit of care, gradient", 2.25)(compiled("care", True))
 
 
-@case("rollout", 0.8)
-def rollout():
-    import jax
+def rollout(name: str) -> Callable[[], tuple[Thunk, ...]]:
+    """A task without control."""
 
-    import delucax as dlx
+    def prepare():
+        import jax
 
-    env, zero = dlx.make("pendulum"), dlx.controllers.Zero(1)
-    key = jax.random.key(0)
-    return (lambda: dlx.rollout(env, zero, key=key),)
+        import delucax as dlx
 
+        env = dlx.make(name)
+        zero, key = dlx.controllers.Zero(env.control_size), jax.random.key(0)
+        return (lambda: dlx.rollout(env, zero, key=key, throw=False),)
 
-@case("simulate", peer="Diffrax: diffeqsolve", at_most=1.3)
-def simulate():
-    import jax.numpy as jnp
-
-    import delucax as dlx
-
-    system, controls = dlx.systems.Pendulum(), jnp.zeros((100, 1))
-    x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
-    return (
-        lambda: dlx.simulate(system, controls, 0.0, 5.0, x0, dt=0.05, ts=ts).states,
-    )
+    return prepare
 
 
-@case("Diffrax: diffeqsolve")
-def diffeqsolve():
-    import diffrax
-    import jax.numpy as jnp
+case("rollout", 0.8)(rollout("pendulum"))
+for _task in ("quadrotor", "dynamic_bicycle", "balloon_lung"):
+    case(f"rollout of {_task}", 0.8)(rollout(_task))
 
-    x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
-    controls = jnp.zeros((100, 1))
 
-    def field(t, x, controls):
-        k = jnp.clip((t / 0.05).astype(int), 0, 99)
-        torque = controls[k, 0]
-        return jnp.stack([x[1], 15.0 * jnp.sin(x[0]) + 3.0 * torque])
+def simulate(adaptive: bool) -> Callable[[], tuple[Thunk, ...]]:
+    """A pendulum under held controls for 100 intervals."""
 
-    def answer():
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
-            diffrax.Tsit5(),
-            0.0,
-            5.0,
-            None,
-            x0,
-            controls,
-            saveat=diffrax.SaveAt(ts=ts),
-            stepsize_controller=diffrax.PIDController(
-                rtol=1e-6, atol=1e-9, jump_ts=jnp.linspace(0.0, 5.0, 101)
-            ),
-        ).ys
+    def prepare():
+        import diffrax
+        import jax.numpy as jnp
 
-    return (answer,)
+        import delucax as dlx
+
+        system, controls = dlx.systems.Pendulum(), jnp.zeros((100, 1))
+        x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
+        steps = diffrax.PIDController(rtol=1e-6, atol=1e-9) if adaptive else None
+        options = dict(dt=0.05, ts=ts, stepsize_controller=steps)
+        run = lambda: dlx.simulate(system, controls, 0.0, 5.0, x0, **options)
+        return (lambda: run().states,)
+
+    return prepare
+
+
+def diffeqsolve(adaptive: bool) -> Callable[[], tuple[Thunk, ...]]:
+    """The same by Diffrax alone."""
+
+    def prepare():
+        import diffrax
+        import jax.numpy as jnp
+
+        x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
+        controls = jnp.zeros((100, 1))
+        steps = diffrax.StepTo(ts)
+        if adaptive:
+            steps = diffrax.PIDController(rtol=1e-6, atol=1e-9, jump_ts=ts)
+
+        def field(t, x, controls):
+            k = jnp.clip((t / 0.05).astype(int), 0, 99)
+            torque = controls[k, 0]
+            return jnp.stack([x[1], 15.0 * jnp.sin(x[0]) + 3.0 * torque])
+
+        def answer():
+            return diffrax.diffeqsolve(
+                diffrax.ODETerm(field),
+                diffrax.Tsit5(),
+                0.0,
+                5.0,
+                None,
+                x0,
+                controls,
+                saveat=diffrax.SaveAt(ts=ts),
+                stepsize_controller=steps,
+            ).ys
+
+        return (answer,)
+
+    return prepare
+
+
+for _kind, _adaptive in (("fixed steps", False), ("adaptive steps", True)):
+    _peer = f"Diffrax: diffeqsolve, {_kind}"
+    case(f"simulate, {_kind}", peer=_peer, at_most=1.3)(simulate(_adaptive))
+    case(_peer)(diffeqsolve(_adaptive))
 
 
 def quadrotor(constrained: bool) -> Callable[[], tuple[Thunk, ...]]:

@@ -13,7 +13,6 @@ from . import (
     dynamics as dynamics,
     environments as environments,
     math as math,
-    references as references,
     systems as systems,
 )
 from ._controller import (
@@ -67,6 +66,7 @@ if TYPE_CHECKING:
         lung as lung,
         planning as planning,
         plotting as plotting,
+        references as references,
         riccati as riccati,
         studies as studies,
         training as training,
@@ -78,7 +78,7 @@ del TYPE_CHECKING
 
 _LAZY = """
     analysis animate controllers estimators experiments interop lung planning plot
-    plotting riccati studies training
+    plotting references riccati studies training
 """.split()
 
 

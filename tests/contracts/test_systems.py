@@ -45,10 +45,8 @@ def disturbed(system, size, seed=1):
 def test_every_system_is_listed():
     members = {
         name
-        for name, member in vars(dlx.systems).items()
-        if inspect.isclass(member)
-        and issubclass(member, dlx.AbstractSystem)
-        and not inspect.isabstract(member)
+        for name, member in inspect.getmembers(dlx.systems, inspect.isclass)
+        if issubclass(member, dlx.AbstractSystem) and not inspect.isabstract(member)
     }
     assert members == {type(system_of(name)).__name__ for name in SYSTEMS}
     assert set(CONSERVED) <= members

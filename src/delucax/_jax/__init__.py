@@ -28,5 +28,6 @@ from ._derivatives import (
     is_constant as is_constant,
     jacobian as jacobian,
     nan_tangent as nan_tangent,
+    value_and_jacobians as value_and_jacobians,
 )
 from ._normal import normal as normal

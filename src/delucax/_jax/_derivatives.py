@@ -6,7 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import Primitive
+from jax.flatten_util import ravel_pytree
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
 
@@ -30,12 +32,24 @@ def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
     return evaluate
 
 
-def jacobian(
-    f: Callable[..., Any], argnums: int | tuple[int, ...] = 0
-) -> Callable[..., Any]:
+def jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     """The Jacobian of `f` in forward mode, or in reverse where a solver inside has only
     that."""
-    return first_possible(jax.jacfwd(f, argnums), jax.jacrev(f, argnums))
+    return first_possible(jax.jacfwd(f), jax.jacrev(f))
+
+
+def value_and_jacobians(f: Callable[..., Array], *args: Array) -> tuple[Array, Any]:
+    """`f` of vectors, and its Jacobian with respect to each, from one copy of `f`."""
+    joined, split = ravel_pytree(args)
+
+    def twice(joined):
+        value = f(*split(joined))
+        return value, value
+
+    ways = jax.jacfwd(twice, has_aux=True), jax.jacrev(twice, has_aux=True)
+    J, value = first_possible(*ways)(joined)
+    ends = np.cumsum([arg.size for arg in args])
+    return value, jnp.split(J, ends[:-1], axis=1)
 
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:

@@ -309,12 +309,15 @@ class _Reader:
         return getattr(self, f"build_{kind}")(content, node)
 
     def build_array(self, content, node):
-        return jnp.asarray(self.fitted(self.arrays[content]))
+        # `jnp.asarray` would compile a program for each shape.
+        return jax.device_put(self.fitted(self.arrays[content]))
 
     def build_weak(self, content, node):
         # A weak type has the precision that is current, and is kept by what is written
         # into a weakly typed array.
         array = self.arrays[content]
+        if array.ndim == 0:
+            return jax.device_put(array.item())
         zero = jnp.asarray(array.dtype.type(0).item())
         return jnp.broadcast_to(zero, array.shape).at[...].set(array)
 

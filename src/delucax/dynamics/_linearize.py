@@ -1,6 +1,5 @@
 """First-order models, and the points that they are about."""
 
-import functools
 from typing import Any, overload
 
 import equinox as eqx
@@ -9,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._check import as_vector, is_concrete
 from .._integration import evaluate_field
-from .._jax import jacobian
+from .._jax import jacobian, value_and_jacobians
 from .._message import shortened
 from .._results import Result, RESULTS
 from .._typing import Control, RealScalar, State
@@ -109,26 +108,33 @@ def linearize(
     """
     hint = "for an environment, its `dynamics`"
     model, x, u = at_point(model, t, x, u, "linearize", hint)
-    t = jnp.asarray(t, x.dtype)
+    names = dict(state_names=model.state_names, control_names=model.control_names)
+    C, value, (A, B, *E) = _first_order(model, jnp.asarray(t, x.dtype), x, u)
+    E = E[0] if E else None
+    # The value is kept, because at a point that is no equilibrium the model is affine,
+    # f(x_ref, u_ref) + A (x - x_ref) + B (u - u_ref).
+    if isinstance(model, AbstractSystem):
+        return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=value, **names)
+    return LinearDynamics(A, B, C, E, model.dt, x, u, value, **names)
+
+
+@eqx.filter_jit
+def _first_order(model: Any, t: Array, x: State, u: Control) -> Any:
+    """The derivative of the sensor, and the value and the derivatives of the field or
+    the step by state, control and disturbance."""
     # The sensor is linearised, too, so that estimators can be designed on the result.
     C = jacobian(lambda x: model.observe(t, x))(x)
-    names = dict(state_names=model.state_names, control_names=model.control_names)
+    is_system = isinstance(model, AbstractSystem)
+
+    def f(x, u, w=None):
+        # Of dynamics the public call, whose solver failures raise, and not `advance`.
+        return evaluate_field(model, t, x, u, w) if is_system else model(t, x, u, w)
+
+    # Where a system names no disturbances its field has no w, and so there is no E.
+    if is_system and not model.disturbance_names:
+        return C, *value_and_jacobians(f, x, u)
     w = jnp.zeros(model.disturbance_size, x.dtype)
-    if isinstance(model, AbstractSystem):
-        # Where no disturbances are named the field has no w, and so there is no E.
-        held, E = (w if model.disturbance_names else None), None
-        f = functools.partial(evaluate_field, model)
-        A, B = jacobian(f, (1, 2))(t, x, u, held)
-        if model.disturbance_names:
-            E = jacobian(f, 3)(t, x, u, w)
-        # Kept, because at a point that is no equilibrium the model is affine,
-        # f(x_ref, u_ref) + A (x - x_ref) + B (u - u_ref).
-        dx = f(t, x, u, held)
-        return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=dx, **names)
-    step = functools.partial(model, t)
-    # The public call, whose solver failures raise, and not `advance`.
-    A, B, E = jacobian(step, (0, 1, 2))(x, u, w)
-    return LinearDynamics(A, B, C, E, model.dt, x, u, step(x, u, w), **names)
+    return C, *value_and_jacobians(f, x, u, w)
 
 
 def at_point(

@@ -16,7 +16,6 @@ _CLOSE = 0.25
 _SQUARINGS = 12
 _TERMS = 9
 """The terms of the exponential's series: exact to rounding for norms up to 300."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 def logarithm(
@@ -116,7 +115,8 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
         # The rule is for [-1, 1]: x = (1 + node) / 2, with half of the weight.
         return total + weight / 2 * solve(eye + (1 + node) / 2 * X, X), None
 
-    rules = jnp.asarray(_NODES, A.dtype), jnp.asarray(_WEIGHTS, A.dtype)
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    rules = jnp.asarray(nodes, A.dtype), jnp.asarray(weights, A.dtype)
     total, _ = lax.scan(add, jnp.zeros_like(A), rules)
     return total * 2.0**k, converged
 

@@ -93,9 +93,13 @@ class Delayed(AbstractWrapper):
         """
         inner, where = self.dynamics, "Delayed.filled"
         x = as_vector(x, inner.state_size, "x", where)
-        u = jnp.zeros(inner.control_size) if u is None else u
+        u = [0.0] * inner.control_size if u is None else u
         u = as_vector(u, inner.control_size, "u", where)
-        y = inner.observe(0.0, x)
+        return self._filled(x, u)
+
+    @eqx.filter_jit
+    def _filled(self, x: Array, u: Array) -> Array:
+        y = self.dynamics.observe(0.0, x)
         late = [jnp.tile(u, self.controls), jnp.tile(y, self.sensor)]
         return jnp.concatenate([x, *late]).astype(x.dtype)
 

@@ -1,31 +1,45 @@
 """Environments, and the named tasks."""
 
-from ._classic_control import (
-    acrobot as acrobot,
-    cartpole as cartpole,
-    mountain_car as mountain_car,
-    mountain_car_discrete as mountain_car_discrete,
-    pendulum as pendulum,
-)
+from typing import TYPE_CHECKING
+
+from .._lazy import lazily as _lazily
 from ._environment import Environment as Environment, Step as Step
-from ._linear import cartpole_linear as cartpole_linear, lds as lds
 from ._randomise import randomise as randomise
-from ._registry import make as make, register as register, registered as registered
-from ._regulation import (
-    cstr as cstr,
-    double_integrator as double_integrator,
-    lorenz as lorenz,
-    mass_spring_damper as mass_spring_damper,
-    neural as neural,
-    permanent_magnet_motor as permanent_magnet_motor,
-    two_tank as two_tank,
-    van_der_pol as van_der_pol,
-)
-from ._robots import (
-    dynamic_bicycle as dynamic_bicycle,
-    kinematic_bicycle as kinematic_bicycle,
-    planar_quadrotor as planar_quadrotor,
-    quadrotor as quadrotor,
-    reacher as reacher,
+from ._registry import (
+    make as make,
+    register as register,
+    registered as registered,
+    TASKS as _TASKS,
 )
 from ._task import UniformState as UniformState
+
+
+if TYPE_CHECKING:
+    from ._classic_control import (
+        acrobot as acrobot,
+        cartpole as cartpole,
+        mountain_car as mountain_car,
+        mountain_car_discrete as mountain_car_discrete,
+        pendulum as pendulum,
+    )
+    from ._linear import cartpole_linear as cartpole_linear, lds as lds
+    from ._regulation import (
+        cstr as cstr,
+        double_integrator as double_integrator,
+        lorenz as lorenz,
+        mass_spring_damper as mass_spring_damper,
+        neural as neural,
+        permanent_magnet_motor as permanent_magnet_motor,
+        two_tank as two_tank,
+        van_der_pol as van_der_pol,
+    )
+    from ._robots import (
+        dynamic_bicycle as dynamic_bicycle,
+        kinematic_bicycle as kinematic_bicycle,
+        planar_quadrotor as planar_quadrotor,
+        quadrotor as quadrotor,
+        reacher as reacher,
+    )
+else:
+    __getattr__, __dir__ = _lazily(__name__, _TASKS)
+del TYPE_CHECKING

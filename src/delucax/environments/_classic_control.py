@@ -12,7 +12,7 @@ from ..dynamics import Discretized
 from ..math import cos, sin
 from ..systems import Acrobot, CartPole, MountainCar, Pendulum
 from ._gym import GymAcrobot, GymCartPole, GymMountainCar, GymPendulum
-from ._task import Fields, Limit, Number, Positive, task, UniformState
+from ._task import box, Fields, Limit, Number, Positive, task, UniformState
 
 
 def pendulum_features(x: State) -> Vector:
@@ -49,14 +49,12 @@ def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Limit = 2.0) ->
         ```
     """
     fastest = dynamics.max_speed if isinstance(dynamics, GymPendulum) else np.inf
-    feature_bound = jnp.array([1.0, 1.0, fastest])
-    corner = jnp.array([np.pi, 1.0])
     return dict(
         cost=PendulumCost(),
-        initial_state=UniformState(-corner, corner),
+        initial_state=UniformState([-np.pi, -1.0], [np.pi, 1.0]),
         control_bounds=(-max_torque, max_torque),
         encode=pendulum_features,
-        observation_bounds=(-feature_bound, feature_bound),
+        observation_bounds=box([1.0, 1.0, fastest]),
     )
 
 
@@ -113,14 +111,14 @@ def cartpole(
         ```
     """
     # Gym's own: twice where the episode ends, which no state of an episode reaches.
-    feature_bound = jnp.array([2 * max_position, np.inf, 2 * max_angle, np.inf])
+    feature_bound = [2 * max_position, np.inf, 2 * max_angle, np.inf]
     return dict(
         cost=Arrival(step_cost=-1.0),
         initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         control_bounds=(-max_force, max_force),
         terminated=_Fallen(max_position, max_angle),
-        actions=max_force * jnp.array([[-1.0], [1.0]]),
-        observation_bounds=(-feature_bound, feature_bound),
+        actions=[[-max_force], [max_force]],
+        observation_bounds=box(feature_bound),
     )
 
 
@@ -229,8 +227,9 @@ def _valley(dynamics: GymMountainCar | Discretized, goal: _AtGoal) -> Fields:
     """The initial states and bounds that both tasks share."""
     bounds = None
     if isinstance(dynamics, GymMountainCar):
-        low = jnp.stack([dynamics.min_position, -dynamics.max_speed])
-        bounds = low, jnp.stack([dynamics.max_position, dynamics.max_speed])
+        slowest, fastest = box(dynamics.max_speed)
+        low = [dynamics.min_position, slowest]
+        bounds = low, [dynamics.max_position, fastest]
     return dict(
         initial_state=UniformState([-0.6, 0.0], [-0.4, 0.0]),
         control_bounds=(-1.0, 1.0),
@@ -318,7 +317,7 @@ def acrobot(
     fastest = np.inf, np.inf
     if isinstance(dynamics, GymAcrobot):
         fastest = dynamics.max_velocity_1, dynamics.max_velocity_2
-    feature_bound = jnp.array([1.0, 1.0, 1.0, 1.0, *fastest])
+    feature_bound = [1.0, 1.0, 1.0, 1.0, *fastest]
     above = _AboveLine(goal_height)
     return dict(
         cost=Arrival(above, arrival_cost=-1.0),
@@ -326,7 +325,7 @@ def acrobot(
         initial_state=UniformState([-0.1] * 4, [0.1] * 4),
         control_bounds=(-max_torque, max_torque),
         terminated=above,
-        actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),
+        actions=[[-max_torque], [0.0], [max_torque]],
         encode=acrobot_features,
-        observation_bounds=(-feature_bound, feature_bound) if bounded else None,
+        observation_bounds=box(feature_bound) if bounded else None,
     )

@@ -145,7 +145,7 @@ class Environment(eqx.Module):
         if self.disturbance is None:
             self.disturbance = _default_disturbance(self.dynamics)
         if self.initial_state is None:
-            self.initial_state = jnp.zeros(self.dynamics.state_size)
+            self.initial_state = jnp.array(np.zeros(self.dynamics.state_size))
         if self.encode is None:
             self.encode = _identity
 

@@ -15,13 +15,12 @@ from .._check import (
     check_range,
     check_step,
 )
-from .._module import as_float_array
-from .._typing import PRNGKey
+from .._jax import host_unless_traced, xp
+from .._typing import Matrix, PRNGKey
 from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
-from ._registry import register
 from ._task import Fields, UniformState
 
 
@@ -83,25 +82,32 @@ def cartpole_linear(
     for name, value in positive.items():
         check_positive(value, name, where)
     check_step(dt, where)
-    M, m, l, g = (as_float_array(v) for v in (cart_mass, pole_mass, length, gravity))
-    zero, one = jnp.zeros_like(M), jnp.ones_like(M)
+    A, B = _euler_step(cart_mass, pole_mass, length, gravity, dt)
+    states = ("position", "angle", "velocity", "spin")
+    names: Fields = dict(state_names=states, control_names=("force",))
+    fields: Fields = dict(
+        dynamics=LinearDynamics(A, B, dt=dt, **names),
+        cost=Quadratic([1.0] * 4, [1.0]),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
+        horizon=horizon,
+    )
+    return Environment(**(fields | others))
+
+
+@host_unless_traced
+def _euler_step(M: Any, m: Any, l: Any, g: Any, dt: Any) -> tuple[Matrix, Matrix]:
+    """The matrices of the step of the linear cart-pole."""
+    dtype = jnp.result_type(float)
+    M, m, l, g = (xp.asarray(number, dtype) for number in (M, m, l, g))
+    zero, one = xp.zeros_like(M), xp.ones_like(M)
     rate = [
         [zero, zero, one, zero],
         [zero, zero, zero, one],
         [zero, m * g / M, zero, zero],
         [zero, (m + M) * g / (M * l), zero, zero],
     ]
-    A = jnp.eye(4) + dt * jnp.array(rate)
-    B = dt * jnp.array([[zero], [zero], [1 / M], [1 / (M * l)]])
-    states = ("position", "angle", "velocity", "spin")
-    names: Fields = dict(state_names=states, control_names=("force",))
-    fields: Fields = dict(
-        dynamics=LinearDynamics(A, B, dt=dt, **names),
-        cost=Quadratic(jnp.ones(4), jnp.ones(1)),
-        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
-        horizon=horizon,
-    )
-    return Environment(**(fields | others))
+    B = dt * xp.array([[zero], [zero], [1 / M], [1 / (M * l)]])
+    return xp.eye(4) + dt * xp.array(rate), B
 
 
 def lds(
@@ -178,13 +184,9 @@ def lds(
             raise ValueError("lds: give A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
-    cost = Quadratic(jnp.ones(n), jnp.ones(m))
+    cost = Quadratic([1.0] * n, [1.0] * m)
     fields: Fields = dict(dynamics=dynamics, cost=cost, horizon=horizon)
     return Environment(**(fields | others))
-
-
-for _name in ("cartpole_linear", "lds"):
-    register(_name, f"{__package__}:{_name}")
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

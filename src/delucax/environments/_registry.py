@@ -8,14 +8,27 @@ from .._message import did_you_mean
 from ._environment import Environment
 
 
+TASKS = {
+    "_classic_control": "acrobot cartpole mountain_car mountain_car_discrete pendulum",
+    "_linear": "cartpole_linear lds",
+    "_regulation": "cstr double_integrator lorenz mass_spring_damper neural "
+    "permanent_magnet_motor two_tank van_der_pol",
+    "_robots": "dynamic_bicycle kinematic_bicycle planar_quadrotor quadrotor reacher",
+}
+"""The tasks of this package, by the module that makes them."""
 _LUNGS = """
     balloon_lung delay_lung double_compartment learned_lung single_compartment
 """.split()
 # The names of the paper.
 _CLASSIC = "acrobot cartpole mountain_car pendulum planar_quadrotor reacher".split()
 
-# The entry points. The tasks of this package register themselves.
+# The entry points.
 _REGISTRY: dict[str, str] = {
+    **{
+        name: f"delucax.environments:{name}"
+        for names in TASKS.values()
+        for name in names.split()
+    },
     **{f"classic/{name}": f"delucax.environments:{name}" for name in _CLASSIC},
     **{name: f"delucax.lung:{name}" for name in _LUNGS},
     **{f"lung/{name}": f"delucax.lung:{name}" for name in _LUNGS},

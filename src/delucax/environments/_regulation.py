@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._typing import PRNGKey
@@ -19,20 +18,19 @@ from ..systems import (
     TwoTank,
     VanDerPol,
 )
-from ._task import Fields, Limit, Number, Positive, task, UniformState
+from ._task import box, Fields, Limit, Number, Positive, task, UniformState
 
 
 def _regulation(
     cost: Quadratic,
     spread: Array | Sequence[float],
     bounds: tuple[Limit, Limit],
-    centre: Array | float = 0.0,
+    centre: Array | Sequence[float] | float = 0.0,
 ) -> Fields:
     """A start within `spread` of `centre`, and bounds of the controls."""
-    spread = jnp.asarray(spread)
     return dict(
         cost=cost,
-        initial_state=UniformState(centre - spread, centre + spread),
+        initial_state=UniformState(*box(spread, centre)),
         control_bounds=bounds,
     )
 
@@ -83,7 +81,7 @@ def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> F
         env = dlx.make("mass_spring_damper", masses=3)
         ```
     """
-    ones = jnp.ones(system.state_size)
+    ones = [1.0] * system.state_size
     return _regulation(Quadratic(ones, [0.1]), ones, (-max_force, max_force))
 
 
@@ -135,7 +133,7 @@ def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
     """
     wing, _ = system.equilibrium()
     cost = Quadratic([1.0, 1.0, 1.0], [0.001], state_target=wing)
-    middle = jnp.array([0.0, 0.0, 25.0])
+    middle = [0.0, 0.0, 25.0]
     return _regulation(cost, [20.0, 20.0, 15.0], (-max_control, max_control), middle)
 
 
@@ -276,6 +274,6 @@ def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
         again = dlx.make("neural", system=env.dynamics.system)
         ```
     """
-    ones = jnp.ones(system.state_size)
-    cost = Quadratic(ones, 0.1 * jnp.ones(system.control_size))
+    ones = [1.0] * system.state_size
+    cost = Quadratic(ones, [0.1] * system.control_size)
     return _regulation(cost, ones, (-max_control, max_control))

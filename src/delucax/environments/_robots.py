@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._check import as_vector, check_finite, FLOAT32_MAX
+from .._jax import host_unless_traced
 from .._module import as_float_array, parameter
 from .._typing import Control, PRNGKey, Real, Scalar, State, Time, Vector
 from ..costs import AbstractCost, Quadratic
@@ -24,7 +25,7 @@ from ..systems import (
     Reacher,
     VortexWind,
 )
-from ._task import Fields, Limit, Number, task, UniformState
+from ._task import box, Fields, Limit, Number, task, UniformState
 
 
 def bicycle_features(x: State) -> Vector:
@@ -53,22 +54,20 @@ def _lane_keeping(
     what else moves, and `0.1 acceleration^2 + steering^2`. Of the features the cosine
     and the sine of the heading are bounded.
     """
-    states = len(spread)
-    target = jnp.zeros(states).at[3].set(speed)
-    corner = jnp.array(spread)
-    limit = jnp.stack([jnp.asarray(max_acceleration), jnp.asarray(max_steering)])
-    feature_bound = jnp.full(states + 1, FLOAT32_MAX).at[2:4].set(1.0)
+    rest = len(spread) - 3
+    target = [0.0, 0.0, 0.0, speed] + [0.0] * (rest - 1)
+    feature_bound = [FLOAT32_MAX] * 2 + [1.0] * 2 + [FLOAT32_MAX] * rest
     # Where the car is along the lane costs nothing.
-    weights = [0.0, 1.0, 1.0] + [0.1] * (states - 3)
+    weights = [0.0, 1.0, 1.0] + [0.1] * rest
     cost = Quadratic(
         weights, [0.1, 1.0], state_target=target, difference=heading_difference
     )
     return dict(
         cost=cost,
-        initial_state=UniformState(target - corner, target + corner),
-        control_bounds=(-limit, limit),
+        initial_state=UniformState(*box(spread, target)),
+        control_bounds=box([max_acceleration, max_steering]),
         encode=bicycle_features,
-        observation_bounds=(-feature_bound, feature_bound),
+        observation_bounds=box(feature_bound),
     )
 
 
@@ -203,8 +202,8 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
     # The paper's cost is that of the model, which knows of no wind.
     _, hover = windless.equilibrium()
     return dict(
-        cost=Quadratic(jnp.ones(6), 0.1 * jnp.ones(2), control_target=hover),
-        initial_state=jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
+        cost=Quadratic([1.0] * 6, [0.1] * 2, control_target=hover),
+        initial_state=[1.0, 1.0, 0.0, 0.0, 0.0, 0.0],
     )
 
 
@@ -262,16 +261,16 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
         turn, yaw = system.arm * high, 2 * system.moment * high
         high = jnp.stack([4 * high, turn, turn, yaw])
         low = -high.at[0].set(0.0)
-    feature_bound = jnp.full(18, FLOAT32_MAX).at[3:12].set(_ROTATION)
-    corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
-    weights = jnp.array([1.0] * 7 + [0.1] * 6), 0.1 * jnp.ones(4)
+    feature_bound = [FLOAT32_MAX] * 3 + [_ROTATION] * 9 + [FLOAT32_MAX] * 6
+    spread = [1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6
+    weights = [1.0] * 7 + [0.1] * 6, [0.1] * 4
     target = dict(state_target=x, control_target=hover)
     return dict(
         cost=Quadratic(*weights, difference=Quadrotor.difference, **target),
-        initial_state=_Start(UniformState(x - corner, x + corner)),
+        initial_state=_Start(UniformState(*box(spread, x))),
         control_bounds=(low, high),
         encode=quadrotor_features,
-        observation_bounds=(-feature_bound, feature_bound),
+        observation_bounds=box(feature_bound),
     )
 
 
@@ -307,6 +306,13 @@ class _ReacherFeatures(eqx.Module):
         return jnp.stack([*angles, x[2], x[3], offset[0], offset[1]])
 
 
+@host_unless_traced
+def _feature_bounds(system: Reacher, goal: Vector) -> tuple[Vector, Vector]:
+    reach = system.length_1 + system.length_2
+    spread = [1.0] * 4 + [FLOAT32_MAX] * 2 + [reach] * 2
+    return box(spread, [0.0] * 6 + [-goal[0], -goal[1]])
+
+
 @task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
 def reacher(
     system: Reacher, *, goal: ArrayLike | tuple[float, float] = (0.0, 1.8)
@@ -338,14 +344,9 @@ def reacher(
         ```
     """
     cost = ReacherCost(system, goal)
-    reach = system.length_1 + system.length_2
-    low, high = (
-        jnp.array([sign] * 4 + [sign * FLOAT32_MAX] * 2 + [*(sign * reach - cost.goal)])
-        for sign in (-1.0, 1.0)
-    )
     return dict(
         cost=cost,
-        initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
+        initial_state=[np.pi / 4, np.pi / 2, 0.0, 0.0],
         encode=_ReacherFeatures(cost),
-        observation_bounds=(low, high),
+        observation_bounds=_feature_bounds(system, cost.goal),
     )

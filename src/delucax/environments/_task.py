@@ -7,9 +7,9 @@ from typing import Annotated, Any, get_args, TypeAlias
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array
 
 from .._check import (
     as_bounds,
@@ -22,12 +22,12 @@ from .._check import (
     check_step,
     keywords_of,
 )
+from .._jax import host_unless_traced, xp
 from .._module import parameter
-from .._typing import PRNGKey, Real
+from .._typing import Array, PRNGKey, Real
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
-from ._registry import register
 
 
 class UniformState(eqx.Module):
@@ -63,6 +63,14 @@ class UniformState(eqx.Module):
         return self.low + (self.high - self.low) * unit
 
 
+@host_unless_traced
+def box(spread: Any, centre: Any = 0.0) -> tuple[Array, Array]:
+    """The corners of the box within `spread` of `centre`, numbers or lists of them."""
+    dtype = jnp.result_type(float)
+    spread, centre = xp.asarray(spread, dtype), xp.asarray(centre, dtype)
+    return centre - spread, centre + spread
+
+
 _CHANGES_OBSERVATIONS = frozenset(
     "disturbance dynamics encode initial_state sensor_noise terminated".split()
 )
@@ -88,8 +96,7 @@ def task(
     arguments: Callable[..., dict[str, Any]] = lambda: {},
     accepts: type[AbstractSystem] | None = None,
 ) -> Callable[[Callable[..., Fields]], Callable[..., Environment]]:
-    """A decorator that turns a function into a task, which returns an `Environment`,
-    and registers it.
+    """A decorator that turns a function into a task, which returns an `Environment`.
 
     The decorated function maps the system (with `gym`, the dynamics) and options to
     arguments of `Environment`. The task takes a system or its arguments, the options,
@@ -204,7 +211,6 @@ def task(
         own, source, rest = (inspect.getdoc(build) or "").partition("\n\nSource:")
         make.__doc__ = f"{own}\n{shared}{source}{rest}"
         vars(make)["__signature__"] = signature.replace(parameters=parameters)
-        register(where, f"{__package__}:{where}")
         return make
 
     return decorate

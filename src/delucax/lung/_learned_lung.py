@@ -9,6 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_instance, check_key
+from .._jax import host_unless_traced, xp
 from .._module import mlp, parameter, positive, weight
 from .._results import Result, RESULTS
 from .._typing import Observation, PRNGKey, RealScalar, Scalar, State, Time
@@ -142,14 +143,15 @@ class LearnedLung(AbstractDynamics):
         pressures = ["pressure", *(f"pressure[-{i}]" for i in range(1, n))]
         return (*controls, *pressures, "step")
 
+    @host_unless_traced
     def resting(self) -> State:
         """The state before an inspiration."""
         n = self.window
         first = (self.start - self.p_mean) / self.p_std
         if self.published:
-            return jnp.zeros(2 * n + 1).at[n].set(first)
-        closed = jnp.full(n, -self.u_mean / self.u_std)
-        return jnp.concatenate([closed, jnp.full(n, first), jnp.zeros(1)])
+            return xp.concatenate([xp.zeros(n), first[None], xp.zeros(n)])
+        closed = xp.full(n, -self.u_mean / self.u_std)
+        return xp.concatenate([closed, xp.full(n, first), xp.zeros(1)])
 
     def pressure(self, x: State) -> Scalar:
         """The pressure now.

@@ -5,11 +5,13 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
 
 from .._check import is_concrete
+from .._jax import host_unless_traced, xp
 from .._module import bounded, parameter, positive
 from .._typing import (
+    Array,
     Control,
     Disturbance,
     Observation,
@@ -122,9 +124,10 @@ class _AbstractCompartment(_AbstractRigidPipe):
     def _inside(self, x: State) -> Array:
         return self.elastic_pressure(x[2])
 
+    @host_unless_traced
     def resting(self, pressure: RealScalar) -> State:
         volume = self._volume(pressure)
-        return jnp.stack([0 * volume, 0 * volume, volume])
+        return xp.stack([0 * volume, 0 * volume, volume])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
@@ -243,10 +246,11 @@ class DoubleCompartment(_AbstractRigidPipe):
     def _inside(self, x: State) -> Array:
         return self._parts(x)[-1]
 
+    @host_unless_traced
     def resting(self, pressure: RealScalar) -> State:
         volume = PER_ML * self.compliance * pressure
         fast, slow = self.share * volume, (1 - self.share) * volume
-        return jnp.stack([0 * volume, 0 * volume, fast, slow])
+        return xp.stack([0 * volume, 0 * volume, fast, slow])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
@@ -261,9 +265,9 @@ def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
     """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, with the
     radius of a sphere of its volume; constant below a tenth of the volume at rest."""
     # Towards an empty balloon the pressure and its slope go to minus infinity.
-    volume = jnp.maximum(volume, 0.1 * rest)
-    radius = (3 * volume / (4 * jnp.pi)) ** (1 / 3)
-    unstretched = (3 * rest / (4 * jnp.pi)) ** (1 / 3)
+    volume = xp.maximum(volume, 0.1 * rest)
+    radius = (3 * volume / (4 * np.pi)) ** (1 / 3)
+    unstretched = (3 * rest / (4 * np.pi)) ** (1 / 3)
     return stiffness * (1 - (rest / volume) ** 2) / (unstretched**2 * radius)
 
 
@@ -360,10 +364,11 @@ class DelayLung(AbstractLung):
     def pressure(self, x: State) -> Scalar:
         return x[2]
 
+    @host_unless_traced
     def resting(self, pressure: RealScalar) -> State:
         volume = _stretched(self.rest, self.stiffness, pressure)
         # `0 * volume` is a zero of its dtype and shape, whatever `pressure` is.
-        return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
+        return xp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
@@ -385,14 +390,14 @@ def _stretched(rest: Array, stiffness: Array, pressure: Any) -> Array:
 
     **Raises:** `ValueError` if the pressure is above what it can hold.
     """
-    pressure = jnp.asarray(pressure)
+    pressure = xp.asarray(pressure)
     most = balloon_pressure(_FULLEST * rest, rest, stiffness)
-    if is_concrete(most) and is_concrete(pressure) and bool(jnp.any(pressure > most)):
+    if is_concrete(most) and is_concrete(pressure) and bool(xp.any(pressure > most)):
         raise ValueError(
             f"resting: pressure must be at most the {float(most):g} cmH2O that the "
             f"balloon can hold, got {pressure}."
         )
-    unit = stiffness * (4 * jnp.pi / 3) / rest
+    unit = stiffness * (4 * np.pi / 3) / rest
     # p / unit = (1 - s^-2) s^(-1/3) of the stretch s = v / v0 has no closed form.
     # Newton's method from below converges as the left side is concave; in double
     # precision six steps do for half of the greatest pressure.
@@ -401,5 +406,5 @@ def _stretched(rest: Array, stiffness: Array, pressure: Any) -> Array:
     for _ in range(12):
         value = (1 - s**-2) * s ** (-1 / 3) - ratio
         slope = 2 * s**-3 * s ** (-1 / 3) - (1 - s**-2) * s ** (-4 / 3) / 3
-        s = jnp.clip(s - value / jnp.maximum(slope, 1e-3), 1.0, _FULLEST)
+        s = xp.clip(s - value / xp.maximum(slope, 1e-3), 1.0, _FULLEST)
     return rest * s

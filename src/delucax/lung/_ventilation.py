@@ -195,7 +195,7 @@ class PressureSensor(AbstractWrapper):
         **Raises:** `ValueError` on a wrong shape.
         """
         x = as_vector(x, self.dynamics.state_size, "x", "PressureSensor.filled")
-        return jnp.append(x, self.dynamics.observe(0.0, x)).astype(x.dtype)
+        return _with_reading(self.dynamics, x)
 
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
@@ -214,6 +214,11 @@ class PressureSensor(AbstractWrapper):
     def equilibrium(self) -> tuple[State, Control]:
         x, u = self.dynamics.equilibrium()
         return self.filled(x), u
+
+
+@eqx.filter_jit
+def _with_reading(dynamics: AbstractDynamics, x: Array) -> Array:
+    return jnp.append(x, dynamics.observe(0.0, x)).astype(x.dtype)
 
 
 class BreathCost(AbstractCost):
@@ -320,7 +325,7 @@ def ventilation(
     check_range(expiration_weight, "expiration_weight", where)
     delay = check_count(sensor_delay, "sensor_delay", where, least=0)
     waveform = BreathWaveform() if waveform is None else waveform
-    rest = jnp.zeros(dynamics.state_size) if resting_state is None else resting_state
+    rest = [0.0] * dynamics.state_size if resting_state is None else resting_state
     sensor = sensed = PressureSensor(dynamics)
     initial_state = sensor.filled(rest)
     if delay:
@@ -333,7 +338,7 @@ def ventilation(
         cost=BreathCost(waveform, dynamics.state_size, expiration_weight, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
         initial_state=initial_state,
-        control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
+        control_bounds=([0.0, 0.0], [100.0, 1.0]),
         horizon=horizon,
     )
     return Environment(**(fields | options))

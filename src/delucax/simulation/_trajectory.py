@@ -1,18 +1,19 @@
 """The trajectory of a closed loop."""
 
 import dataclasses
-import functools
 from typing import Any, TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._check import is_concrete
 from .._extras import extra
+from .._jax import host_unless_traced, xp
 from .._results import choose, INCIDENTS, Result, RESULTS
+from .._typing import Array
 from ..systems import AbstractPlant
 
 
@@ -137,7 +138,7 @@ class Trajectory(eqx.Module):
         """Whether a step failed, the run diverged, or a learner refused an update:
         `result` is not `successful`, `plan_failed` or `estimate_failed`."""
         handled = RESULTS.successful, RESULTS.plan_failed, RESULTS.estimate_failed
-        return ~functools.reduce(jnp.logical_or, [self.result == r for r in handled])
+        return _is_none_of(self.result._value, [np.asarray(r._value) for r in handled])
 
     @property
     def incident_counts(self) -> dict[str, Array]:
@@ -340,6 +341,11 @@ class Trajectory(eqx.Module):
                 columns[f"{name}_count"] = count
                 columns[f"{name}_time"] = np.ravel(self.incident_times[name])
         return pd.DataFrame(columns)
+
+
+@host_unless_traced
+def _is_none_of(index: Array, known: list[Any]) -> Array:
+    return xp.all(xp.stack(known) != index[..., None], axis=-1)
 
 
 def plant_fields(plant: AbstractPlant) -> dict[str, Any]:

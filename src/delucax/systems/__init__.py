@@ -1,38 +1,58 @@
 """Vector fields `dx/dt = f(t, x, u, w)`. Independent of steps, costs and solvers."""
 
+from typing import TYPE_CHECKING
+
+from .._lazy import lazily as _lazily
 from ._base import AbstractPlant as AbstractPlant, AbstractSystem as AbstractSystem
-from ._classic_control import (
-    Acrobot as Acrobot,
-    CartPole as CartPole,
-    MountainCar as MountainCar,
-    Pendulum as Pendulum,
-)
 from ._general import (
     FunctionSystem as FunctionSystem,
     LinearSystem as LinearSystem,
     NeuralSystem as NeuralSystem,
     system as system,
 )
-from ._industrial import (
-    CSTR as CSTR,
-    PermanentMagnetMotor as PermanentMagnetMotor,
-    TwoTank as TwoTank,
-)
-from ._oscillators import (
-    DoubleIntegrator as DoubleIntegrator,
-    Lorenz as Lorenz,
-    MassSpringDamper as MassSpringDamper,
-    VanDerPol as VanDerPol,
-)
-from ._quadrotors import (
-    ConstantWind as ConstantWind,
-    DissipativeWind as DissipativeWind,
-    PlanarQuadrotor as PlanarQuadrotor,
-    Quadrotor as Quadrotor,
-    VortexWind as VortexWind,
-)
-from ._robots import (
-    DynamicBicycle as DynamicBicycle,
-    KinematicBicycle as KinematicBicycle,
-    Reacher as Reacher,
-)
+
+
+if TYPE_CHECKING:
+    from ._classic_control import (
+        Acrobot as Acrobot,
+        CartPole as CartPole,
+        MountainCar as MountainCar,
+        Pendulum as Pendulum,
+    )
+    from ._industrial import (
+        CSTR as CSTR,
+        PermanentMagnetMotor as PermanentMagnetMotor,
+        TwoTank as TwoTank,
+    )
+    from ._oscillators import (
+        DoubleIntegrator as DoubleIntegrator,
+        Lorenz as Lorenz,
+        MassSpringDamper as MassSpringDamper,
+        VanDerPol as VanDerPol,
+    )
+    from ._quadrotors import (
+        ConstantWind as ConstantWind,
+        DissipativeWind as DissipativeWind,
+        PlanarQuadrotor as PlanarQuadrotor,
+        Quadrotor as Quadrotor,
+        VortexWind as VortexWind,
+    )
+    from ._robots import (
+        DynamicBicycle as DynamicBicycle,
+        KinematicBicycle as KinematicBicycle,
+        Reacher as Reacher,
+    )
+else:
+    # The catalogue is imported as it is used.
+    __getattr__, __dir__ = _lazily(
+        __name__,
+        {
+            "_classic_control": "Acrobot CartPole MountainCar Pendulum",
+            "_industrial": "CSTR PermanentMagnetMotor TwoTank",
+            "_oscillators": "DoubleIntegrator Lorenz MassSpringDamper VanDerPol",
+            "_quadrotors": "ConstantWind DissipativeWind PlanarQuadrotor Quadrotor "
+            "VortexWind",
+            "_robots": "DynamicBicycle KinematicBicycle Reacher",
+        },
+    )
+del TYPE_CHECKING

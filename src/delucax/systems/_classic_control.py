@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._check import check_choice
+from .._jax import host_unless_traced, xp
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, Real, State, Time
 from ..math import cos, sin
@@ -68,8 +69,9 @@ class Pendulum(AbstractSystem):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], self.acceleration(x[0], x[1], u[0])])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.zeros(2), jnp.zeros(1)
+        return xp.zeros(2), xp.zeros(1)
 
 
 class CartPole(AbstractSystem):
@@ -146,8 +148,9 @@ class CartPole(AbstractSystem):
         acceleration, turn = self.accelerations(x[2], x[3], u[0])
         return jnp.stack([x[1], acceleration, x[3], turn])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.zeros(4), jnp.zeros(1)
+        return xp.zeros(4), xp.zeros(1)
 
 
 class MountainCar(AbstractSystem):
@@ -212,8 +215,9 @@ class MountainCar(AbstractSystem):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], self.acceleration(x[0], u[0])])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.array([-np.pi / 6, 0.0]), jnp.zeros(1)
+        return xp.array([-np.pi / 6, 0.0]), xp.zeros(1)
 
 
 class Acrobot(AbstractSystem):
@@ -309,5 +313,6 @@ class Acrobot(AbstractSystem):
         acceleration_1 = -(d2 * acceleration_2 + phi1) / d1
         return jnp.stack([velocity_1, velocity_2, acceleration_1, acceleration_2])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.array([np.pi, 0.0, 0.0, 0.0]), jnp.zeros(1)
+        return xp.array([np.pi, 0.0, 0.0, 0.0]), xp.zeros(1)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._check import is_concrete
+from .._jax import host_unless_traced, xp
 from .._message import shortened
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, Real, Scalar, State, Time
@@ -76,6 +77,7 @@ class CSTR(AbstractSystem):
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
         return jnp.stack([dc, warming + self.cooling * (u[0] - T)])
 
+    @host_unless_traced
     def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
         """The equilibrium at a concentration.
 
@@ -86,7 +88,10 @@ class CSTR(AbstractSystem):
 
         **Raises:** `ValueError` if `concentration` is not between these.
         """
-        c, feed = jnp.asarray(concentration, float), self.feed_concentration
+        c, feed = (
+            xp.asarray(concentration, jnp.result_type(float)),
+            self.feed_concentration,
+        )
         if is_concrete(c) and is_concrete(feed):
             if not np.all((0 < np.asarray(c)) & (np.asarray(c) < np.asarray(feed))):
                 raise ValueError(
@@ -95,9 +100,9 @@ class CSTR(AbstractSystem):
                 )
         # All that flows in reacts: this gives the rate, and the rate the temperature.
         reaction = self.flow * (feed - c)
-        T = self.activation / jnp.log(self.rate * c / reaction)
+        T = self.activation / xp.log(self.rate * c / reaction)
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
-        return jnp.stack([c, T]), jnp.stack([T - warming / self.cooling])
+        return xp.stack([c, T]), xp.stack([T - warming / self.cooling])
 
 
 class TwoTank(AbstractSystem):
@@ -159,6 +164,7 @@ class TwoTank(AbstractSystem):
         filling = (u[0] - upper) / self.upper_area
         return jnp.stack([filling, (upper - lower) / self.lower_area])
 
+    @host_unless_traced
     def equilibrium(self, level: Any = 10.0) -> tuple[State, Control]:
         """The equilibrium at a level of the lower tank.
 
@@ -166,12 +172,12 @@ class TwoTank(AbstractSystem):
 
         **Returns:** `(x, u)`.
         """
-        level = jnp.asarray(level, float)
+        level = xp.asarray(level, jnp.result_type(float))
         flow = self._outflow(self.lower_outlet, level)
         # The level with that outflow: root(h)^2 = r solves for h^2 by a quadratic.
         r = (flow / self.upper_outlet) ** 2 / (2 * self.gravity)
         square = r * (r + (r * r + 4 * self.smoothing**2) ** 0.5) / 2
-        return jnp.stack([square**0.5, level]), jnp.stack([flow])
+        return xp.stack([square**0.5, level]), xp.stack([flow])
 
 
 class PermanentMagnetMotor(AbstractSystem):
@@ -252,6 +258,7 @@ class PermanentMagnetMotor(AbstractSystem):
         q_slope = q_voltage * (1 / self.q_inductance)
         return jnp.stack([d_slope, q_slope, torque * (1 / self.inertia)])
 
+    @host_unless_traced
     def equilibrium(self, speed: Any = 0.0) -> tuple[State, Control]:
         """Turning at a speed without load, with no current along the magnets.
 
@@ -259,10 +266,10 @@ class PermanentMagnetMotor(AbstractSystem):
 
         **Returns:** `(x, u)`.
         """
-        speed = jnp.asarray(speed, float)
+        speed = xp.asarray(speed, jnp.result_type(float))
         current = self.friction * speed / (1.5 * self.pole_pairs * self.flux)
         electrical = self.pole_pairs * speed
         d_voltage = -electrical * self.q_inductance * current
         q_voltage = self.resistance * current + electrical * self.flux
-        x = jnp.stack([jnp.zeros_like(current), current, speed])
-        return x, jnp.stack([d_voltage, q_voltage])
+        x = xp.stack([xp.zeros_like(current), current, speed])
+        return x, xp.stack([d_voltage, q_voltage])

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._check import as_entries, check_count
+from .._jax import host_unless_traced, xp
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, Real, State, Time
 from ._base import AbstractSystem
@@ -46,8 +47,9 @@ class DoubleIntegrator(AbstractSystem):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], u[0] / self.mass])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.zeros(2), jnp.zeros(1)
+        return xp.zeros(2), xp.zeros(1)
 
 
 def _as_count(masses: Any) -> int:
@@ -128,8 +130,9 @@ class MassSpringDamper(AbstractSystem):
         pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]
         return jnp.stack([*(x[n + i] for i in range(n)), *pulls])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.zeros(2 * self.masses), jnp.zeros(1)
+        return xp.zeros(2 * self.masses), xp.zeros(1)
 
 
 class VanDerPol(AbstractSystem):
@@ -170,8 +173,9 @@ class VanDerPol(AbstractSystem):
         damping = self.mu * (1 - x[0] * x[0])
         return jnp.stack([x[1], damping * x[1] - x[0] + u[0]])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        return jnp.zeros(2), jnp.zeros(1)
+        return xp.zeros(2), xp.zeros(1)
 
 
 class Lorenz(AbstractSystem):
@@ -214,6 +218,7 @@ class Lorenz(AbstractSystem):
         dy = x[0] * (self.rho - x[2]) - x[1]
         return jnp.stack([dx, dy, x[0] * x[1] - self.beta * x[2]])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
         """The centre of the right wing, `x = y = sqrt(beta (rho - 1))`, `z = rho - 1`;
         the origin where there are no wings (`rho <= 1`).
@@ -222,7 +227,7 @@ class Lorenz(AbstractSystem):
         """
         winged = (self.rho > 1) & (self.beta > 0)
         # The root of 1 where there are no wings: that of 0 has no gradient.
-        height = jnp.where(winged, self.rho - 1, 0.0)
-        square = jnp.where(winged, self.beta * height, 1.0)
-        wing = jnp.where(winged, jnp.sqrt(square), 0.0)
-        return jnp.stack([wing, wing, height]), jnp.zeros(1)
+        height = xp.where(winged, self.rho - 1, 0.0)
+        square = xp.where(winged, self.beta * height, 1.0)
+        wing = xp.where(winged, xp.sqrt(square), 0.0)
+        return xp.stack([wing, wing, height]), xp.zeros(1)

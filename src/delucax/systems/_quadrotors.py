@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_choice
+from .._jax import host_unless_traced, xp
 from .._module import check_parameters, function_field, parameter, positive
-from .._typing import Control, Disturbance, Real, State, Time, Vector
+from .._typing import Control, Disturbance, Real, Scalar, State, Time, Vector
 from ..math import cos, sin
 from ._base import AbstractSystem
 
@@ -90,14 +91,20 @@ class PlanarQuadrotor(AbstractSystem):
         **Returns:** the state, and a half of the thrust for each rotor; without wind
             the zero state, and a half of the weight.
         """
-        weight, level = self.mass * self.gravity, jnp.zeros(6)
         if self.wind is None:
-            return level, jnp.stack([weight / 2, weight / 2])
+            return _hovering(self.mass, self.gravity)
+        weight, level = self.mass * self.gravity, jnp.zeros(6)
         force = self.wind(jnp.zeros(()), level)
         up = weight - force[1]
         # The thrust balances the wind and the weight in size and direction.
         half = (force[0] * force[0] + up * up) ** 0.5 / 2
         return level.at[2].set(jnp.arctan2(force[0], up)), jnp.stack([half, half])
+
+
+@host_unless_traced
+def _hovering(mass: Scalar, gravity: Scalar) -> tuple[State, Control]:
+    """At rest, and a half of the weight for each rotor."""
+    return xp.zeros(6), xp.stack([mass * gravity / 2] * 2)
 
 
 class Quadrotor(AbstractSystem):
@@ -285,17 +292,18 @@ class Quadrotor(AbstractSystem):
         ]
         return jnp.stack(entries)
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
         """Hovering at the origin.
 
         **Returns:** the state, level and at rest, and a quarter of the weight for each
             rotor.
         """
-        x = jnp.zeros(13).at[3].set(1.0)
+        x = xp.array([0.0] * 3 + [1.0] + [0.0] * 9)
         weight = self.mass * self.gravity
         if self.inputs == "rotors":
-            return x, jnp.stack([weight / 4] * 4)
-        return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
+            return x, xp.stack([weight / 4] * 4)
+        return x, xp.stack([weight, *[xp.zeros_like(weight)] * 3])
 
 
 class _AbstractWind(eqx.Module):

@@ -3,6 +3,7 @@ tyres that slip; and an arm of two links."""
 
 import jax.numpy as jnp
 
+from .._jax import host_unless_traced, xp
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, Real, State, Time, Vector
 from ..math import cos, sin
@@ -60,12 +61,13 @@ class KinematicBicycle(AbstractSystem):
         dx, dy = v * (c * along - s * across), v * (s * along + c * across)
         return jnp.stack([dx, dy, v * across / self.rear, u[0]])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin; a standing car is not controllable.
 
         **Returns:** the zero state and control.
         """
-        return jnp.zeros(4), jnp.zeros(2)
+        return xp.zeros(4), xp.zeros(2)
 
 
 class DynamicBicycle(AbstractSystem):
@@ -142,12 +144,13 @@ class DynamicBicycle(AbstractSystem):
         turn = (self.front * aside - self.rear * force_rear) / self.inertia
         return jnp.stack([dx, dy, rate, along, across, turn])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin.
 
         **Returns:** the zero state and control.
         """
-        return jnp.zeros(6), jnp.zeros(2)
+        return xp.zeros(6), xp.zeros(2)
 
 
 class Reacher(AbstractSystem):
@@ -233,9 +236,10 @@ class Reacher(AbstractSystem):
         a2 = (m11 * b2 - m12 * b1) / determinant
         return jnp.stack([d1, d2, a1, a2])
 
+    @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
         """The arm stretched along the x axis, at rest.
 
         **Returns:** the zero state and control.
         """
-        return jnp.zeros(4), jnp.zeros(2)
+        return xp.zeros(4), xp.zeros(2)

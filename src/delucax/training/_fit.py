@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._check import check_at_most, check_count, check_function, check_key, is_concrete
 from .._results import choose, Result, RESULTS
@@ -255,12 +255,17 @@ def fit(
 
     if np.any(faults) and throw:
         raise RuntimeError(_failure(faults, blocks[-1], done))
-    outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
-    each = outcome if seeds is None else jax.vmap(outcome)
     metrics = _joined(blocks)
     columns = {name: metrics.pop(name) for name in COLUMNS}
     history = History(**columns, metrics=metrics)
-    return Fitted(run.finished(state), history, each(state.fault))
+    return Fitted(run.finished(state), history, _outcome(state.fault))
+
+
+@eqx.filter_jit
+def _outcome(fault: Array) -> Result:
+    """The status of each seed."""
+    outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
+    return outcome(fault) if fault.ndim == 0 else jax.vmap(outcome)(fault)
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:

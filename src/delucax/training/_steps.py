@@ -139,7 +139,7 @@ class Steps(NamedTuple):
 
     def start(self, model: PyTree, values: Values) -> State:
         """The state before the first step."""
-        state = _over_seeds(self.optimiser.init, self.seeds)(values)
+        state = _first_state(self.optimiser, self.seeds, values)
         memory = order = None
         if isinstance(self.loss, AbstractSurrogate):
             begin = jax.tree_util.Partial(_first_memory, self.loss)
@@ -150,7 +150,7 @@ class Steps(NamedTuple):
             no_pass = jnp.full(shape, -1, jnp.int32)
             order = jnp.zeros((*shape, size), jnp.int32), no_pass
         fault = jnp.zeros(shape, jnp.int32)
-        return State(values, jax.tree.map(strip_weak_type, state), memory, order, fault)
+        return State(values, state, memory, order, fault)
 
     def block(
         self, state: State, first: int, stop: int
@@ -159,7 +159,8 @@ class Steps(NamedTuple):
 
         **Returns:** the state after them, and the metrics by name, an entry per step.
         """
-        state, outcome = self._compiled(state, jnp.asarray([first, stop], jnp.int32))
+        span = jax.device_put(np.array([first, stop], np.int32))
+        state, outcome = self._compiled(state, span)
         rows, count = jax.device_get(outcome)
         return state, {name: column[:count] for name, column in rows.items()}
 
@@ -256,6 +257,12 @@ class Steps(NamedTuple):
         stepped: Any = jax.tree.map(kept, (moved, after, memory), before[:3])
         row = {"loss": strip_weak_type(cost), "gradient_norm": norm, **metrics}
         return State(*stepped, order=order, fault=fault), row
+
+
+@eqx.filter_jit
+def _first_state(optimiser: Any, seeds: int | None, values: Values) -> PyTree:
+    """The state of an optimiser before the first step."""
+    return jax.tree.map(strip_weak_type, _over_seeds(optimiser.init, seeds)(values))
 
 
 def _first_memory(loss: AbstractSurrogate, model: PyTree, key: PRNGKey) -> PyTree:

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..._check import check_count, check_instance, check_step, is_concrete
 from ..._controller import AbstractController, wrong_observation
-from ..._jax import jacobian
+from ..._jax import value_and_jacobians
 from ..._module import parameter
 from ...dynamics import AbstractDynamics, LinearDynamics
 from ...math import matvec
@@ -354,11 +354,11 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
         # The base learns what was applied, so that its anti-windup is part of the loop.
         after = base.applied(u + v, jnp.zeros((), x.dtype), after)
         z_next = jnp.concatenate([x_next, _vector(after)[0].astype(x.dtype)])
-        return z_next, jnp.concatenate([y, u.astype(y.dtype)])
+        return jnp.concatenate([z_next, y.astype(x.dtype), u.astype(x.dtype)])
 
     z = jnp.concatenate([x, vector.astype(x.dtype)])
-    (transition, input), (output, _) = jacobian(step, (0, 1))(z, v)
-    return Tangents(transition, input, output)
+    _, (by_state, by_control) = value_and_jacobians(step, z, v)
+    return Tangents(by_state[: z.size], by_control[: z.size], by_state[z.size :])
 
 
 def _equilibrium_tangents(

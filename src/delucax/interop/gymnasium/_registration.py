@@ -16,7 +16,7 @@ from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
 
-_FUNCTIONS = vars(lung) | vars(environments)
+_FUNCTIONS = {n: getattr(p, n) for p in (lung, environments) for n in dir(p)}
 # The name of a task, whether its actions are whole numbers, and Gymnasium's threshold
 # of the mean return from which it counts as solved.
 _IDS = {
