@@ -4,6 +4,7 @@ import os
 import platform
 from datetime import datetime, UTC
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 
@@ -18,6 +19,23 @@ def limit_cores(count: int) -> None:
     """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+def keep_programs() -> None:
+    """Keep compiled programs in `.cache/programs`, or as the variables of JAX say.
+
+    Each benchmark calls this, or `compile_anew` if its seconds contain compilation.
+    """
+    from delucax import _programs
+
+    _programs.keep_programs(otherwise=Path(__file__).parents[1] / ".cache/programs")
+
+
+def compile_anew() -> None:
+    """Compile every program, whatever the variables of JAX say."""
+    from delucax import _programs
+
+    _programs.forget_programs()
 
 
 def describe() -> dict[str, Any]:

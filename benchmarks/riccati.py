@@ -26,7 +26,7 @@ import pandas as pd  # noqa: E402
 import scipy.linalg  # noqa: E402
 
 import delucax as dlx  # noqa: E402
-from benchmarks._machine import describe, limit_cores  # noqa: E402
+from benchmarks._machine import compile_anew, describe, limit_cores  # noqa: E402
 from benchmarks._timing import compiled, python, race, Timing  # noqa: E402
 
 
@@ -122,6 +122,7 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=1)
     options = parser.parse_args()
     limit_cores(options.cores)
+    compile_anew()
     jax.config.update("jax_enable_x64", True)
 
     ratios, record, qualities = [], [], []
