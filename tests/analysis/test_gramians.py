@@ -6,7 +6,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -28,7 +27,6 @@ C = _RNG.normal(size=(3, 4))
 A_STEP = A / 6
 
 
-@thorough
 def test_infinite_gramians_are_scipys():
     system, dynamics = LinearSystem(A, B, C), dlx.LinearDynamics(A_STEP, B, C)
     close = tolerance(1e-5, 1e-13)
@@ -91,8 +89,8 @@ def test_disturbances_enter_through_E():
     "make, horizon",
     [
         (LinearSystem, None),
-        pytest.param(LinearSystem, 0.7, marks=thorough),
-        pytest.param(dlx.LinearDynamics, None, marks=thorough),
+        (LinearSystem, 0.7),
+        (dlx.LinearDynamics, None),
     ],
 )
 def test_gradients_are_central_differences(make, horizon):

@@ -8,7 +8,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -114,7 +113,6 @@ def test_told_what_was_applied(key):
     assert_close(run.controls, expected, **close)
 
 
-@thorough
 def test_exact_sensor_is_state_feedback(key):
     dynamics = dlx.LinearDynamics(A, B)
     noise = dlx.disturbances.Gaussian(0.3, size=2)
@@ -130,7 +128,6 @@ def test_exact_sensor_is_state_feedback(key):
         assert (lqg.average_cost is None) == (not steady_state)
 
 
-@thorough
 def test_holds_an_operating_point(key):
     """A pendulum leant against a constant torque, its bob seen from the side."""
 
@@ -160,7 +157,6 @@ def test_holds_an_operating_point(key):
     assert abs(run.final_state[0] - 0.3) > 0.01
 
 
-@thorough
 def test_output_feedback_of_anything(key):
     """With the parts of an LQG it is that LQG; each part may be another one."""
     env = environment(horizon=10)
@@ -192,7 +188,6 @@ def test_output_feedback_of_anything(key):
     assert_close(run.controls, a.controls, atol=1e-4)
 
 
-@thorough
 @needs_x64
 def test_gradient_of_the_design():
     """Of the least average cost, with respect to the noise and to the physics."""

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+from helpers import assert_close, needs_x64, tolerance, user_error
 from jax.test_util import check_grads
 from scipy.linalg import logm
 
@@ -76,7 +76,6 @@ def test_integrators_are_their_formula():
     assert_close(double.B, [[0], [1]], atol=close)
 
 
-@thorough
 @pytest.mark.parametrize("ours, theirs", [("zoh", "zoh"), ("tustin", "bilinear")])
 def test_what_control_samples_comes_back(ours, theirs):
     system = random_system(3)
@@ -89,7 +88,6 @@ def test_what_control_samples_comes_back(ours, theirs):
     assert_close(back.B, system.B, atol=tolerance(1e-4, 1e-11))
 
 
-@thorough
 @needs_x64
 def test_gradients_are_central_differences():
     A = jnp.array([[0.9, 0.3], [-0.4, 0.7]])
@@ -109,7 +107,6 @@ def test_gradients_are_central_differences():
     assert_close(hessian.reshape(4, 4), numeric, rtol=1e-6, atol=1e-6)
 
 
-@thorough
 @needs_x64
 def test_tustin_is_differentiable():
     def loss(A):

@@ -12,7 +12,6 @@ from helpers import (
     central_difference,
     dtype,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -86,7 +85,6 @@ class Hidden(dlx.AbstractSystem):
 # What a step is.
 
 
-@thorough
 def test_substeps_are_shorter_steps():
     for solver in (diffrax.Tsit5(), diffrax.ImplicitEuler()):
         x = X
@@ -181,9 +179,9 @@ def test_implicit_euler_of_a_stiff_decay(rate, size):
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(diffrax.Kvaerno3(), marks=thorough),
+        diffrax.Kvaerno3(),
         diffrax.Kvaerno5(),
-        pytest.param(diffrax.ImplicitEuler(), marks=thorough),
+        diffrax.ImplicitEuler(),
     ],
 )
 def test_implicit_steps_converge_where_diffrax_gives_up(solver):
@@ -350,7 +348,7 @@ def test_substeps_of_noise_need_their_increments():
     "solver",
     [
         diffrax.HalfSolver(dlx.dynamics.RK4()),
-        pytest.param(diffrax.Kvaerno4(), marks=thorough),
+        diffrax.Kvaerno4(),
     ],
     ids=["wrapped", "implicit"],
 )
@@ -408,7 +406,6 @@ def final_angle(leaves, dynamics):
     return dlx.open_loop(dynamics, leaves[1:3], leaves[3:, None])[-1, 0]
 
 
-@thorough
 @needs_x64
 def test_backsolve_at_a_tight_tolerance():
     at = jnp.array([1.1, 1.0, -0.5, 0.7, -1.3])
@@ -419,14 +416,12 @@ def test_backsolve_at_a_tight_tolerance():
 
 
 @needs_x64
-@thorough
 def test_a_backward_solve_that_fails_is_loud():
     at = jnp.array([1.1, 1.0, -0.5, 0.7])
     with user_error(RuntimeError, match="maximum number of solver steps"):
         jax.block_until_ready(jax.grad(final_angle)(at, backsolve(max_steps=1)))
 
 
-@thorough
 def test_backsolve_inside_a_rollout():
     def slopes(dynamics):
         env = dlx.Environment(dynamics, dlx.costs.PendulumCost(), horizon=3)

@@ -7,7 +7,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -63,7 +62,6 @@ def test_time_varying_is_indexed_by_rounding():
 
 
 @needs_x64
-@thorough
 def test_linearize_is_central_differences():
     system = dlx.systems.Pendulum(length=1.3, damping=0.1)
     x, u, w = jnp.array([0.4, -0.3]), jnp.array([0.2]), jnp.zeros(2)
@@ -81,7 +79,6 @@ def test_linearize_is_central_differences():
         assert model.state_names == ("angle", "velocity")
 
 
-@thorough
 def test_linearize_keeps_the_operating_point():
     system = dlx.systems.Pendulum()
     model = dlx.linearize(system)
@@ -116,7 +113,6 @@ def test_c2d_is_scipys(ours, scipys):
     assert_close(model.B, Bd, atol=tolerance(1e-5, 1e-13))
 
 
-@thorough
 def test_zoh_of_a_linearised_system_is_a_fine_integration():
     system = dlx.systems.Pendulum()
     x, u = jnp.array([0.5, 0.1]), jnp.array([0.3])

@@ -10,7 +10,6 @@ from helpers import (
     dtype,
     needs_x64,
     once,
-    thorough,
     tolerance,
     user_error,
 )
@@ -191,7 +190,6 @@ def test_linear_cartpole_is_the_nonlinear_one_of_a_point_mass():
     assert_close(A[3, 2], rate, rtol=1e-5)
 
 
-@thorough
 def test_an_lqr_of_the_linearisation_holds_the_pole(key):
     env = dlx.make("cartpole")
     lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), jnp.eye(4), jnp.eye(1))
@@ -214,7 +212,6 @@ def test_height_cost_has_its_minimum_upright():
     assert slope[0] < -0.5
 
 
-@thorough
 def test_a_smooth_acrobot_has_gradients(key):
     env = dlx.make(
         "acrobot",

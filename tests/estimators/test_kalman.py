@@ -8,7 +8,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -75,7 +74,7 @@ def textbook(kalman, ys, us):
 
 @pytest.mark.parametrize(
     "n, p, steps",
-    [(3, 2, None), pytest.param(7, 6, None, marks=thorough), (3, 1, 8)],
+    [(3, 2, None), (7, 6, None), (3, 1, 8)],
 )
 def test_as_in_the_textbook(n, p, steps):
     kalman, ys, us = problem(n, p, steps=steps)
@@ -154,7 +153,6 @@ def test_smoother_solves_the_whole_record_at_once(known_start):
     assert smoothed.result == dlx.RESULTS.successful
 
 
-@thorough
 def test_steady_state():
     transient, ys, us = problem(3, 2, k=3, T=60)
     dynamics, W, V = transient.dynamics, transient.W, transient.V
@@ -178,7 +176,6 @@ def test_steady_state():
     assert_close(*densities, **CLOSE)
 
 
-@thorough
 def test_steady_smoother_is_that_of_the_stationary_start():
     transient, ys, us = problem(2, 1, T=6)
     dynamics, W, V = transient.dynamics, transient.W, transient.V
@@ -210,7 +207,6 @@ def test_operating_point():
         assert_close(b.covariance, a.covariance, **CLOSE)
 
 
-@thorough
 def test_linearised_sensor():
     """What a sensor reads at the operating point is given, where it is not C x_ref."""
     system = dlx.system(
@@ -253,7 +249,6 @@ def noisy(log_levels, stiffness):
     return c.KalmanFilter(dynamics, q * jnp.eye(2), r * jnp.eye(1))
 
 
-@thorough
 @needs_x64
 def test_gradient_of_the_likelihood():
     @jax.jit
@@ -270,7 +265,6 @@ def test_gradient_of_the_likelihood():
     assert_close(hessian, rows, rtol=1e-6, atol=1e-7)
 
 
-@thorough
 @needs_x64
 def test_gradient_of_the_smoother():
     kalman = problem(3, 2)[0]
@@ -285,7 +279,6 @@ def test_gradient_of_the_smoother():
     assert_close(jax.grad(size)(kalman.W), numeric, rtol=1e-6, atol=1e-8)
 
 
-@thorough
 def test_batch_and_its_bad_member():
     """A member that fails says so, and harms neither the others nor the gradient."""
     ys = jnp.stack([YS, 2 * YS, YS])
@@ -334,7 +327,6 @@ def test_covariance_stays_semidefinite():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(float, marks=needs_x64)])
-@thorough
 def test_precision_and_file(dtype, tmp_path):
     dynamics = dlx.LinearDynamics(A.astype(dtype), B.astype(dtype), C.astype(dtype))
     noise = W.astype(dtype), V.astype(dtype)
@@ -349,7 +341,6 @@ def test_precision_and_file(dtype, tmp_path):
         np.testing.assert_array_equal(again.mean, found.mean)
 
 
-@thorough
 def test_failures():
     dynamics = dlx.LinearDynamics(A, B, C)
     blind = c.KalmanFilter(dynamics, W, 0 * V, covariance=jnp.zeros((2, 2)))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+from helpers import assert_close, needs_x64, tolerance, user_error
 
 import delucax as dlx
 
@@ -34,7 +34,6 @@ def arrived(t, x):
     return x - jnp.array([1.0, 0.0, 0.0, 0.0])
 
 
-@thorough
 @needs_x64
 def test_an_obstacle_and_an_end_against_scipy():
     optimize = pytest.importorskip("scipy.optimize")
@@ -71,7 +70,6 @@ def test_an_obstacle_and_an_end_against_scipy():
     assert_close(plan.controls.ravel(), found.x, atol=1e-3)
 
 
-@thorough
 def test_a_state_limit_costs_and_holds():
     dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
     cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])

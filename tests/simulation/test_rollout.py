@@ -11,7 +11,6 @@ from helpers import (
     central_difference,
     CountCalls,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -111,9 +110,7 @@ def test_a_batch_is_vmap(key):
         assert_close(batch.times[i], one.times)
 
 
-@pytest.mark.parametrize(
-    "horizon", [*(pytest.param(n, marks=thorough) for n in (1, 16)), 23]
-)
+@pytest.mark.parametrize("horizon", [1, 16, 23])
 def test_checkpoints_change_no_number(key, horizon):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
 
