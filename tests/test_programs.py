@@ -30,13 +30,17 @@ print(*(counts[f"/jax/compilation_cache/cache_{n}"] for n in ("hits", "misses"))
 """
 
 
+# Without what the tests themselves are run with.
+ENVIRONMENT = {k: v for k, v in os.environ.items() if "COMPILATION_CACHE" not in k}
+ENVIRONMENT.pop("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", None)
+
+
 def compile_four(*arguments, **variables):
     """What a process says that keeps its programs: the folder, `(found, written)`, and
     its complaints."""
-    environment = {k: v for k, v in os.environ.items() if "_CACHE" not in k}
     command = [sys.executable, "-c", SCRIPT, programs.__file__, *map(str, arguments)]
     done = subprocess.run(
-        command, env=environment | variables, capture_output=True, text=True
+        command, env=ENVIRONMENT | variables, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     folder, counts = done.stdout.splitlines()
@@ -138,11 +142,15 @@ def test_the_command_line_keeps_programs(tmp_path, how):
     folder = tmp_path / "programs"
     if how == "a file":
         folder.write_text("not a folder")
-    options = ["--no-cache"] if how == "--no-cache" else ["--cache", str(folder)]
+    options = {
+        "--cache": ["--cache", str(folder), "--workers", "2"],  # by the workers, too
+        "--no-cache": ["--no-cache"],
+        "a file": ["--cache", str(folder)],
+    }
     done = subprocess.run(
-        [sys.executable, "-m", "delucax", "run", "few.py", *options, "--workers", "2"],
+        [sys.executable, "-m", "delucax", "run", "few.py", *options[how]],
         cwd=tmp_path,
-        env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "other")},
+        env=ENVIRONMENT | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "other")},
         capture_output=True,
         text=True,
     )

@@ -17,9 +17,6 @@ from helpers import (
 import delucax as dlx
 
 
-pytestmark = needs_x64
-
-
 START = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 
 

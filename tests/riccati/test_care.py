@@ -5,12 +5,9 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, tolerance, user_error
 
 import delucax as dlx
-
-
-pytestmark = needs_x64
 
 
 A = jnp.array([[0.0, 1.0], [0.0, 0.0]])

@@ -18,9 +18,6 @@ from helpers import (
 import delucax as dlx
 
 
-pytestmark = needs_x64
-
-
 FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
 UPRIGHT = jnp.array([0.1, 0.0])
 

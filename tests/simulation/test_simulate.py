@@ -9,7 +9,6 @@ import scipy.integrate
 from helpers import (
     assert_close,
     dtype,
-    needs_x64,
     tolerance,
     user_error,
 )
@@ -17,9 +16,6 @@ from jaxtyping import Array
 
 import delucax as dlx
 from delucax.simulation._hold import Hold, interval_before
-
-
-pytestmark = needs_x64
 
 
 PENDULUM = dlx.systems.Pendulum(damping=0.1)
