@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, needs_x64, tolerance
+from helpers import assert_close, needs_x64
 from jax.test_util import check_grads
 
 from delucax._jax import by_components
@@ -44,7 +44,7 @@ def _arguments():
 
 def _leaves_close(a, b):
     for p, q in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        assert_close(p, q, rtol=tolerance(1e-4, 1e-10), atol=tolerance(1e-3, 1e-10))
+        assert_close(p, q, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])

@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -72,7 +72,7 @@ def test_time_varying_about_a_path():
     off = jnp.array([0.1, -0.2])
     for k in range(6):
         u, _ = controller(float(k), path[k] + off, None)
-        close = tolerance(1e-5, 1e-12)
+        close = 1e-12
         assert_close(u, -solution.K[k] @ off, rtol=close, atol=close)
     stray = eqx.tree_at(lambda d: d.x_next, dynamics, reached + 1)
     with user_error(match="each operating point to the next"):

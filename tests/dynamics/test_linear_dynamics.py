@@ -7,7 +7,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    tolerance,
     user_error,
 )
 from scipy.signal import cont2discrete
@@ -109,8 +108,8 @@ def test_c2d_is_scipys(ours, scipys):
     Ad, Bd, *_ = cont2discrete(
         (continuous.A, continuous.B, np.eye(4), np.zeros((4, 2))), 0.1, scipys
     )
-    assert_close(model.A, Ad, atol=tolerance(1e-5, 1e-13))
-    assert_close(model.B, Bd, atol=tolerance(1e-5, 1e-13))
+    assert_close(model.A, Ad, atol=1e-13)
+    assert_close(model.B, Bd, atol=1e-13)
 
 
 def test_zoh_of_a_linearised_system_is_a_fine_integration():
@@ -120,7 +119,7 @@ def test_zoh_of_a_linearised_system_is_a_fine_integration():
     sampled = dlx.c2d(linear, 0.05)
     fine = dlx.Discretized(linear, 0.05, diffrax.Dopri8(), substeps=4)
     at = (0.0, jnp.array([0.6, -0.2]), jnp.array([1.0]))
-    assert_close(sampled(*at), fine(*at), atol=tolerance(1e-6, 1e-14))
+    assert_close(sampled(*at), fine(*at), atol=1e-14)
 
 
 def test_lqr_about_a_point_holds_it():
@@ -135,7 +134,7 @@ def test_lqr_about_a_point_holds_it():
     )
     env = dlx.Environment(dynamics, dlx.costs.PendulumCost(), horizon=200)
     run = dlx.rollout(env, controller, key=jax.random.key(0), x0=x + 0.05)
-    assert_close(run.final_state, x, atol=tolerance(1e-5, 1e-6))
+    assert_close(run.final_state, x, atol=1e-6)
 
 
 @pytest.mark.parametrize(

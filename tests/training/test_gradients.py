@@ -9,7 +9,6 @@ from helpers import (
     assert_close,
     dtype,
     needs_x64,
-    tolerance,
     user_error,
 )
 from jaxtyping import Array
@@ -183,7 +182,7 @@ def test_a_score_stops_where_the_episode_does():
     for _ in range(2):
         key, now = jr.split(key)
         total += jr.normal(now, (1,), dtype())[0] ** 2 - 1
-    assert_close(slope, total, rtol=tolerance(1e-3, 1e-9))
+    assert_close(slope, total, rtol=1e-9)
 
 
 def quadratic(model, key):
