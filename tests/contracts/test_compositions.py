@@ -477,7 +477,7 @@ quietly = dict(
 )
 
 
-@settings(max_examples=20, **quietly)
+@settings(max_examples=8, **quietly)
 @given(compositions)
 def test_a_random_loop(c):
     check(c)

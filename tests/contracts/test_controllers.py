@@ -245,7 +245,6 @@ def test_every_controller_is_listed():
     assert members >= {"Zero", "LQR", "PID", "MLP", "Gaussian"}
 
 
-@needs_x64
 @every
 def test_jit_and_vmap(case, key):
     """It goes into plain `jax.jit`, where other numbers in it do not compile again; a
