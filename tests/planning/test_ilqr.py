@@ -245,7 +245,7 @@ def test_a_bound_that_is_far_is_not_taken_for_met():
     x0 = jnp.array([-2.5, 0.3, 0.0, 0.0, 0.0, 0.0])
     options = dict(bounds=(0.0, 1.0), second_order=True, throw=False)
     plan = ilqr(dynamics, cost, x0, hover[:80], **options)
-    assert plan.iterations > 5 and plan.residual < 1e-6
+    assert plan.iterations > 5 and plan.residual < tolerance(3e-5, 1e-6)
     assert plan.cost < 0.1 * plan.trace[0]
 
 

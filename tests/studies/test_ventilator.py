@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, once, user_error
+from helpers import assert_close, minutes, once, user_error
 
 import delucax as dlx
 from delucax import lung, studies
@@ -184,6 +184,7 @@ def write_lungs(path, lungs, breaths):
     lung.write_breaths(path, jax.tree.map(join, *parts))
 
 
+@minutes("trains lungs, networks and PIDs, as `python -m delucax lung --small` does")
 @pytest.mark.parametrize("from_file", [False, True])
 def test_small_study(tmp_path, from_file):
     data, out = None, tmp_path / "out"
