@@ -4,6 +4,7 @@ import os
 import platform
 from datetime import datetime, UTC
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 
@@ -30,6 +31,23 @@ def pinned_environment() -> dict[str, str]:
     names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"
     return os.environ | dict.fromkeys(names, "1") | {"XLA_FLAGS": flags.strip()}
+
+
+def keep_programs() -> None:
+    """Keep compiled programs in `.cache/programs`, or as the variables of JAX say.
+
+    Each benchmark calls this, or `compile_anew` if its seconds contain compilation.
+    """
+    from delucax import _programs
+
+    _programs.keep_programs(otherwise=Path(__file__).parents[1] / ".cache/programs")
+
+
+def compile_anew() -> None:
+    """Compile every program, whatever the variables of JAX say."""
+    from delucax import _programs
+
+    _programs.forget_programs()
 
 
 def describe() -> dict[str, Any]:

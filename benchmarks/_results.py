@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import describe, keep_programs, limit_cores
 
 
 def updated(path: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Any:
@@ -50,6 +50,7 @@ def run_in_parts(
         draw(json.loads(results.read_text()))
         return
     limit_cores(1)
+    keep_programs()
     jax.config.update("jax_enable_x64", True)
     about = {"machine": describe()} | about
     content: dict[str, Any] = {}

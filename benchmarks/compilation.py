@@ -1,10 +1,11 @@
 """`python -m benchmarks.compilation`: how long the first answer takes, and why.
 
 Each case of `_first_answers.py` runs in a process of its own, as a user would: with
-default flags and, unless `--x64`, in single precision. Imports are timed apart. Prints
-the wait, the seconds that JAX traced, lowered and compiled, the number of programs and
-the operations in them, beside the peers; with `--cache` also the wait of a second
-process, which finds the compiled programs on disk. Writes
+default flags and, unless `--x64`, in single precision. Imports are timed apart, and no
+compiled program is taken from disk. Prints the wait, the seconds that JAX traced,
+lowered and compiled, the number of programs and the operations in them, beside the
+peers; with `--cache` also the wait of a second process that finds the programs of the
+first on disk, and how many it did not find. Writes
 `benchmarks/results/compilation.json`.
 """
 
@@ -23,6 +24,8 @@ from benchmarks._first_answers import CASES
 
 
 OUT = Path(__file__).parent / "results" / "compilation.json"
+# What a second process may wait, and what of that for XLA, as parts of the first's.
+WAIT, COMPILED = 0.6, 0.2
 STAGES = {
     "/jax/core/compile/jaxpr_trace_duration": "trace",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
@@ -51,7 +54,7 @@ def answer(name: str) -> dict[str, Any]:
     thunks = CASES[name].prepare()
     row: dict[str, Any] = {"case": name, "prepare": time.perf_counter() - start}
     spent = dict.fromkeys(STAGES.values(), 0.0)
-    programs = 0
+    programs = on_disk = 0
     if "jax" in sys.modules:
         import jax
 
@@ -61,7 +64,12 @@ def answer(name: str) -> dict[str, Any]:
                 spent[STAGES[event]] += seconds
                 programs += STAGES[event] == "compile"
 
+        def hit(event: str, **_: Any) -> None:
+            nonlocal on_disk
+            on_disk += event == "/jax/compilation_cache/cache_hits"
+
         jax.monitoring.register_event_duration_secs_listener(heard)
+        jax.monitoring.register_event_listener(hit)
         wait = jax.block_until_ready
     else:
         wait = lambda value: value
@@ -72,6 +80,7 @@ def answer(name: str) -> dict[str, Any]:
         waits.append(time.perf_counter() - start)
         if k == 0:
             row |= {"first": waits[0], **spent, "programs": programs}
+            row["on disk"] = on_disk
     start = time.perf_counter()
     wait(thunks[0]())
     row["again"] = time.perf_counter() - start
@@ -151,6 +160,42 @@ def show(rows: list[dict[str, Any]]) -> None:
         print(f"{row['case']:44s}" + "".join(f"{c!s:>11s}" for c in cells))
 
 
+def with_cache(name: str, variables: dict[str, str], rounds: int) -> dict[str, Any]:
+    """The waits of a process that finds nothing on disk, and of the one after it."""
+    pairs = []
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory() as folder:
+            kept = variables | {
+                "JAX_ENABLE_COMPILATION_CACHE": "true",
+                "JAX_COMPILATION_CACHE_DIR": folder,
+                "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            }
+            pairs.append([in_a_process(name, **kept) for _ in range(2)])
+    before, after = (median(list(rows)) for rows in zip(*pairs, strict=True))
+    if "error" in before or "error" in after:
+        return {}
+    return {
+        "cache": {
+            "wait": [before["first"], after["first"]],
+            "compile": [before["compile"], after["compile"]],
+            "not found": after["programs"] - after["on disk"],
+        }
+    }
+
+
+def show_cache(rows: list[dict[str, Any]]) -> None:
+    """Print a table of the waits without and with programs on disk."""
+    columns = "wait then ratio compile then ratio not-found".split()
+    print(f"{'case':44s}" + "".join(f"{c:>11s}" for c in columns))
+    for row in rows:
+        if cache := row.get("cache"):
+            cells = []
+            for before, after in (cache["wait"], cache["compile"]):
+                cells += [before, after, after / before]
+            shown = "".join(f"{cell:>11.3f}" for cell in cells)
+            print(f"{row['case']:44s}{shown}{cache['not found']:>11d}")
+
+
 def main() -> None:
     """Run, print and write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.compilation")
@@ -169,7 +214,10 @@ def main() -> None:
         for name in CASES
         if not options.cases or any(word in name for word in options.cases)
     ]
-    variables = {"JAX_ENABLE_X64": "1" if options.x64 else "0"}
+    variables = {
+        "JAX_ENABLE_X64": "1" if options.x64 else "0",
+        "JAX_ENABLE_COMPILATION_CACHE": "false",
+    }
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for _ in range(options.rounds):
         for name in names:
@@ -185,27 +233,12 @@ def main() -> None:
         rows.append(row)
     show(rows)
     if options.cache:
-        print("\nA second process that finds the programs on disk")
+        print("\nA second process, with the programs of the first on disk: limits are")
+        print(f"{WAIT} of the wait, and {COMPILED} of what XLA took")
         for name in names:
-            with tempfile.TemporaryDirectory() as folder:
-                kept = variables | {
-                    "JAX_COMPILATION_CACHE_DIR": folder,
-                    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-                    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-                }
-                before, after = (in_a_process(name, **kept) for _ in range(2))
-            if "error" in before or "error" in after or not before.get("compile"):
-                continue
-            found[name] |= {
-                "wait with cache": after["first"] / before["first"],
-                "compile with cache": after["compile"] / before["compile"],
-            }
-            print(
-                f"{name:44s} wait {before['first']:.2f} -> {after['first']:.2f} "
-                f"({after['first'] / before['first']:.2f}), compile "
-                f"{before['compile']:.2f} -> {after['compile']:.2f} "
-                f"({after['compile'] / before['compile']:.2f})"
-            )
+            if found[name].get("programs"):
+                found[name] |= with_cache(name, variables, options.rounds)
+        show_cache([found[name] for name in names])
     if options.out or not options.cases:
         from benchmarks._machine import describe
 

@@ -18,7 +18,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks import _adapter, _tasks
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._peers import gymnax_peer
 from benchmarks._problem import Episodes
 from benchmarks._timing import Contender, Missing, race, Timing
@@ -248,6 +248,7 @@ def main() -> None:
         print(documented(json.loads(Path(options.out).read_text())))
         return
     limit_cores(options.cores)
+    compile_anew()
     rounds = 3 if options.quick else options.rounds
     chain, batch = (5_000, 50) if options.quick else (50_000, 200)
     names = _tasks.names() if options.tasks is None else options.tasks

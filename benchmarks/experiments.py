@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._machine import describe
+from benchmarks._machine import compile_anew, describe
 from delucax.experiments import experiment, Results, run
 from delucax.experiments._results import TIMES
 
@@ -396,6 +396,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all if none")
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args(arguments)
+    compile_anew()
     wrong = [part for part in options.parts if part not in PARTS]
     if wrong:
         parser.error(f"parts must be of {', '.join(PARTS)}, got {wrong[0]}")

@@ -11,7 +11,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._venv import interpreter, ROOT
 
 
@@ -31,6 +31,7 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=1)
     options = parser.parse_args()
     limit_cores(options.cores)
+    compile_anew()
     python = interpreter("rejax", *REQUIREMENTS)
     outside = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     command = [python, "-m", "benchmarks._peers._rejax_worker"]

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 
 import delucax as dlx
+from benchmarks._machine import compile_anew
 from delucax import lung
 from delucax.studies.ventilator._stages import FULL
 
@@ -34,6 +35,7 @@ def main() -> None:
     env = lung.double_compartment()
     train = lung.explore(env, BREATHS, key=jax.random.key(0))
     test = lung.explore(env, BREATHS, key=jax.random.key(100))
+    compile_anew()
     begin = time.perf_counter()
     model = lung.LearnedLung(train, key=jax.random.key(1), **SIZES)
     steps: Any = dict(teacher_steps=FULL.teacher_steps, steps=FULL.simulator_steps)

@@ -23,7 +23,7 @@ import pandas as pd
 from jaxtyping import Array
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._timing import compiled, race
 
 
@@ -380,6 +380,7 @@ def main() -> None:
     parser.add_argument("--part", choices=PARTS, help="one table alone, again")
     options = parser.parse_args()
     limit_cores(1)
+    compile_anew()
     quick = options.quick
     seeds = 4 if quick else SEEDS
     # Speed first, for it is in single precision.

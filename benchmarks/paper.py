@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from benchmarks._machine import describe
+from benchmarks._machine import compile_anew, describe
 from delucax import studies
 from delucax.studies.paper._reproduce import STUDIES
 
@@ -72,6 +72,7 @@ def main() -> None:
     parser.add_argument("--page", action="store_true", help="from what is stored")
     options = parser.parse_args()
     if not options.page:
+        compile_anew()
         out = Path(options.out)
         rows = read(out / "claims.csv")
         if {row["study"] for row in rows} != set(STUDIES):

@@ -22,7 +22,7 @@ import pandas as pd
 
 import delucax as dlx
 from benchmarks import _ours
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._peers import c, gymnax_peer, raw
 from benchmarks._problem import Case
 from benchmarks._results import updated
@@ -322,6 +322,7 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=1, help="cores to run on")
     options = parser.parse_args()
     limit_cores(options.cores)
+    compile_anew()
     for part in [options.part] if options.part else parts:
         run = Run(options.quick, 3 if options.quick else options.rounds)
         if part == "calls":

@@ -29,7 +29,7 @@ import numpy as np
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._plans import CASES, Plans
 from benchmarks._timing import compiled, Contender, Missing, race, Timing
 from benchmarks._venv import interpreter, ROOT
@@ -469,6 +469,7 @@ def main() -> None:
     parser.add_argument("--trajax", help="a checkout of Google's trajax")
     options = parser.parse_args()
     limit_cores(1)
+    compile_anew()
     jax.config.update("jax_enable_x64", True)
     quick = options.quick
     workers: list[Worker] = []

@@ -29,7 +29,7 @@ import optax
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._paired import middle, spread
 from benchmarks._results import updated
 from delucax.studies import holds_upright, train_swing_up
@@ -290,6 +290,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, choices=BUDGETS, help="one budget, again")
     parser.add_argument("--small", action="store_true", help="to try it; not written")
     options = parser.parse_args()
+    compile_anew()
     about = {"machine": describe()}
     runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}
     for part in options.part or PARTS:

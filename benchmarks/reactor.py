@@ -30,7 +30,7 @@ import jax.random as jr
 import numpy as np
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import describe, keep_programs, limit_cores
 from benchmarks._plans import TO_GO
 from benchmarks._results import updated
 from benchmarks.planning import PEERS, Worker
@@ -271,6 +271,7 @@ def main() -> None:
     parser.add_argument("--part", choices=tuple(PARTS), help="one table alone, again")
     options = parser.parse_args()
     limit_cores(1)
+    keep_programs()
     jax.config.update("jax_enable_x64", True)
     casadi = Worker("casadi", *PEERS["casadi"])
     try:

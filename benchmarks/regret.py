@@ -26,7 +26,7 @@ import pandas as pd
 from jaxtyping import Array
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import describe, keep_programs, limit_cores
 
 
 ROOT = Path(__file__).parents[1]
@@ -382,6 +382,7 @@ def main() -> None:
         draw(content["rows"], tuple(content["lengths"]))
         return
     limit_cores(1)
+    keep_programs()
     jax.config.update("jax_enable_x64", True)
     lengths, seeds = (LENGTHS[:3], 5) if options.quick else (LENGTHS, SEEDS)
     rows: list[dict[str, Any]] = []

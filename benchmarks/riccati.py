@@ -22,7 +22,13 @@ import pandas as pd
 import scipy.linalg
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores, PINNED, pinned_environment
+from benchmarks._machine import (
+    compile_anew,
+    describe,
+    limit_cores,
+    PINNED,
+    pinned_environment,
+)
 from benchmarks._timing import compiled, python, race, Timing
 
 
@@ -170,6 +176,7 @@ def main() -> None:
         "--pinned", action="store_true", help="print the pinned rows as JSON alone"
     )
     options = parser.parse_args()
+    compile_anew()
     if options.pinned:
         limit_cores(1)
     jax.config.update("jax_enable_x64", True)

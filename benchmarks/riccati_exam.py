@@ -25,7 +25,7 @@ import numpy as np  # noqa: E402
 import scipy.linalg  # noqa: E402
 
 import delucax as dlx  # noqa: E402
-from benchmarks._machine import describe, limit_cores  # noqa: E402
+from benchmarks._machine import describe, keep_programs, limit_cores  # noqa: E402
 
 
 ROOT = Path(__file__).parents[1]
@@ -209,6 +209,7 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=1)
     options = parser.parse_args()
     limit_cores(options.cores)
+    keep_programs()
     jax.config.update("jax_enable_x64", True)
 
     rows = [examine(name, True, *data) for name, *data in riccati_systems.carex()]

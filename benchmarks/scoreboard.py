@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import delucax as dlx
-from benchmarks._machine import describe
+from benchmarks._machine import describe, keep_programs
 from delucax import experiments
 from delucax.experiments import interquartile_mean, Results
 from delucax.studies._scoreboard import FAMILIES, METHODS, scoreboard, task_of
@@ -237,6 +237,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--table", action="store_true", help="from what is stored")
     parser.add_argument("--fresh", action="store_true", help="run all again")
     options = parser.parse_args(arguments)
+    keep_programs()
     begin = time.perf_counter()
     if options.table:
         results = Results.read(STORE)

@@ -18,7 +18,7 @@ import gymnasium
 
 import delucax
 import delucax.interop.gymnasium  # noqa: F401, tells Gymnasium of our tasks
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 
 
 OUT = Path(__file__).parent / "results" / "stable_baselines3.json"
@@ -63,6 +63,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     limit_cores(options.cores)
+    compile_anew()
     import torch  # pyright: ignore
     from stable_baselines3 import PPO  # pyright: ignore
     from stable_baselines3.common.env_checker import check_env  # pyright: ignore

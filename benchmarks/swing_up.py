@@ -27,7 +27,7 @@ import optax
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._results import updated
 from delucax.training import expected_cost, fit
 
@@ -314,6 +314,7 @@ def main() -> None:
     parser.add_argument("--method", choices=METHODS, help="one method alone, again")
     options = parser.parse_args()
     limit_cores(1)
+    compile_anew()
     jax.config.update("jax_enable_x64", True)
     about = {"machine": describe(), "limits": LIMITS, "settings": SETTINGS}
     methods = [options.method] if options.method else METHODS

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
+from benchmarks._machine import compile_anew, describe, limit_cores
 
 
 OUT = Path(__file__).parent / "results" / "wall_clock.json"
@@ -79,6 +79,7 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=1)
     options = parser.parse_args()
     limit_cores(options.cores)
+    compile_anew()
 
     compiles = np.array([cold_compile(options.steps) for _ in range(options.runs)])
     before = peak_megabytes()

@@ -15,7 +15,7 @@ from delucax._module import path_string
 
 needs_x64 = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="float64 only")
 needs_x32 = pytest.mark.skipif(bool(jax.config.jax_enable_x64), reason="float32 only")
-thorough = pytest.mark.thorough
+minutes = pytest.mark.minutes
 once = pytest.mark.skipif(
     bool(jax.config.jax_enable_x64), reason="precision plays no part: float32 will do"
 )

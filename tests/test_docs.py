@@ -9,9 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers import as_a_user, thorough
-
-import delucax as dlx
+from helpers import as_a_user
 
 
 ROOT = Path(__file__).parents[1]
@@ -49,46 +47,8 @@ def test_pages_are_found():
     assert {"index.md", "first_system.md", "gradients.md", "errors.md"} <= names
 
 
-LONG = {
-    "experiments.md",
-    "first_system.md",
-    "gradients.md",
-    "gymnasium.md",
-    "identification.md",
-    "jit_vmap.md",
-    "linear_analysis.md",
-    "online_control.md",
-    "planning.md",
-    "policies.md",
-    "regulators.md",
-    "ventilator.md",
-}
-"""Pages whose blocks compile or run for long."""
-
-
-def pages(of):
-    return pytest.mark.parametrize("page", [pytest.param(p, id=p.name) for p in of])
-
-
-@pages(p for p in RUNNABLE if p.name not in LONG)
+@pytest.mark.parametrize("page", [pytest.param(p, id=p.name) for p in RUNNABLE])
 def test_page_runs(page, tmp_path, monkeypatch):
-    """With three steps of every training; the thorough tests take them all."""
-    fit = dlx.training.fit
-
-    def briefly(loss, model, optimiser, steps, **options):
-        return fit(loss, model, optimiser, min(steps, 3), **options)
-
-    monkeypatch.setattr(dlx.training, "fit", briefly)
-    run_page(page, tmp_path, monkeypatch)
-
-
-@thorough
-@pages(RUNNABLE)
-def test_page_runs_in_full(page, tmp_path, monkeypatch):
-    run_page(page, tmp_path, monkeypatch)
-
-
-def run_page(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
     namespace = {"__name__": "page"}

@@ -14,7 +14,7 @@ import lineax as lx
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x32, needs_x64, once, thorough, user_error
+from helpers import assert_close, needs_x32, needs_x64, once, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -160,7 +160,7 @@ def assert_same_leaf(a, b):
 @pytest.mark.parametrize(
     "name",
     # A simulated trajectory is one of another making, dear to make.
-    [pytest.param(n, marks=thorough if "simulated" in n else ()) for n in THINGS],
+    list(THINGS),
 )
 def test_round_trip_is_exact(name, tmp_path):
     thing = THINGS[name]()

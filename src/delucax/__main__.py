@@ -14,6 +14,7 @@ from typing import Any
 
 from ._controller import AbstractController
 from ._extras import extra
+from ._programs import forget_programs, keep_programs
 
 
 _SUITES = {"scoreboard": "delucax.studies._scoreboard"}
@@ -53,10 +54,30 @@ def _expression(flag: str, name: str, help: str) -> tuple[str, dict[str, Any]]:
     return flag, {"dest": name, "metavar": "EXPR", **settings}
 
 
+_CACHE = (
+    _option(
+        "--cache",
+        "folder where they are kept for later runs (default: that of "
+        "JAX_COMPILATION_CACHE_DIR, or ~/.cache/delucax/programs)",
+        metavar="DIR",
+    ),
+    _option(
+        "--no-cache",
+        "keep none, as with JAX_ENABLE_COMPILATION_CACHE=false",
+        **{"dest": "is_kept", "action": "store_false"},
+    ),
+)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """The command line; the exit status is 1 if cases failed, 2 on wrong arguments."""
     options = vars(_parser().parse_args(arguments))
     call = options.pop("call")
+    folder, is_kept = options.pop("cache", None), options.pop("is_kept", None)
+    if is_kept:
+        keep_programs(folder)
+    elif is_kept is not None:
+        forget_programs()
     try:
         return call(**options) or 0
     except (OSError, ValueError, ImportError) as error:
@@ -89,6 +110,9 @@ def _parser() -> argparse.ArgumentParser:
         added.set_defaults(call=call)
         for name, settings in command_options:
             added.add_argument(name, **settings)
+        kept = added.add_argument_group("compiled programs")
+        for name, settings in _CACHE:
+            kept.add_argument(name, **settings)
     return parser
 
 

@@ -6,7 +6,6 @@ import pytest
 from helpers import (
     assert_close,
     needs_x64,
-    thorough,
     user_error,
 )
 from scipy.linalg import solve_continuous_are
@@ -66,7 +65,6 @@ STEPS = {"servo": 0.2, "resonant": 0.2, "conditional": 0.05, "unstable plant": 0
 
 @pytest.mark.parametrize("name", LOOPS)
 @pytest.mark.parametrize("sampled", [False, True])
-@thorough
 def test_margins_are_controls(name, sampled):
     dt = STEPS[name] if sampled else None
     loop, theirs = loop_of(LOOPS[name], dt)
@@ -95,7 +93,6 @@ def test_margins_are_controls(name, sampled):
 
 @pytest.mark.filterwarnings("ignore:Setting the shape:DeprecationWarning")
 @pytest.mark.parametrize("name", ["servo", "resonant", "conditional"])
-@thorough
 def test_disk_margins_are_controls_on_a_fine_grid(name):
     loop, theirs = loop_of(LOOPS[name])
     found = an.margins(loop)
@@ -112,7 +109,6 @@ def test_disk_margins_are_controls_on_a_fine_grid(name):
         assert_close(20 * np.log10(ours), gain, rtol=close)
 
 
-@thorough
 def test_each_margin_puts_a_pole_on_the_boundary():
     loop, _ = loop_of(LOOPS["resonant"])
     found = an.margins(loop)
@@ -165,8 +161,7 @@ def test_an_lqr_loop_has_the_margins_that_it_must():
     assert np.isinf(found.gain_margin)
 
 
-@thorough
-@pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("discrete", [False, True])
 def test_gradients_are_central_differences_beside_an_unstable_loop(discrete):
     def loop(theta):
         gain, lag, damping = theta
@@ -204,7 +199,6 @@ def test_gradients_are_central_differences_beside_an_unstable_loop(discrete):
     assert np.all(np.isfinite(slopes[7]))
 
 
-@thorough
 def test_disk_margins_of_several_channels():
     # A loop that is fragile only if both gains change at once (Seiler et al., 2020).
     A = jnp.array([[0.0, 10.0], [-10.0, 0.0]])

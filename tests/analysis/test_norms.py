@@ -7,7 +7,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     user_error,
 )
 
@@ -49,7 +48,6 @@ def swept(model, discrete):
 
 
 @pytest.mark.parametrize("shape, discrete", [((4, 2, 3), False), ((5, 2, 2), True)])
-@thorough
 def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
     for seed in (0, 1):
         model, theirs = random_model(seed, *shape, discrete)
@@ -114,8 +112,7 @@ THETA = np.array([1.0, 0.1, 1.5])
 SIDES = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
 
 
-@thorough
-@pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("discrete", [False, True])
 def test_gradients_are_central_differences_beside_an_unstable_model(discrete):
     def measures(theta):
         model = spring_chain(theta, discrete)
@@ -133,7 +130,6 @@ def test_gradients_are_central_differences_beside_an_unstable_model(discrete):
     assert np.all(np.isfinite(slopes))
 
 
-@thorough
 def test_second_derivatives_are_central_differences():
     gain = lambda theta: an.hinf_norm(spring_chain(theta, False), throw=False).gain
 
@@ -147,7 +143,6 @@ def test_second_derivatives_are_central_differences():
     assert_close(curvatures[6], numeric, rtol=1e-6, atol=1e-6)
 
 
-@thorough
 def test_alike_channels_have_finite_gradients():
     def gain(a):
         system = LinearSystem(-a * jnp.eye(3), jnp.eye(3))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, minutes, needs_x64, user_error
 from hypothesis import given, HealthCheck, Phase, settings, strategies as st
 
 import delucax as dlx
@@ -477,13 +477,13 @@ quietly = dict(
 )
 
 
-@settings(max_examples=20, **quietly)
+@settings(max_examples=8, **quietly)
 @given(compositions)
 def test_a_random_loop(c):
     check(c)
 
 
-@thorough
+@minutes("250 random loops, each of which compiles a program of its own")
 @settings(max_examples=250, **quietly)
 @given(compositions)
 def test_many_random_loops(c):

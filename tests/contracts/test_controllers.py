@@ -14,7 +14,6 @@ from helpers import (
     assert_refuses_nan,
     needs_x64,
     once,
-    thorough,
     tolerance,
     user_error,
 )
@@ -206,48 +205,10 @@ CASES = {
     "MPC": Case(receding),
     "MPC that samples": Case(drawn),
 }
-# What differs little from another case, or compiles for long.
-KIN = (
-    "Adaptive",
-    "BPC",
-    "Constant",
-    "DRC along the way",
-    "FiniteHorizonLQR",
-    "GPC, fixed",
-    "GRU",
-    "History",
-    "LeakyPID",
-    "Categorical, greedy",
-    "LQI",
-    "OutputFeedback",
-    "MPC",
-    "MPC that samples",
-    "SFC",
-    "DSC",
-    "DRC",
-    "NeuralGPC",
-    "Explore",
-    "LQR that looks ahead",
-    "LQG from the start",
-    "HInfinity over a horizon",
-    "OutputFeedback of an unscented filter",
-    "PID on an index",
-    "MLP of features",
-    "Gaussian of PID",
-)
 
 
-# What a controller without a state, or with little in it, shows no better than others.
-PLAIN = ("Zero", "Random", "OpenLoop", "Scheduled")
-STATELESS = ("Zero", "OpenLoop", "Linear", "LQR", "HInfinity", "MLP", "Scheduled")
-FEW = ("Gaussian", "GPC", "Linear", "LQR", "MLP")
-
-
-def over(cases, kin=KIN):
-    parameters = [
-        pytest.param(case, id=name, marks=thorough if name in kin else ())
-        for name, case in cases.items()
-    ]
+def over(cases):
+    parameters = [pytest.param(case, id=name) for name, case in cases.items()]
     return pytest.mark.parametrize("case", parameters)
 
 
@@ -284,8 +245,7 @@ def test_every_controller_is_listed():
     assert members >= {"Zero", "LQR", "PID", "MLP", "Gaussian"}
 
 
-@needs_x64
-@over(CASES, {*KIN, *PLAIN})
+@every
 def test_jit_and_vmap(case, key):
     """It goes into plain `jax.jit`, where other numbers in it do not compile again; a
     batch over controllers and keys is what the loop over them gives."""
@@ -329,7 +289,7 @@ class Known(dlx.AbstractController):
 
 
 @needs_x64
-@over(CASES, {*KIN, *STATELESS})
+@every
 def test_scan(case, key):
     """Calling it by hand, its state carried by `lax.scan`, is what a rollout does."""
     env, controller = environment(), case.make(1.0)
@@ -415,13 +375,13 @@ def test_wrong_observation(case, key):
 
 
 @once
-@over(CASES, set(CASES) - set(FEW))
+@every
 def test_no_number_can_be_replaced_by_nan(case):
     assert_refuses_nan(case.make(1.0))
 
 
 @once
-@over(CASES, set(CASES) - set(FEW))
+@every
 def test_saved_and_loaded(case, key, tmp_path):
     """What is loaded acts as what was saved did, and compiles no more."""
     env, controller = environment(), case.make(1.0)

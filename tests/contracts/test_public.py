@@ -9,7 +9,6 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from helpers import thorough
 
 import delucax as dlx
 
@@ -108,49 +107,9 @@ def _examples(doc):
     return [textwrap.dedent(code) for _, code in blocks]
 
 
-LONG = {
-    f"delucax.{name}"
-    for name in """
-    AbstractDisturbance analysis.disk_margin analysis.DiskMargin analysis.hinf_norm
-    analysis.Margins analysis.margins c2d controllers.Adaptive
-    controllers.best_in_hindsight controllers.BPC controllers.Categorical
-    controllers.drc controllers.Explore estimators.ExtendedKalmanFilter
-    controllers.FiniteHorizonLQR
-    controllers.Gaussian controllers.gpc controllers.HInfinity
-    estimators.KalmanFilter controllers.Linear
-    controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
-    controllers.MPC controllers.online_newton
-    controllers.OutputFeedback controllers.regret estimators.run_filter
-    controllers.Scheduled estimators.smooth controllers.Standardise
-    estimators.UnscentedKalmanFilter d2c Discretized dynamics.OperatingPoint
-    dynamics.WorstCase
-    environments.cartpole environments.cartpole_linear studies.reproduce
-    studies.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
-    lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
-    planning.Constraints planning.ilqr planning.Plan
-    plotting.phase_portrait randomise
-    riccati.dre riccati.hinf_care riccati.hinf_cre
-    riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
-    training.expected_cost training.fit training.PPO training.scored_cost
-    training.SHAC training.sysid.arx training.sysid.Identified
-    training.sysid.physical training.sysid.PredictionError training.worst_case
-    trim
-    """.split()
-}
-"""Examples that compile for long, beside those of whole packages that do."""
-HEAVY = tuple(
-    f"delucax.{name}." for name in "analysis lung planning riccati training".split()
-)
-
-
 @pytest.mark.parametrize(
     "name, value",
-    [
-        pytest.param(
-            *case, id=id, marks=thorough if id in LONG or id.startswith(HEAVY) else ()
-        )
-        for case, id in zip(CALLABLES, IDS, strict=True)
-    ],
+    [pytest.param(*case, id=id) for case, id in zip(CALLABLES, IDS, strict=True)],
 )
 def test_example_runs(name, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -12,7 +12,6 @@ from helpers import (
     assert_refuses_nan,
     needs_x64,
     once,
-    thorough,
     user_error,
 )
 from hypothesis import given, settings, strategies as st
@@ -112,11 +111,7 @@ def test_a_wrong_argument_is_named(name):
 @once
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(n, marks=() if n in ("pendulum", "lds") else thorough)
-        for n in NAMES
-        if "/" not in n
-    ],
+    [n for n in NAMES if "/" not in n],
 )
 def test_no_number_can_be_replaced_by_nan(name):
     assert_refuses_nan(task(name))
@@ -178,7 +173,6 @@ def test_a_step_is_finite_inside_and_at_the_edges(name):
     finite_on(name, 256)
 
 
-@thorough
 @pytest.mark.parametrize("name", ONCE)
 @settings(max_examples=100, deadline=None, database=None)
 @given(seed=st.integers(0, 2**32 - 1), edges=st.sampled_from([0.0, 0.1, 0.5, 1.0]))
@@ -239,7 +233,6 @@ def test_gradient_of_a_task():
     gradient_of("pendulum")
 
 
-@thorough
 @needs_x64
 @pytest.mark.parametrize("name", [name for name in CALM if name != "pendulum"])
 def test_gradient_of_the_other_tasks(name):
@@ -275,7 +268,6 @@ def test_convergence(name):
     converges(name)
 
 
-@thorough
 @needs_x64
 @pytest.mark.parametrize("name", [n for n in ONCE if n not in {*MAPS, *CONVERGENCE}])
 def test_convergence_of_the_others(name):

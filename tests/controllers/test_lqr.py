@@ -8,7 +8,6 @@ from helpers import (
     central_difference,
     needs_x64,
     once,
-    thorough,
     tolerance,
     user_error,
 )
@@ -43,7 +42,7 @@ def test_no_neighbouring_gain_is_better(key):
 
     assert_close(cost(regulator.K), jnp.trace(regulator.P), rtol=1e-5)
     gradient = jax.grad(cost)(regulator.K)
-    assert_close(gradient, np.zeros((1, 2)), atol=tolerance(1e-3, 1e-9))
+    assert_close(gradient, np.zeros((1, 2)), atol=1e-9)
 
 
 def test_cross_weight():
@@ -84,7 +83,6 @@ def test_angles_wrap():
     assert abs(plain(0.0, far, None)[0][0] - u[0]) > 10
 
 
-@thorough
 def test_inside_jit_and_vmap(key):
     env = dlx.make("pendulum")
     x0 = jnp.array([0.2, 0.0])
@@ -102,7 +100,6 @@ def test_inside_jit_and_vmap(key):
     assert_close(costs(lengths)[1], alone, rtol=tolerance(1e-4, 1e-11))
 
 
-@thorough
 @needs_x64
 def test_gradient_through_the_design(key):
     env = dlx.make("lds", A=A, B=B)

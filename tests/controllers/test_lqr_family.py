@@ -10,7 +10,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     user_error,
 )
 
@@ -63,7 +62,7 @@ def _dense_minimum(x0, T, r, v_r, w, final):
     return controls, np.sum((rows @ controls - right) ** 2)
 
 
-@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("parallel", [False, True])
 def test_finite_horizon_tracking_is_the_best_of_all_controls(key, parallel):
     T, x0 = 12, jnp.array([1.0, -0.5])
     push = lambda t: 0.2 * jnp.cos(t)[None]
@@ -94,7 +93,6 @@ def test_finite_horizon_tracking_is_the_best_of_all_controls(key, parallel):
     assert_close(cost, minimum, rtol=1e-11)
 
 
-@thorough
 def test_a_planned_trajectory_needs_no_feed_forward(key):
     env = dlx.make("pendulum", solver=dlx.dynamics.RK4(), max_torque=10.0)
     controls = jnp.sin(0.3 * jnp.arange(15.0))[:, None]
@@ -120,7 +118,6 @@ def test_a_planned_trajectory_needs_no_feed_forward(key):
     assert np.isnan(shorter(10.0, states[0], None)[0])
 
 
-@thorough
 def test_a_long_finite_horizon_is_the_infinite_one():
     long = FiniteHorizonLQR(DYNAMICS, Q, R, S, horizon=150)
     steady = LQR(DYNAMICS, Q, R, S)
@@ -144,7 +141,6 @@ def test_infinite_horizon_feed_forward(preview):
         assert_close(found, expected, rtol=1e-9)
 
 
-@thorough
 def test_feed_forward_helps(key):
     env = dlx.Environment(
         DYNAMICS,
@@ -207,7 +203,6 @@ def test_integral_does_not_wind_up(key):
     assert jnp.max(heard) < 12.5 < 15.0 < jnp.max(deaf)
 
 
-@thorough
 def test_hover_holds_a_quadrotor(key):
     def field(t, x, u, w):
         lift, roll = u[0] + u[1], 2.0 * (u[1] - u[0])
@@ -255,7 +250,6 @@ def test_sampled_weights_are_the_integral():
     assert_close(found, expected, atol=1e-12)
 
 
-@thorough
 def test_sampled_regulator_charges_the_continuous_cost():
     dt, x0 = 0.3, np.array([1.0, -0.4, 0.2])
     controller = dlx.controllers.lqrd(STIFF, Q3, R, dt, S3)
@@ -277,7 +271,6 @@ def test_sampled_regulator_charges_the_continuous_cost():
     assert_close(total, x0 @ controller.P @ x0, rtol=1e-10)
 
 
-@thorough
 def test_sampled_regulator_of_short_steps_is_the_continuous_one():
     controller = dlx.controllers.lqrd(STIFF, Q3, R, 1e-3)
     A_, B_ = np.asarray(STIFF.A, float), np.asarray(STIFF.B, float)
@@ -290,7 +283,6 @@ def test_sampled_regulator_of_short_steps_is_the_continuous_one():
     assert_close(pendulum(0.0, far, None)[0], u, atol=1e-4)
 
 
-@thorough
 def test_gradients_of_designs(key):
     x0, T = jnp.array([1.0, 0.5]), 8
     env = dlx.Environment(DYNAMICS, dlx.costs.Quadratic(Q, R), horizon=T)

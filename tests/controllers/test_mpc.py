@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, user_error
+from helpers import assert_close, needs_x64, once, user_error
 from hypothesis import settings, strategies as st
 
 import delucax as dlx
@@ -34,9 +34,7 @@ def regulated(**options):
     "options",
     [
         {},
-        pytest.param(
-            {"planner": dlx.planning.ILQR(finite_difference=1e-2)}, marks=thorough
-        ),
+        {"planner": dlx.planning.ILQR(finite_difference=1e-2)},
     ],
 )
 def test_without_bounds_it_is_the_regulator(options):
@@ -71,9 +69,9 @@ def test_a_plan_starts_from_the_last_one():
 @pytest.mark.parametrize(
     "kind, options",
     [
-        pytest.param("ILQR", dict(max_iterations=5), marks=thorough),
+        ("ILQR", dict(max_iterations=5)),
         ("MPPI", dict(iterations=2, samples=64, temperature=0.1)),
-        pytest.param("CEM", dict(iterations=3, samples=32, elites=8), marks=thorough),
+        ("CEM", dict(iterations=3, samples=32, elites=8)),
     ],
 )
 def test_every_planner_balances(kind, options):
@@ -132,7 +130,6 @@ def test_a_plan_that_fails_is_seen():
     assert state.failures.count == 3 and state.result == dlx.RESULTS.successful
 
 
-@thorough
 @needs_x64
 def test_a_plan_that_fails_is_an_error():
     dynamics, cost = explosive()
@@ -240,7 +237,6 @@ class Thermometer(AbstractWrapper):
 
 
 @needs_x64
-@thorough
 def test_on_an_estimate_of_an_unstable_plant():
     """Twenty pairs of runs with the noise of `python -m benchmarks.reactor`."""
     env, lqr, cost = reactor()
@@ -275,7 +271,6 @@ def test_on_an_estimate_of_an_unstable_plant():
     assert jnp.mean(pairs) < -0.05
 
 
-@thorough
 @once
 def test_a_start_of_ones_own():
     env, lqr, cost = reactor()
@@ -331,7 +326,6 @@ def test_bad_arguments_are_named():
 
 
 @needs_x64
-@thorough
 def test_learning_online_around_a_plan():
     """The gradient perturbation controller whose base is a plan: better than the plan
     alone where the plant is pushed as the plan did not foresee."""

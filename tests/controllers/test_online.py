@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -61,18 +61,12 @@ LEARNERS = {
 }
 
 
-FEW = [
-    pytest.param(make, id=name, marks=() if name in ("GPC", "BPC") else thorough)
-    for name, make in LEARNERS.items()
-]
-
-
-@pytest.mark.parametrize("make", FEW)
+@pytest.mark.parametrize("make", LEARNERS.values(), ids=LEARNERS)
 @pytest.mark.parametrize(
     "dynamics",
     [
         pytest.param(PLANT, id="linear"),
-        pytest.param(PENDULUM, id="pendulum", marks=thorough),
+        pytest.param(PENDULUM, id="pendulum"),
     ],
 )
 def test_recovered_disturbances(dynamics, make):
@@ -101,7 +95,6 @@ def partial(base=None):
     return plant, c.drc(plant, dlx.costs.Quadratic(R, R), base=base, memory=3)
 
 
-@thorough
 def test_natures_output():
     """It is what the base alone would have shown, whatever was added."""
     plant, learner = partial()
@@ -170,7 +163,6 @@ def hindsight_policy(A, B, K, w, memory):
     return np.sum((rows @ theta + right) ** 2)
 
 
-@thorough
 def test_defaults_reach_what_is_possible():
     """Under noise, a slow sine and a constant, in any units of cost and disturbance."""
     learner, base = c.gpc(PLANT, COST), c.LQR(PLANT, Q, R)
@@ -208,7 +200,6 @@ def test_published_setting():
         assert abs(ratio - published) < 0.02 * published
 
 
-@thorough
 def test_best_in_hindsight():
     """The least-squares solution for a policy; a stationary point for a gain."""
     w = np.random.default_rng(4).normal(size=(200, 2))
@@ -231,7 +222,6 @@ def test_best_in_hindsight():
     assert gain.trajectory.total_cost < cost(learner.loop.base.K)
 
 
-@thorough
 def test_hindsight_sees_the_noise_of_the_run():
     plant, learner = partial()
     noise = dlx.disturbances.Gaussian(1.0, size=1)
@@ -254,7 +244,6 @@ def switched():
     return dlx.LinearDynamics(A, np.where(first, [[0], [1.2]], [[0], [0.9]]))
 
 
-@thorough
 def test_adaptive_keeps_up():
     """The switching study in the setting that was published for it."""
     plant = switched()
@@ -299,7 +288,6 @@ def test_births_and_deaths():
         assert np.isclose(weights.sum(), 1)
 
 
-@thorough
 def test_switching_follows_one():
     w = np.random.default_rng(6).normal(size=(100, 2))
     learner = c.Adaptive(c.gpc(PLANT, COST, memory=2), every=5, play="switch")
@@ -322,7 +310,6 @@ def build(model):
     return c.gpc(model, COST, horizon=15)
 
 
-@thorough
 def test_explore_identifies():
     """From steps that an adversary disturbs, and then controls by what it found."""
     K = np.array([[0.2, 0.8]])
@@ -531,7 +518,6 @@ def test_bad_input(make, match):
         make()
 
 
-@thorough
 def test_traced_dynamics_need_a_horizon():
     def cost(b, **options):
         dynamics = dlx.LinearDynamics(A, b * B)

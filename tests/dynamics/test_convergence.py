@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough
+from helpers import assert_close, needs_x64
 from scipy.integrate import solve_ivp
 
 import delucax as dlx
@@ -40,7 +40,6 @@ def _exact(dt):
     ],
     ids=lambda value: type(value).__name__ if not isinstance(value, int) else None,
 )
-@thorough
 def test_order_under_switching_controls(solver, order, substeps):
     starts = jax.random.uniform(jax.random.key(0), (32, 2), minval=-3.0, maxval=3.0)
 
@@ -88,8 +87,8 @@ class Geometric(dlx.AbstractSystem):
 @pytest.mark.parametrize(
     "solver, stratonovich, order",
     [
-        pytest.param(diffrax.Euler(), False, 0.5, marks=thorough),
-        pytest.param(diffrax.ItoMilstein(), False, 1.0, marks=thorough),
+        (diffrax.Euler(), False, 0.5),
+        (diffrax.ItoMilstein(), False, 1.0),
         (diffrax.StratonovichMilstein(), True, 1.0),
     ],
     ids=["Euler-Maruyama", "Itô-Milstein", "Stratonovich-Milstein"],

@@ -4,7 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, central_difference, needs_x64, thorough
+from helpers import assert_close, central_difference, needs_x64
 
 import delucax as dlx
 
@@ -84,7 +84,6 @@ def _cost(dynamics, checkpoint="step"):
 
 
 @pytest.mark.parametrize("name", CASES)
-@thorough
 def test_reverse_mode_is_central_differences(name):
     total, at = _cost(CASES[name]())
     both = jax.jit(jax.value_and_grad(total))
@@ -94,7 +93,7 @@ def test_reverse_mode_is_central_differences(name):
     assert_close(found / scale, expected / scale, atol=1e-6)
 
 
-@pytest.mark.parametrize("checkpoint", ["sqrt", pytest.param(None, marks=thorough)])
+@pytest.mark.parametrize("checkpoint", ["sqrt", None])
 def test_checkpoints(checkpoint):
     total, at = _cost(CASES["RK4"](), checkpoint)
     both = jax.jit(jax.value_and_grad(total))
@@ -103,7 +102,6 @@ def test_checkpoints(checkpoint):
 
 
 @pytest.mark.parametrize("name", ["RK4", "Kvaerno3", "Euler-Maruyama"])
-@thorough
 def test_forward_mode_and_second_order(name):
     total, at = _cost(CASES[name]())
     slope = jax.jit(jax.grad(total))

@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, central_difference, needs_x32, needs_x64, thorough
+from helpers import assert_close, central_difference, needs_x32, needs_x64
 from jaxtyping import Array
 
 import delucax as dlx
@@ -80,10 +80,7 @@ def inputs(kind, dtype):
 
 every = pytest.mark.parametrize(
     "kind",
-    [
-        pytest.param(kind, marks=thorough if kind == "adaptive implicit" else ())
-        for kind in KINDS
-    ],
+    list(KINDS),
 )
 
 
@@ -127,10 +124,7 @@ def ulps(single, double):
 @pytest.mark.parametrize("late", [1e3, 1e4, 1e5])
 @pytest.mark.parametrize(
     "kind",
-    [
-        pytest.param(kind, marks=thorough if kind == "adaptive implicit" else ())
-        for kind in [*KINDS, "map"]
-    ],
+    [*KINDS, "map"],
 )
 def test_a_late_step_of_a_fast_field_is_that_of_double_precision(kind, late):
     if kind == "map":
@@ -237,7 +231,6 @@ def adaptive(system, adjoint):
 
 
 @needs_x64
-@thorough
 @pytest.mark.parametrize("name", ["stored", "direct", "backsolve", "fixed"])
 def test_gradients_of_a_step(name):
     adjoints = {

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+from helpers import assert_close, needs_x64, tolerance, user_error
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
@@ -250,7 +250,6 @@ def test_gradient_of_a_held_value_is_that_of_the_formula():
     assert_close(by_c, -(T**2) / 8750 / (0.4 * 0.6), rtol=1e-8)
 
 
-@thorough
 @needs_x64
 @pytest.mark.parametrize("fix", [(), "Tc", "c", ("T", "Tc")])
 def test_derivatives_are_those_of_finite_differences(fix):

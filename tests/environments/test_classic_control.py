@@ -10,8 +10,6 @@ from helpers import (
     dtype,
     needs_x64,
     once,
-    thorough,
-    tolerance,
     user_error,
 )
 
@@ -80,7 +78,7 @@ def test_energy_is_kept_under_a_solver(task, arguments, energy, start, dt):
     run = dlx.rollout(env, zero, key=jax.random.key(0), x0=x0, horizon=60)
     found = jax.vmap(lambda x: energy(env.dynamics.system, x))(run.states)
     assert np.ptp(run.states[:, 0]) > 0.3
-    assert_close(found, jnp.full(61, found[0]), atol=tolerance(5e-5, 1e-8))
+    assert_close(found, jnp.full(61, found[0]), atol=1e-8)
 
 
 @needs_x64
@@ -92,7 +90,7 @@ def test_the_papers_form_does_not_keep_energy():
         dx = system.vector_field(0.0, x, jnp.zeros(1), None)
         return jax.jvp(lambda x: acrobot_energy(system, x), (x,), (dx,))[1]
 
-    assert abs(gain("book")) <= tolerance(1e-4, 1e-12)
+    assert abs(gain("book")) <= 1e-12
     assert abs(gain("nips")) > 0.1
 
 
@@ -102,7 +100,7 @@ def test_the_equilibrium_rests(task):
     for env in (dlx.make(task), dlx.make(task, solver=diffrax.Heun())):
         x, u = env.dynamics.equilibrium()
         moved = env.dynamics.difference(env.dynamics(0.0, x, u), x)
-        assert_close(moved, jnp.zeros_like(x), atol=tolerance(1e-6, 1e-14))
+        assert_close(moved, jnp.zeros_like(x), atol=1e-14)
 
 
 @needs_x64
@@ -111,9 +109,7 @@ def test_angles_wrap_in_differences(task):
     system = dlx.make(task).dynamics.system
     x = jnp.arange(1.0, 1 + system.state_size)
     turn = np.array([unit == "rad" for unit in system.state_units]) * 2 * np.pi
-    assert_close(
-        system.difference(x + turn, x), jnp.zeros_like(x), atol=tolerance(1e-6, 1e-14)
-    )
+    assert_close(system.difference(x + turn, x), jnp.zeros_like(x), atol=1e-14)
 
 
 @once
@@ -174,7 +170,7 @@ def test_linear_cartpole_is_the_papers():
     expected = [1 - 0.02 * growth, 1, 1, 1 + 0.02 * growth]
     found = np.sort(np.linalg.eigvals(A.astype(np.float64)).real)
     # A double eigenvalue moves by the root of what its matrix does.
-    assert_close(found, expected, atol=tolerance(1e-3, 1e-7))
+    assert_close(found, expected, atol=1e-7)
     assert_close(B[:, 0], [0, 0, 0.02 / 2.0, 0.02 / 1.6], rtol=1e-6)
     slope = jax.jacfwd(lambda m: dlx.make("cartpole_linear", pole_mass=m).dynamics.A)
     assert_close(slope(0.1)[2, 1], 0.02 * 9.81, rtol=1e-6)
@@ -191,7 +187,6 @@ def test_linear_cartpole_is_the_nonlinear_one_of_a_point_mass():
     assert_close(A[3, 2], rate, rtol=1e-5)
 
 
-@thorough
 def test_an_lqr_of_the_linearisation_holds_the_pole(key):
     env = dlx.make("cartpole")
     lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), jnp.eye(4), jnp.eye(1))
@@ -205,7 +200,7 @@ def test_height_cost_has_its_minimum_upright():
     cost = dlx.costs.AcrobotHeight(0.1, 0.2, 3.0)
     u = jnp.zeros(1)
     upright = jnp.array([np.pi, 0.0, 0.0, 0.0])
-    assert_close(cost(0.0, upright, u), 0, atol=tolerance(1e-12, 1e-15))
+    assert_close(cost(0.0, upright, u), 0, atol=1e-15)
     assert_close(cost(0.0, jnp.zeros(4), jnp.ones(1)), 16.2, rtol=1e-6)
     moving = jnp.array([np.pi / 2, 0.0, 1.0, 2.0])
     assert_close(cost(0.0, moving, u), 4.5, rtol=1e-5)
@@ -214,7 +209,6 @@ def test_height_cost_has_its_minimum_upright():
     assert slope[0] < -0.5
 
 
-@thorough
 def test_a_smooth_acrobot_has_gradients(key):
     env = dlx.make(
         "acrobot",

@@ -3,25 +3,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, CountCalls, Drift, once, thorough, user_error
+from helpers import assert_close, CountCalls, Drift, once, user_error
 
 import delucax as dlx
 
 
 DYNAMICS = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
 COST = dlx.costs.PendulumCost()
-FEW = ("lds", "mountain_car_discrete", "pendulum", "planar_quadrotor")
 
 
 @once
-@pytest.mark.parametrize(
-    "name",
-    [
-        # The contract of the tasks steps them all.
-        pytest.param(name, marks=() if name in FEW else thorough)
-        for name in dlx.environments.registered()
-    ],
-)
+@pytest.mark.parametrize("name", dlx.environments.registered())
 def test_every_task(name, key):
     arguments = {"key": key} if name in ("lds", "neural") else {}
     env = dlx.make(name, **arguments)
@@ -67,7 +59,6 @@ def test_replace():
         dlx.replace(env, {"dynamics.dt.size": 1.0})
 
 
-@thorough
 def test_randomise_is_domain_randomisation_without_compiling(key):
     env = dlx.make("pendulum")
     ranges = {

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
-from helpers import needs_x64, thorough
+from helpers import needs_x64
 
 import delucax as dlx
 
@@ -179,7 +179,6 @@ def test_one_step_agrees_on_many_states(task):
     compare(CASES[task], 5_000)
 
 
-@thorough
 @pytest.mark.parametrize("task", CASES)
 def test_one_step_agrees_on_all_states(task):
     compare(CASES[task], 100_000)
@@ -290,13 +289,12 @@ def compare_episodes(case, seeds):
 @pytest.mark.parametrize(
     "task",
     # The discrete one has the same arithmetic.
-    [pytest.param(t, marks=thorough if t == "mountain_car" else ()) for t in CASES],
+    list(CASES),
 )
 def test_whole_episodes_agree(task):
     compare_episodes(CASES[task], range(6))
 
 
-@thorough
 @pytest.mark.parametrize("task", CASES)
 def test_a_hundred_episodes_agree(task):
     compare_episodes(CASES[task], range(100))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, tolerance
+from helpers import assert_close, needs_x64, once
 
 import delucax as dlx
 
@@ -17,7 +17,7 @@ def gym():
 
 
 @needs_x64
-@pytest.mark.parametrize("n", [10_000, pytest.param(100_000, marks=thorough)])
+@pytest.mark.parametrize("n", [10_000, 100_000])
 def test_one_step_agrees_on_many_states(gym, n):
     env = dlx.make("pendulum")
     rng = np.random.default_rng(0)
@@ -40,7 +40,7 @@ def test_one_step_agrees_on_many_states(gym, n):
 
 
 @needs_x64
-@pytest.mark.parametrize("count", [20, pytest.param(100, marks=thorough)])
+@pytest.mark.parametrize("count", [20, 100])
 def test_whole_episodes_agree(gym, count):
     env = dlx.make("pendulum")
     actions = np.random.default_rng(1).uniform(-2, 2, (count, 200, 1))
@@ -122,7 +122,7 @@ def test_a_solver_swaps_the_arithmetic():
     zero = dlx.controllers.Zero(1)
     run = dlx.rollout(env, zero, key=jax.random.key(0), x0=x0, horizon=100)
     energy = 0.5 * run.states[:, 1] ** 2 / 3 + 5.0 * jnp.cos(run.states[:, 0])
-    assert_close(energy, energy[0] * jnp.ones(101), rtol=tolerance(1e-5, 1e-7))
+    assert_close(energy, energy[0] * jnp.ones(101), rtol=1e-7)
     assert isinstance(system, dlx.systems.Pendulum)
     with pytest.raises(ValueError, match="substeps"):
         dlx.make("pendulum", substeps=2)

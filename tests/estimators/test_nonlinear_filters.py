@@ -10,7 +10,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    thorough,
     user_error,
 )
 
@@ -25,7 +24,7 @@ EKF, UKF = c.ExtendedKalmanFilter, c.UnscentedKalmanFilter
 CLOSE = dict(rtol=1e-10, atol=1e-11)
 both = pytest.mark.parametrize("kind", [EKF, UKF])
 # The extended one is a Kalman filter, whose own tests say the same.
-light = pytest.mark.parametrize("kind", [pytest.param(EKF, marks=thorough), UKF])
+light = pytest.mark.parametrize("kind", [EKF, UKF])
 
 
 @pytest.mark.parametrize(
@@ -33,7 +32,7 @@ light = pytest.mark.parametrize("kind", [pytest.param(EKF, marks=thorough), UKF]
     [
         (EKF, {}),
         (UKF, {}),
-        pytest.param(UKF, {"alpha": 0.5, "beta": 1.0, "kappa": 1.0}, marks=thorough),
+        (UKF, {"alpha": 0.5, "beta": 1.0, "kappa": 1.0}),
     ],
 )
 def test_is_the_kalman_filter_of_linear_dynamics(kind, options):
@@ -113,7 +112,6 @@ NOISE = STD_W**2 * jnp.eye(1), STD_V**2 * jnp.eye(2)
 START = dict(mean=jnp.array([1.0, 0.0]), covariance=0.3**2 * jnp.eye(2))
 
 
-@thorough
 def test_better_than_dead_reckoning(key):
     """On noisy swings the filter beats the model alone and the sensor alone, the
     smoother beats the filter, and both know how good they are."""
@@ -204,8 +202,7 @@ def test_angles_wrap(kind):
     assert np.max(angles[1]) < 3.5 and np.max(found.mean[0, :, 0]) > 3.2
 
 
-@thorough
-@pytest.mark.parametrize("kind", [EKF, pytest.param(UKF, marks=thorough)])
+@pytest.mark.parametrize("kind", [EKF, UKF])
 def test_gradient_of_the_likelihood(kind):
     """With respect to a length and to noise levels."""
     ys = jnp.stack([jnp.sin(0.2 * jnp.arange(6)), jnp.cos(0.2 * jnp.arange(6))], 1)
@@ -240,7 +237,6 @@ def test_points_of_a_singular_covariance():
         c.run_filter(spoilt, ys)
 
 
-@thorough
 @both
 def test_solver_that_fails(kind):
     """A step that is not solved is not passed off as a prediction."""

@@ -10,7 +10,7 @@ import typing
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import once, thorough
+from helpers import once
 
 from delucax import experiments
 from delucax.experiments import experiment
@@ -243,7 +243,6 @@ value = None
 """
 
 
-@thorough
 def test_the_hash_is_that_of_another_process(module, tmp_path, capsys):
     module(OTHER)
     there = subprocess.run(

@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from helpers import once, thorough, user_error
+from helpers import once, user_error
 
 from delucax import experiments
 from delucax.__main__ import main
@@ -67,7 +67,6 @@ def file(tmp_path, monkeypatch):
     sys.path[:] = [place for place in sys.path if place != str(tmp_path)]
 
 
-@thorough
 def test_workers_give_the_same_and_their_death_harms_no_other(file, capfd):
     """With two processes, one of which a case kills, the rows are those of one."""
     assert main(["run", file, "--quiet"]) == 1
@@ -87,7 +86,6 @@ def test_workers_give_the_same_and_their_death_harms_no_other(file, capfd):
     assert "8 cases in both.jsonl" in out.out
 
 
-@thorough
 def test_fixtures_of_workers_are_let_go_with_the_run(tmp_path):
     folder = str(tmp_path)
 

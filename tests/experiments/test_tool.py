@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import once, thorough, user_error
+from helpers import once, user_error
 
 import delucax as dlx
 from delucax import experiments
@@ -330,7 +330,6 @@ def test_a_change_of_code_or_values_runs_again(tmp_path):
     assert done == [] and values(results) == [8.0, 20.0]
 
 
-@thorough
 def test_what_a_class_inherits_and_a_module_imports_is_code_too(tmp_path):
     first = {
         "deep": "def factor():\n    return 1\n",

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import assert_close, once, thorough, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 import delucax.interop.gymnasium as interop
@@ -24,8 +24,6 @@ pytestmark = once
 IDS = tuple(id for id in gymnasium.registry if id.startswith("delucax/"))
 TASKS = {name for name in dlx.environments.registered() if "/" not in name}
 ZERO = np.zeros(1, np.float32)
-# One of each kind of action, of observation and of end.
-CHECKED = {"CartPole-v1", "DelayLung-v1", "LDS-v1", "Pendulum-v1", "Reacher-v1"}
 
 
 def test_every_task_has_an_id():
@@ -33,13 +31,7 @@ def test_every_task_has_an_id():
     assert TASKS <= made
 
 
-@pytest.mark.parametrize(
-    "id",
-    [
-        pytest.param(id, marks=() if id.partition("/")[2] in CHECKED else thorough)
-        for id in IDS
-    ],
-)
+@pytest.mark.parametrize("id", IDS)
 def test_check_env(id):
     env = gymnasium.make(id, disable_env_checker=True)
     with warnings.catch_warnings():

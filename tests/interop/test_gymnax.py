@@ -18,7 +18,6 @@ from helpers import (
     central_difference,
     needs_x64,
     once,
-    thorough,
     user_error,
 )
 
@@ -340,7 +339,6 @@ class TestFromGymnax:
         assert_close(jax.grad(total)(at), central_difference(total, at), rtol=1e-6)
 
     @once
-    @thorough
     def test_there_and_back(self):
         example = run_example(from_gymnax)
         env, key = example["env"], KEY

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, once, thorough, user_error
+from helpers import assert_close, once, user_error
 
 from delucax import lung
 
@@ -21,7 +21,6 @@ def breaths():
     return lung.explore(env, 12, key=KEY, length=40, scale=0.5, **lungs)
 
 
-@thorough
 def test_explored_breaths(breaths):
     assert len(breaths) == 12 and breaths.pressure.shape == (12, 40)
     assert np.all(breaths.truth <= 70) and np.all(breaths.u_in >= 0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 from hypothesis import given, settings, strategies as st
 from original_lungs import (
     OriginalBalloonLung,
@@ -113,8 +113,8 @@ def test_scores_of_the_original(name):
 
 
 THOROUGH = (
-    pytest.param("single", marks=thorough),
-    pytest.param("balloon", marks=thorough),
+    "single",
+    "balloon",
 )
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -34,7 +34,6 @@ def arrived(t, x):
     return x - jnp.array([1.0, 0.0, 0.0, 0.0])
 
 
-@thorough
 @needs_x64
 def test_an_obstacle_and_an_end_against_scipy():
     optimize = pytest.importorskip("scipy.optimize")
@@ -71,7 +70,6 @@ def test_an_obstacle_and_an_end_against_scipy():
     assert_close(plan.controls.ravel(), found.x, atol=1e-3)
 
 
-@thorough
 def test_a_state_limit_costs_and_holds():
     dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
     cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])
@@ -80,12 +78,12 @@ def test_a_state_limit_costs_and_holds():
     slow = lambda t, x, u: jnp.stack([x[1] - 1.8, -x[1] - 1.8])
     plan = ilqr(dynamics, cost, *start, constraints=Constraints(slow))
     assert jnp.max(jnp.abs(free.states[:, 1])) > 1.9
-    assert jnp.max(jnp.abs(plan.states[:-1, 1])) < 1.8 + tolerance(5e-3, 1e-6)
+    assert jnp.max(jnp.abs(plan.states[:-1, 1])) < 1.8 + 1e-6
     assert plan.cost > free.cost
     # A limit that is not met changes nothing.
     wide = Constraints(lambda t, x, u: jnp.abs(u) - 1e3, final_inequality=_low)
     same = ilqr(dynamics, cost, *start, constraints=wide)
-    assert_close(same.cost, free.cost, rtol=tolerance(1e-4, 1e-8))
+    assert_close(same.cost, free.cost, rtol=1e-8)
 
 
 def _low(t, x):

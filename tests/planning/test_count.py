@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from helpers import assert_close, needs_x64, once, thorough, user_error
+from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
 from delucax.planning import count_evaluations, Problem
@@ -45,7 +45,6 @@ def test_a_linearisation():
     assert_close(near, exact, atol=1e-4)
 
 
-@thorough
 @needs_x64
 def test_a_whole_plan():
     """What the planner says of itself is what it did: each roll-out is T calls, and

@@ -10,15 +10,11 @@ from helpers import (
     ilqr,
     needs_x64,
     original_ilqr,
-    thorough,
     tolerance,
     user_error,
 )
 
 import delucax as dlx
-
-
-pytestmark = needs_x64
 
 
 START = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
@@ -75,7 +71,6 @@ def test_the_published_trace():
     assert plan.rollouts == 33
 
 
-@thorough
 @needs_x64
 def test_the_trace_with_short_steps():
     env, hover = quadrotor()
@@ -95,11 +90,11 @@ def test_the_trace_with_short_steps():
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param(dict(line_search="parallel"), marks=thorough),
+        dict(line_search="parallel"),
         dict(second_order=True),
-        pytest.param(dict(regularise="state"), marks=thorough),
-        pytest.param(dict(parallel=True), marks=thorough),
-        pytest.param(dict(bounds=(-10.0, [10.0, 10.0])), marks=thorough),
+        dict(regularise="state"),
+        dict(parallel=True),
+        dict(bounds=(-10.0, [10.0, 10.0])),
     ],
 )
 def test_the_optimum_of_the_quadrotor(options):
@@ -111,7 +106,6 @@ def test_the_optimum_of_the_quadrotor(options):
 
 
 @needs_x64
-@thorough
 def test_from_states_that_do_not_follow():
     dynamics, cost, start, hover = regulated()
     straight = jnp.linspace(1, 0, 101)[:, None] * start
@@ -123,7 +117,6 @@ def test_from_states_that_do_not_follow():
     assert_close(followed, plan.states, atol=1e-9)
 
 
-@thorough
 def test_a_plan_is_a_controller():
     dynamics, cost = pendulum()
     plan = swing()
@@ -147,8 +140,7 @@ def test_a_plan_is_a_controller():
         plan(0.0, jnp.zeros(3), None)
 
 
-@thorough
-@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("parallel", [False, True])
 def test_gains_are_those_of_the_regulator_of_a_linear_problem(parallel):
     A, B = jnp.array([[1.0, 0.1], [0.3, 0.9]]), jnp.array([[0.0], [0.1]])
     Q, R, Qf = jnp.diag(jnp.array([1.0, 0.2])), 0.1 * jnp.eye(1), 3 * jnp.eye(2)
@@ -176,7 +168,6 @@ def test_cross_terms_of_the_cost():
     assert_close(plan.gains, known.K, rtol=tolerance(1e-3, 1e-9), atol=1e-6)
 
 
-@thorough
 def test_known_disturbances_and_time():
     dynamics, cost = pendulum()
     w = 0.1 * jnp.ones((20, 2))
@@ -191,7 +182,6 @@ def test_known_disturbances_and_time():
     assert plan.cost < end + cost.final(0.0, unaware[-1])
 
 
-@thorough
 def test_bounds_hold_and_their_gains_are_zero():
     free, plan = swing(), swing(bounds=(-4.0, [5.0]))
     assert jnp.min(free.controls) < -4.0
@@ -206,7 +196,7 @@ def test_bounds_hold_and_their_gains_are_zero():
 
 
 @needs_x64
-@pytest.mark.parametrize("size", [1, pytest.param(2, marks=thorough)])
+@pytest.mark.parametrize("size", [1, 2])
 def test_bounds_against_scipy(size):
     optimize = pytest.importorskip("scipy.optimize")
     if size == 1:
@@ -255,12 +245,11 @@ def test_a_bound_that_is_far_is_not_taken_for_met():
     x0 = jnp.array([-2.5, 0.3, 0.0, 0.0, 0.0, 0.0])
     options = dict(bounds=(0.0, 1.0), second_order=True, throw=False)
     plan = ilqr(dynamics, cost, x0, hover[:80], **options)
-    assert plan.iterations > 5 and plan.residual < 1e-6
+    assert plan.iterations > 5 and plan.residual < tolerance(3e-5, 1e-6)
     assert plan.cost < 0.1 * plan.trace[0]
 
 
 @needs_x64
-@thorough
 def test_a_quadratic_program_between_bounds():
     """Of a few controls: the Karush-Kuhn-Tucker conditions."""
     from delucax.planning._lq import solve_box_qp
@@ -282,7 +271,6 @@ def test_a_quadratic_program_between_bounds():
     assert jnp.max(off) < 1e-10 and jnp.max(slope) < 1e-10
 
 
-@thorough
 def test_a_concave_control_cost_is_regularised_and_it_shows():
     class Concave(dlx.AbstractCost):
         def __call__(self, t, x, u):
@@ -340,10 +328,7 @@ def test_no_descent():
         ilqr(dynamics, Kinked(), jnp.zeros(2), jnp.zeros((4, 1)))
 
 
-@pytest.mark.parametrize(
-    "line_search", ["backtracking", pytest.param("parallel", marks=thorough)]
-)
-@thorough
+@pytest.mark.parametrize("line_search", ["backtracking", "parallel"])
 def test_a_bad_member_of_a_batch_harms_no_other(line_search):
     cost = dlx.costs.Quadratic([1.0], [0.1], final=[1.0])
     u = jnp.zeros((8, 1))

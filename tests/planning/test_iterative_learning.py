@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, original_ilqr, thorough, user_error
+from helpers import assert_close, needs_x64, original_ilqr, user_error
 
 import delucax as dlx
 from delucax.planning._lq import in_sequence, model
@@ -80,7 +80,6 @@ def test_learning_in_wind(windy):
     assert_close(again.total_cost, run.cost, rtol=1e-8)
 
 
-@thorough
 def test_learning_in_wind_and_online(windy):
     options = dict(step=0.2, learning_rate=0.001)
     run = igpc(*windy, indices="deluca", **options)
@@ -128,7 +127,6 @@ class ChargedNext(dlx.AbstractCost):
         return jax.lax.stop_gradient(x[4] ** 2 + x[5] ** 2) - self.first
 
 
-@thorough
 def test_an_arm_under_gravity():
     def arm(gravity):
         env = dlx.make("reacher", gravity=gravity)
@@ -155,7 +153,6 @@ def test_an_arm_under_gravity():
     assert_close(rest.cost, learned.cost, rtol=1e-7)
 
 
-@thorough
 def test_where_the_problem_is_not_convex():
     """The distance of the tip is concave in the angles somewhere on the way: without
     regularisation there is no step."""
@@ -166,7 +163,6 @@ def test_where_the_problem_is_not_convex():
     assert run.cost < 0.8 * run.trace[0] and jnp.all(jnp.diff(run.trace) <= 0)
 
 
-@thorough
 def test_batches_of_winds(windy):
     _, sim, cost, plan = windy
 
@@ -181,8 +177,7 @@ def test_batches_of_winds(windy):
             assert_close(batch[i], learned(wind, learner), rtol=1e-8)
 
 
-@pytest.mark.parametrize("learner", [ilc, pytest.param(igpc, marks=thorough)])
-@thorough
+@pytest.mark.parametrize("learner", [ilc, igpc])
 def test_bounds_disturbances_and_what_diverges(learner):
     sim = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
     plant = dlx.Discretized(dlx.systems.Pendulum(mass=1.2), dt=0.1)

@@ -3,9 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import user_error
+from helpers import once, user_error
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 class Shooting(dlx.planning.AbstractPlanner):

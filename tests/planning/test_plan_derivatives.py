@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, central_difference, ilqr, needs_x64, thorough
+from helpers import assert_close, central_difference, ilqr, needs_x64
 from jaxtyping import Array
 
 import delucax as dlx
@@ -58,18 +58,16 @@ def check(f, at, forward=True):
     "options",
     [
         dict(bounds=(-4.0, 4.0)),
-        pytest.param(dict(), marks=thorough),
-        pytest.param(dict(second_order=True), marks=thorough),
-        pytest.param(dict(parallel=True), marks=thorough),
-        pytest.param(dict(regularise="state"), marks=thorough),
+        dict(),
+        dict(second_order=True),
+        dict(parallel=True),
+        dict(regularise="state"),
     ],
 )
-@thorough
 def test_against_finite_differences(options):
     check(lambda theta: outcomes(theta, **options), AT, forward=not options)
 
 
-@thorough
 def test_forward_is_reverse():
     along = jnp.array([0.3, -1.0, 0.5])
     cost = lambda theta: outcomes(theta)[0]
@@ -77,7 +75,6 @@ def test_forward_is_reverse():
     assert_close(change, jax.jit(jax.grad(cost))(AT) @ along, rtol=1e-10)
 
 
-@thorough
 def test_with_active_constraints():
     at = jnp.array([1.0, 1.0, 1.3, 1.6])
     rows = check(lambda a: outcomes(a[:3], speed=a[3]), at)
@@ -85,7 +82,6 @@ def test_with_active_constraints():
     assert abs(rows[0, 3]) > 1
 
 
-@thorough
 def test_of_bounds_disturbances_and_time_twice():
     dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
     reference = lambda t: jnp.stack([jnp.sin(t), jnp.cos(t)])
@@ -120,7 +116,6 @@ def test_it_does_not_depend_on_the_guess():
     assert jax.grad(optimal)(1.0) == 0
 
 
-@thorough
 def test_an_unconverged_plan_is_not_detached():
     def asked(theta, keep):
         options = dict(max_iterations=1, throw=False)
@@ -135,7 +130,6 @@ def test_an_unconverged_plan_is_not_detached():
     assert jnp.all(masked == 0)
 
 
-@thorough
 def test_a_batch_with_a_failure():
     def total(mass, start, keep):
         theta = lambda angle: jnp.stack([mass, 0 * mass + 1, angle])

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, user_error
+from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
 
@@ -27,7 +27,7 @@ def linear():
 @needs_x64
 @pytest.mark.parametrize(
     "planner, options",
-    [PLANNERS["mppi"], pytest.param(*PLANNERS["cem"], marks=thorough)],
+    [PLANNERS["mppi"], PLANNERS["cem"]],
     ids=list(PLANNERS),
 )
 def test_the_minimum_of_a_linear_problem(planner, options):
@@ -58,7 +58,7 @@ class Cliff(dlx.AbstractCost):
 @once
 @pytest.mark.parametrize(
     "planner, options",
-    [pytest.param(*PLANNERS["mppi"], marks=thorough), PLANNERS["cem"]],
+    [PLANNERS["mppi"], PLANNERS["cem"]],
     ids=list(PLANNERS),
 )
 def test_what_diverges_has_no_part_in_it(planner, options):
@@ -86,10 +86,9 @@ def test_what_diverges_has_no_part_in_it(planner, options):
 @needs_x64
 @pytest.mark.parametrize(
     "planner, options",
-    [PLANNERS["mppi"], pytest.param(*PLANNERS["cem"], marks=thorough)],
+    [PLANNERS["mppi"], PLANNERS["cem"]],
     ids=list(PLANNERS),
 )
-@thorough
 def test_bounds_batches_and_derivatives(planner, options):
     dynamics, cost, _, U = linear()
     options = options | dict(bounds=(-0.2, [0.3]), correlation=0.5, samples=64)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, user_error
+from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
 
@@ -57,7 +57,6 @@ def test_an_unstable_plant_is_planned_by_default():
 
 
 @needs_x64
-@thorough
 def test_controls_alone_lead_elsewhere():
     """What the default is for: from the equilibrium's control the plan ignites, and
     says that it is stationary."""
@@ -73,7 +72,6 @@ def test_controls_alone_lead_elsewhere():
 
 
 @needs_x64
-@thorough
 @pytest.mark.parametrize(
     "limit, x0, expected",
     [

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import once, thorough
+from helpers import once
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from systems_catalogue import SYSTEMS
@@ -87,7 +87,7 @@ def drawn(env, x, u=None):
 
 @pytest.mark.parametrize(
     "name, arguments",
-    [*TASKS.values(), *(pytest.param(*v, marks=thorough) for v in VARIANTS.values())],
+    [*TASKS.values(), *VARIANTS.values()],
     ids=[*TASKS, *VARIANTS],
 )
 def test_every_task_has_a_drawing_that_moves(name, arguments):
@@ -203,10 +203,7 @@ def test_default_can_be_replaced():
         _BY_TYPE.update(kept)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=() if n == "Pendulum" else thorough) for n in PLANAR],
-)
+@pytest.mark.parametrize("name", list(PLANAR))
 def test_planar_systems_have_a_phase_portrait(name, monkeypatch):
     monkeypatch.setattr("delucax.plotting._phase.GRID", 12)
     case = SYSTEMS[name]

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers import once, thorough
+from helpers import once
 from PIL import Image
 
 import delucax as dlx
@@ -35,7 +35,6 @@ def test_pictures_move_and_are_small():
             assert image.width == 300
 
 
-@thorough
 def test_code_of_the_page_draws_its_pictures(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = DOCS / "figures" / "gallery.py"

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -16,7 +16,6 @@ B, EYE = jnp.array([[0.0], [1.0]]), jnp.eye(2)
 RESULTS = dlx.RESULTS
 
 
-@thorough
 @pytest.mark.parametrize("name", ["dare", "care"])
 def test_gradients_beside_bad_members(name):
     good = np.array([[-0.9, 0.3], [0.1, -0.2]])
@@ -47,7 +46,6 @@ def test_asymmetry_that_cannot_be_seen():
     assert result(jnp.array([[1.0, 0.5], [0.0, 1.0]])) == RESULTS.ill_posed
 
 
-@thorough
 @pytest.mark.parametrize("n, least, most", [(30, 0, 1e-12), (40, 1e-12, 1e-11)])
 def test_as_close_as_rounding_allows(n, least, most):
     """Of 30 states, the solution itself leaves 4.4e-13 when it is rounded."""

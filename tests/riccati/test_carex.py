@@ -5,10 +5,7 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import (
-    needs_x64,
-    thorough,
-)
+from helpers import minutes, needs_x64
 
 import delucax as dlx
 
@@ -42,13 +39,9 @@ def exam(name, *problem):
     return solution
 
 
-# Small ones, and the boundary.
-SOON = 1, 2, 3, 11
-NUMBERS = [pytest.param(i, marks=() if i in SOON else thorough) for i in range(1, 21)]
-
-
-@pytest.mark.parametrize("number", NUMBERS)
-@thorough
+@pytest.mark.parametrize(
+    "number", [*range(1, 20), pytest.param(20, marks=minutes("421 states"))]
+)
 def test_published_systems(number):
     name, A, B, Q, R = SYSTEMS[number - 1]
     solution = exam(name, A, B, Q, R)
@@ -59,7 +52,6 @@ def test_published_systems(number):
     assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X)
 
 
-@thorough
 def test_families():
     # In sizes of published systems, but for CAREX 15, which is left to its one.
     families = riccati_systems.carex_families(sizes=(4,), half_sizes=(4,))

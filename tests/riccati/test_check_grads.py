@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 import delucax as dlx
 
 
-pytestmark = [needs_x64, pytest.mark.thorough]
+pytestmark = needs_x64
 
 
 rng = np.random.default_rng(0)

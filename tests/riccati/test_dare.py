@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import assert_close, needs_x64, once, thorough, tolerance, user_error
+from helpers import assert_close, needs_x64, once, tolerance, user_error
 
 import delucax as dlx
 
@@ -52,7 +52,7 @@ def test_double_integrator():
 
 
 @needs_x64
-@pytest.mark.parametrize("n, m", [pytest.param(1, 1, marks=thorough), (4, 2)])
+@pytest.mark.parametrize("n, m", [(1, 1), (4, 2)])
 def test_matches_scipy(n, m):
     for seed in range(10):
         A, B, Q, R, S, _ = random_problem(seed, n, m)
@@ -65,7 +65,6 @@ def test_matches_scipy(n, m):
 
 
 @needs_x64
-@thorough
 def test_descriptor_form():
     for seed in range(10):
         A, B, Q, R, S, E = random_problem(seed, 4, 2)
@@ -87,7 +86,6 @@ def test_descriptor_form():
 
 
 @needs_x64
-@thorough
 def test_single_precision():
     problem = random_problem(0, 4, 2)
     exact, _ = equation(*problem, np.zeros((4, 4)))
@@ -132,7 +130,6 @@ def test_no_stabilising_solution(A, B, Q, status):
         eqx.filter_jit(dlx.riccati.dare)(A, B, Q, R)
 
 
-@thorough
 def test_ill_posed_where_it_cannot_be_seen():
     solve = jax.jit(lambda A, R: dlx.riccati.dare(A, B, Q, R, throw=False).result)
     ill_posed = dlx.RESULTS.ill_posed
@@ -156,13 +153,12 @@ def test_least_energy():
 def test_free_control():
     # R = 0: one-step dead-beat control of what B reaches.
     solution = dlx.riccati.dare(2 * jnp.eye(2), jnp.eye(2), Q, jnp.zeros((2, 2)))
-    assert_close(solution.K, 2 * np.eye(2), atol=tolerance(1e-5, 1e-12))
-    assert_close(solution.X, np.eye(2), atol=tolerance(1e-5, 1e-12))
+    assert_close(solution.K, 2 * np.eye(2), atol=1e-12)
+    assert_close(solution.X, np.eye(2), atol=1e-12)
     assert solution.spectral_radius < 1e-5
 
 
 @needs_x64
-@thorough
 def test_one_bad_member_harms_no_other():
     As = np.stack([A, 0.5 * A, 0.9 * A])
     spoilt = np.stack([A, np.diag([1.3, 0.2]), 0.9 * A])
@@ -196,11 +192,10 @@ def test_complex_data():
     plain = dlx.riccati.dare(A, B, Q, R)
     turned = dlx.riccati.dare(turn @ A @ turn.conj(), turn @ B, Q, R)
     X = turn @ plain.X @ turn.conj()
-    assert_close(turned.X, X, atol=tolerance(1e-4, 1e-12))
-    assert_close(turned.K, plain.K @ turn.conj(), atol=tolerance(1e-4, 1e-12))
+    assert_close(turned.X, X, atol=1e-12)
+    assert_close(turned.K, plain.K @ turn.conj(), atol=1e-12)
 
 
-@thorough
 @needs_x64
 def test_dead_beat_loop_has_a_gradient():
     nilpotent = jnp.array([[0.0, 1.0], [0.0, 0.0]])

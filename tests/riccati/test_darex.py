@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import needs_x64, once, thorough
+from helpers import needs_x64, once
 
 import delucax as dlx
 
@@ -34,16 +34,10 @@ def exam(name, *problem):
 
 SYSTEMS = riccati_systems.darex()
 SIZES = sorted({B.shape for _, _, B, _, _ in SYSTEMS})
-SOON = (2, 1), (2, 2), (4, 2)
-CASES = [pytest.param(size, marks=() if size in SOON else thorough) for size in SIZES]
 
 
 @needs_x64
-@pytest.mark.parametrize(
-    "size",
-    [pytest.param(size, marks=() if size in SOON else thorough) for size in SIZES],
-)
-@thorough
+@pytest.mark.parametrize("size", SIZES)
 def test_published_systems(size):
     assert len(SYSTEMS) == 19
     for name, A, B, Q, R in (system for system in SYSTEMS if system[2].shape == size):
@@ -55,7 +49,6 @@ def test_published_systems(size):
         assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X), name
 
 
-@thorough
 @needs_x64
 def test_families():
     systems = riccati_systems.darex_families(sizes=(4,))
@@ -64,7 +57,6 @@ def test_families():
         exam(*system)
 
 
-@thorough
 @once
 def test_single_precision():
     for name, *data in riccati_systems.darex():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -71,7 +71,6 @@ def best_controls(stages, x0):
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-@thorough
 def test_is_the_minimum_over_all_controls(parallel):
     stages = random_stages(7, 7, 3, 2)
     x0 = np.array([1.0, -2.0, 0.5])
@@ -94,7 +93,6 @@ def free_controls(stages):
 
 
 @pytest.mark.parametrize("T, n, m", [(1, 2, 1), (7, 3, 2), (9, 6, 6)])
-@thorough
 def test_in_parallel_as_in_sequence(T, n, m):
     problem = random_stages(T, T, n, m)
     for stages in [problem, free_controls(problem)] if n == m else [problem]:
@@ -166,7 +164,7 @@ def test_tracks_a_reference():
         x = A @ x + B @ (-K[t] @ x - k[t])
 
 
-@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("parallel", [False, True])
 def test_no_minimum(parallel):
     # R + B'XB is negative from the third step back on: 1 - 2, and 1 and 1 before it.
     weights = np.array([1.0, 1.0, -2.0, 1.0, 1.0]).reshape(5, 1, 1)
@@ -192,7 +190,6 @@ def test_no_minimum(parallel):
     assert nothing.result == dlx.RESULTS.infeasible
 
 
-@thorough
 @pytest.mark.parametrize("parallel", [False, True])
 def test_one_bad_member_harms_no_other(parallel):
     def total(R):
@@ -224,7 +221,6 @@ def assert_second_order(line, h):
     assert_close(second, (first_high - first_low) / (2 * h), rtol=1e-6)
 
 
-@thorough
 @pytest.mark.parametrize("parallel", [False, True])
 def test_derivatives_of_the_recursion(parallel):
     stages = random_stages(3, 3, 2, 1)
@@ -242,7 +238,6 @@ def test_derivatives_of_the_recursion(parallel):
     assert_second_order(line, 1e-6)
 
 
-@thorough
 def test_differential_equation():
     rng = np.random.default_rng(0)
     n, m = 2, 2
@@ -273,7 +268,6 @@ def test_differential_equation():
         assert_close(long.X[0], X, rtol=1e-11)
 
 
-@thorough
 def test_stiff_differential_equation():
     # Rates of 1e5 and 1 over a time of 3, where an exponential would overflow.
     rates = np.array([1e5, 1.0])
@@ -286,7 +280,6 @@ def test_stiff_differential_equation():
     assert_close(solution.X[0, 1, 1], exact, rtol=1e-12)
 
 
-@thorough
 def test_escape_in_finite_time():
     # dX/ds = X^2 (-1) - 1 from 0 is -tan s, which is beyond its pole at 2 and at 10:
     # there, the first interval goes past two poles.
@@ -304,7 +297,6 @@ def test_escape_in_finite_time():
     assert bad.result == dlx.RESULTS.infeasible
 
 
-@thorough
 def test_derivatives_of_the_differential_equation():
     arguments = (A, B, Q, R, np.array([[0.1], [-0.2]]), Q)
     rng = np.random.default_rng(0)

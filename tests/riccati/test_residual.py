@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import riccati_systems
-from helpers import dtype, needs_x64, thorough
+from helpers import dtype, needs_x64
 
 import delucax as dlx
 from delucax.riccati._arguments import RiccatiData
@@ -57,7 +57,6 @@ def test_it_bounds_the_true_one(discrete, descriptor, seed, spread):
 
 
 @pytest.mark.parametrize("discrete", [False, True])
-@thorough
 @hypothesis.settings(max_examples=25, deadline=None, derandomize=True)
 @hypothesis.given(seed=st.integers(0, 2**32 - 1))
 def test_it_is_close_near_a_solution(discrete, seed):
@@ -112,7 +111,6 @@ def linear(discrete):
 
 
 @pytest.mark.parametrize("name", ["hinf_care", "hinf_dare"])
-@thorough
 def test_games(name):
     rng = np.random.default_rng(0)
     kind = dtype()
@@ -140,12 +138,10 @@ def systems():
         if name == "CAREX 20" or complex_data and dtype() != jnp.float64:
             continue
         kind = complex if complex_data else dtype()
-        soon = name in ("CAREX 1", "DAREX 1")
         yield pytest.param(
             name.startswith(("DAREX", "user")),
             *(np.asarray(Y, kind) for Y in data),
             id=name.replace(" ", "-"),
-            marks=() if soon else thorough,
         )
 
 

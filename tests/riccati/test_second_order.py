@@ -9,7 +9,6 @@ import pytest
 from helpers import (
     assert_close,
     needs_x64,
-    thorough,
 )
 
 import delucax as dlx
@@ -64,11 +63,12 @@ OTHERS = {"dlyap": (LEFT, SQUARE), "sylvester": (STABLE, RIGHT, TALL)}
 @pytest.mark.parametrize(
     "name",
     [
-        *(pytest.param(n, marks=thorough) for n in ("dare", "care")),
-        *(pytest.param(n, marks=thorough) for n in ("lyap", "dsylvester")),
+        "dare",
+        "care",
+        "lyap",
+        "dsylvester",
     ],
 )
-@thorough
 def test_to_second_order(name):
     solve, pairs = getattr(dlx.riccati, name), PROBLEMS[name]
 
@@ -89,7 +89,6 @@ def test_to_second_order(name):
     assert_close(derivatives, np.tile(numeric, 2), rtol=1e-6)
 
 
-@thorough
 @pytest.mark.parametrize("name", OTHERS)
 def test_forwards_over_backwards(name):
     # By the same rules as those above.
@@ -103,7 +102,6 @@ def test_forwards_over_backwards(name):
 
 
 @pytest.mark.parametrize("name", ["filter_dare", "filter_care"])
-@thorough
 def test_filter(name):
     solve = getattr(dlx.riccati, name)
     pairs = PLAIN[:1] + ((B.T, D_B.T),) + PLAIN[2:]

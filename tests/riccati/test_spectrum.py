@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import needs_x64, thorough, tolerance
+from helpers import needs_x64
 
 from delucax.math._linear_solve import is_definite, solve
 from delucax.riccati._spectrum import spectral_abscissa, spectral_radius
@@ -18,7 +18,7 @@ def matrices(n):
 
 
 @needs_x64
-@pytest.mark.parametrize("n", [3, pytest.param(40, marks=thorough)])
+@pytest.mark.parametrize("n", [3, 40])
 def test_radius_and_abscissa(n):
     radius, abscissa = jax.jit(spectral_radius), jax.jit(spectral_abscissa)
     for A in matrices(n):
@@ -35,9 +35,7 @@ def test_nilpotent():
     assert abs(jax.jit(spectral_abscissa)(0 * A)) < 1e-6
 
 
-@pytest.mark.parametrize(
-    "n", [1, 5, *(pytest.param(n, marks=thorough) for n in (2, 4, 6))]
-)
+@pytest.mark.parametrize("n", [1, 2, 4, 5, 6])
 def test_solve(n):
     rng = np.random.default_rng(n)
     # A zero in the corner, so that rows have to be exchanged.
@@ -48,11 +46,11 @@ def test_solve(n):
     found = jax.jit(jax.vmap(solve))(matrix, right)
     exact = np.linalg.solve(matrix, right)
     error = np.max(np.abs(found - exact)) / np.max(np.abs(exact))
-    assert error < tolerance(1e-4, 1e-12)
+    assert error < 1e-12
     transposed = jax.linear_transpose(lambda b: solve(matrix[0], b), right[0])
     (back,) = transposed(right[0])
     exact = np.linalg.solve(matrix[0].T, right[0])
-    assert np.max(np.abs(back - exact)) < tolerance(1e-3, 1e-11) * np.max(np.abs(exact))
+    assert np.max(np.abs(back - exact)) < 1e-11 * np.max(np.abs(exact))
 
 
 def test_singular_is_not_finite():

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
-from helpers import assert_close, central_difference, needs_x64, thorough, user_error
+from helpers import assert_close, central_difference, needs_x64, user_error
 
 import delucax as dlx
 
@@ -200,8 +200,8 @@ class Implicit(dlx.AbstractSystem):
     [
         (False, "step", None),
         (True, "step", None),
-        pytest.param(False, "sqrt", diffrax.Heun(), marks=thorough),
-        pytest.param(False, None, diffrax.ImplicitEuler(), marks=thorough),
+        (False, "sqrt", diffrax.Heun()),
+        (False, None, diffrax.ImplicitEuler()),
     ],
 )
 def test_derivatives_through_a_field_that_solves(key, stacked, checkpoint, solver):

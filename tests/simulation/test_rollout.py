@@ -11,15 +11,11 @@ from helpers import (
     central_difference,
     CountCalls,
     needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
 
 import delucax as dlx
-
-
-pytestmark = needs_x64
 
 
 FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
@@ -111,9 +107,7 @@ def test_a_batch_is_vmap(key):
         assert_close(batch.times[i], one.times)
 
 
-@pytest.mark.parametrize(
-    "horizon", [*(pytest.param(n, marks=thorough) for n in (1, 16)), 23]
-)
+@pytest.mark.parametrize("horizon", [1, 16, 23])
 def test_checkpoints_change_no_number(key, horizon):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
 

@@ -9,8 +9,6 @@ import scipy.integrate
 from helpers import (
     assert_close,
     dtype,
-    needs_x64,
-    thorough,
     tolerance,
     user_error,
 )
@@ -18,9 +16,6 @@ from jaxtyping import Array
 
 import delucax as dlx
 from delucax.simulation._hold import Hold, interval_before
-
-
-pytestmark = needs_x64
 
 
 PENDULUM = dlx.systems.Pendulum(damping=0.1)
@@ -98,10 +93,7 @@ class Told(dlx.AbstractController):
     [
         {"solver": diffrax.Heun(), "substeps": 3},
         {"stepsize_controller": LOOSE},
-        pytest.param(
-            {"stepsize_controller": diffrax.PIDController(1e-4, 1e-6, dtmax=0.006)},
-            marks=thorough,
-        ),
+        {"stepsize_controller": diffrax.PIDController(1e-4, 1e-6, dtmax=0.006)},
     ],
     ids=["fixed", "adaptive", "short steps"],
 )
@@ -165,7 +157,6 @@ def test_interval_of_a_step(count, t0, t1):
     ],
     ids=lambda solver: type(solver).__name__,
 )
-@thorough
 def test_fixed_steps_are_those_of_discretized(solver):
     controls = switching(40)
     run = dlx.simulate(PENDULUM, controls, 0.0, 2.0, HANGING, solver=solver, substeps=2)
@@ -196,7 +187,6 @@ def test_adaptive_steps_agree_with_scipy():
     assert_close(run.times, np.linspace(0.5, 1.5, 21), atol=tolerance(1e-6, 1e-14))
 
 
-@thorough
 def test_held_disturbances():
     controls, w = switching(10), switching(10, seed=1)
     run = dlx.simulate(SWITCHED, controls, 0.0, 1.0, jnp.ones(1), w=w)
@@ -219,7 +209,6 @@ def test_held_disturbances():
     [(FEEDBACK, {"stepsize_controller": ADAPTIVE}), (Told(), {"substeps": 2})],
     ids=["linear", "memory"],
 )
-@thorough
 def test_sampled_feedback_is_that_of_a_rollout(controller, how, key):
     run = dlx.simulate(PENDULUM, controller, 0.0, 1.0, UPRIGHT, dt=0.05, **how)
     dynamics = dlx.Discretized(PENDULUM, 0.05, diffrax.Tsit5(), substeps=8)
@@ -256,7 +245,6 @@ def test_continuous_feedback_agrees_with_scipy():
     assert_close(run.controls[:, 0], -4 * seen, atol=tolerance(5e-5, 1e-9))
 
 
-@thorough
 def test_a_function_of_time():
     signal = lambda t: jnp.stack([jnp.cos(t)])
     exact = np.sin(np.linspace(0, 1, 11))
@@ -269,7 +257,6 @@ def test_a_function_of_time():
     assert_close(held.controls[:, 0], np.cos(0.1 * np.arange(10)), atol=1e-6)
 
 
-@thorough
 def test_a_controller_that_draws(key):
     noise = dlx.controllers.Random(jnp.ones(1))
     run = dlx.simulate(INTEGRATOR, noise, 0.0, 1.0, jnp.zeros(1), dt=0.1, key=key)
@@ -310,7 +297,6 @@ def test_what_a_trajectory_of_it_holds():
     assert list(table.columns[:4]) == ["time", "angle", "velocity", "torque"]
 
 
-@thorough
 def test_batches():
     controls, decay = switching(4), np.exp(-0.25)
     starts = jnp.array([[0.5], [1.0], [4.0]])
@@ -358,12 +344,7 @@ def test_progress_meter(capfd):
     "how, words, at",
     [
         ({}, "NaN or infinite", 0.3),
-        pytest.param(
-            {"stepsize_controller": LOOSE},
-            "maximum number of solver steps",
-            None,
-            marks=thorough,
-        ),
+        ({"stepsize_controller": LOOSE}, "maximum number of solver steps", None),
     ],
 )
 def test_a_failed_solve_raises(how, words, at):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -91,20 +91,17 @@ def assert_gradient(arguments, *, rtol=1e-6, forwards=False, **how):
     ],
     ids=["fixed", "direct", "adaptive", "backsolve"],
 )
-@thorough
 def test_gradient_of_open_loop(how):
     assert_gradient((PENDULUM, CONTROLS, HANGING), **how)
 
 
 @needs_x64
-@thorough
 def test_forward_gradient():
     assert_gradient(
         (PENDULUM, CONTROLS, HANGING), forwards=True, adjoint=diffrax.ForwardMode()
     )
 
 
-@thorough
 @needs_x64
 @pytest.mark.parametrize(
     "controller, how",
@@ -121,13 +118,11 @@ def test_forward_gradient():
     ],
     ids=["sampled", "continuous"],
 )
-@thorough
 def test_gradient_of_feedback(controller, how):
     arguments = (PENDULUM, controller, UPRIGHT)
     assert_gradient(arguments, dt=0.05, **how)
 
 
-@thorough
 @needs_x64
 def test_gradient_with_respect_to_the_end():
     def f(t1):
@@ -138,7 +133,6 @@ def test_gradient_with_respect_to_the_end():
     assert_close(jax.grad(f)(0.3), jnp.mean(CONTROLS), rtol=1e-12)
 
 
-@thorough
 def test_a_gradient_that_fails_is_loud():
     how = dict(stepsize_controller=LOOSE, adjoint=diffrax.BacksolveAdjoint(max_steps=1))
     f = lambda x0: dlx.simulate(

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from helpers import needs_x32, once, thorough, user_error
+from helpers import needs_x32, once, user_error
 from PIL import Image
 
 import delucax as dlx
@@ -15,7 +15,6 @@ from delucax.studies.paper._finding import Claim, Finding
 pytestmark = once
 
 
-@thorough
 def test_the_demo_writes_what_it_says(tmp_path, monkeypatch):
     def study(small):
         assert small

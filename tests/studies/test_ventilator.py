@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, once, thorough, user_error
+from helpers import assert_close, minutes, once, user_error
 
 import delucax as dlx
 from delucax import lung, studies
@@ -140,7 +140,6 @@ def test_what_passed_the_limit_is_not_saved(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a_0.dlx"]
 
 
-@thorough
 def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
     waveform = lung.BreathWaveform()
     envs = stack([lung.single_compartment(resistance=R) for R in (5.0, 50.0)])
@@ -185,7 +184,7 @@ def write_lungs(path, lungs, breaths):
     lung.write_breaths(path, jax.tree.map(join, *parts))
 
 
-@thorough
+@minutes("trains lungs, networks and PIDs, as `python -m delucax lung --small` does")
 @pytest.mark.parametrize("from_file", [False, True])
 def test_small_study(tmp_path, from_file):
     data, out = None, tmp_path / "out"

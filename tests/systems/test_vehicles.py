@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -142,7 +142,6 @@ def test_an_attitude_has_two_quaternions():
     assert np.all(np.isfinite(gradient))
 
 
-@thorough
 def test_a_quadrotor_is_regulated_about_hover(key):
     """From either quaternion of an attitude, on what is controllable: 12 of 13."""
     env = dlx.make("quadrotor")

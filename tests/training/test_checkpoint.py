@@ -10,7 +10,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import once, thorough, user_error
+from helpers import once, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -83,7 +83,7 @@ def cut_at(step):
     return callback
 
 
-@pytest.mark.parametrize("block", [2, pytest.param(3, marks=thorough)])
+@pytest.mark.parametrize("block", [2, 3])
 def test_a_run_that_was_cut_off_goes_on_to_the_same_bits(tmp_path, block):
     path = tmp_path / "new" / "fit.ckpt"
     with pytest.raises(Cut):

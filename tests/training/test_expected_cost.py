@@ -4,7 +4,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, CountCalls, needs_x64, thorough, tolerance, user_error
+from helpers import assert_close, CountCalls, needs_x64, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -33,7 +33,6 @@ def test_it_is_the_mean_of_rollouts():
     assert_close(one(CONTROLLER, jr.key(0)), cost, rtol=1e-6)
 
 
-@thorough
 def test_what_the_gradient_stores_does_not_change_it():
     gradients = [
         analytic(
@@ -45,10 +44,9 @@ def test_what_the_gradient_stores_does_not_change_it():
     ]
     assert jnp.linalg.norm(gradients[0]) > 0.1
     for gradient in gradients[1:]:
-        assert_close(gradient, gradients[0], rtol=tolerance(1e-4, 1e-10))
+        assert_close(gradient, gradients[0], rtol=1e-10)
 
 
-@thorough
 def test_a_decay_damps_the_gradient_and_not_the_cost():
     full = analytic(expected_cost(pendulum(), batch=2), CONTROLLER, jr.key(0))
     none = analytic(
@@ -98,7 +96,6 @@ def test_divergence_is_reported_with_its_step():
         )
 
 
-@thorough
 def test_a_failed_solve_makes_the_cost_nan():
     import diffrax
 

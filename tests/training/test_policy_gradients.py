@@ -7,7 +7,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, user_error
+from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
 from delucax.studies import holds_upright
@@ -107,7 +107,6 @@ def test_advantages_know_an_end_from_a_cut(ends, bootstrap):
     assert_close(record.valid, np.arange(6) < length)
 
 
-@thorough
 @needs_x64
 def test_gradient_of_ppo_is_the_policy_gradient_at_first():
     """Where nothing has moved, the ratio is 1 and its gradient that of the score."""
@@ -136,7 +135,6 @@ def test_gradient_of_ppo_is_the_policy_gradient_at_first():
     assert_close(jnp.mean(rows.advantages), 0, atol=1e-12)
 
 
-@thorough
 @needs_x64
 def test_ppo_follows_the_memory_of_a_policy():
     """What a recurrent policy is scored by is what it drew with."""
@@ -167,7 +165,6 @@ def test_window_of_shac_is_the_whole_gradient_where_it_spans_the_horizon():
         assert_close(a * scale, b, rtol=1e-9, atol=1e-12)
 
 
-@thorough
 @needs_x64
 def test_gradient_is_cut_between_windows():
     """A cut rollout has the gradient of its stretches, each from a start held fixed."""
@@ -207,7 +204,6 @@ def test_moments_are_those_of_all_rows():
     assert_close(moments.std, jnp.std(rows[valid], axis=0), rtol=1e-12)
 
 
-@thorough
 @once
 def test_batch_of_keys_trains_each_by_ppo_as_if_alone():
     env = environment()
@@ -374,7 +370,6 @@ def test_policy_and_critic_begin_flat():
         assert 0 < jnp.linalg.norm(slope) < 0.02
 
 
-@thorough
 @once
 def test_ppo_swings_up():
     env = dlx.make("pendulum")

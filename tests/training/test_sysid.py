@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
@@ -83,7 +83,6 @@ def test_residuals_of_a_wrong_model_are_said_to_be_correlated():
         assert loud.correlation == 0
 
 
-@thorough
 def test_direction_that_is_not_identifiable_is_reported():
     states, controls, _ = recorded()
     paths = ("system.gravity", "system.length", "system.mass")
@@ -117,7 +116,6 @@ def test_data_that_say_nothing_say_so():
         assert line.split()[2:] == ["0", "inf"]
 
 
-@thorough
 def test_too_little_data_say_so():
     states, controls, _ = recorded()
     few = dict(states=states[:3], controls=controls[:2], throw=False)
@@ -128,7 +126,6 @@ def test_too_little_data_say_so():
         sysid.linear(states[:3], controls[:2])
 
 
-@thorough
 def test_two_observations_do_not_tell_two_parameters():
     # They are four numbers, two of which tell where it starts.
     states, controls, _ = recorded()
@@ -185,7 +182,6 @@ def test_level_of_the_intervals():
             fitted(1.5)
 
 
-@thorough
 def test_arx_is_the_dynamics_that_it_came_from():
     true = dlx.LinearDynamics(A, B)
     controls = jr.normal(jr.key(0), (200, 1))
@@ -199,7 +195,6 @@ def test_arx_is_the_dynamics_that_it_came_from():
     assert_close(again, outputs[2:], atol=1e-9)
 
 
-@thorough
 def test_neural_fits_predict():
     states, controls, _ = recorded(noise=1e-3)
     spread = jnp.std(states, axis=0)
@@ -314,7 +309,6 @@ def test_the_start_of_each_run_is_returned():
     assert sysid.linear(states, controls).x0 is None
 
 
-@thorough
 @pytest.mark.parametrize(
     "off, paths", [((0.6, 1.5), RATES), ((1.4, 0.6), RATES), ((1, 1, 1.3), "system.E")]
 )

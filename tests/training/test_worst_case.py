@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -32,7 +32,6 @@ def cost(w):
     return run.total_cost
 
 
-@thorough
 def test_no_bounded_sequence_is_worse():
     options = dict(key=KEY, bound=0.5, x0=np.zeros(2))
     found = dlx.training.worst_case(ENV, lqr(), **options)
@@ -52,7 +51,6 @@ def test_no_bounded_sequence_is_worse():
     assert_close(along, 0.5 * np.linalg.norm(g, axis=1), rtol=1e-3, atol=1e-2)
 
 
-@thorough
 def test_a_learner_under_attack():
     learner = dlx.controllers.gpc(PLANT, COST, memory=2)
     found = dlx.training.worst_case(

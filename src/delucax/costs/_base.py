@@ -152,10 +152,10 @@ class Function(AbstractCost):
     stage: Callable[[RealScalar, Array, Array], Array] = function_field()
     final_cost: Callable[[RealScalar, Array], Array] | None = function_field(None)
 
-    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array | float:
         return self.stage(t, x, u)
 
-    def final(self, t: RealScalar, x: State) -> Array:
+    def final(self, t: RealScalar, x: State) -> Array | float:
         if self.final_cost is None:
             return super().final(t, x)
         return self.final_cost(t, x)
