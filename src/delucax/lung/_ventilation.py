@@ -325,7 +325,9 @@ def ventilation(
     check_range(expiration_weight, "expiration_weight", where)
     delay = check_count(sensor_delay, "sensor_delay", where, least=0)
     waveform = BreathWaveform() if waveform is None else waveform
-    rest = [0.0] * dynamics.state_size if resting_state is None else resting_state
+    rest: Any = resting_state
+    if rest is None:
+        rest = [0.0] * dynamics.state_size
     sensor = sensed = PressureSensor(dynamics)
     initial_state = sensor.filled(rest)
     if delay:

@@ -4,9 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
-
-from .._jax import xp
 
 
 _UNROLL: ContextVar[int] = ContextVar("delucax_unroll", default=32)
@@ -46,7 +45,7 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
         dlx.math.matvec(jnp.eye(2), jnp.array([1.0, 2.0]))
         ```
     """
-    matrix, vector = xp.asarray(matrix), xp.asarray(vector)
+    matrix, vector = jnp.asarray(matrix), jnp.asarray(vector)
     if matrix.ndim != 2 or vector.shape != matrix.shape[1:]:
         raise ValueError(
             "matvec: matrix and vector must have shapes (m, n) and (n,), got "
@@ -62,7 +61,7 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
         for j in range(1, n):
             row = row + matrix[i, j] * vector[j]
         rows.append(row)
-    return xp.stack(rows)
+    return jnp.stack(rows)
 
 
 def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
@@ -84,7 +83,7 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
         dlx.math.quadratic_form(jnp.eye(2), jnp.array([1.0, 2.0]))
         ```
     """
-    vector = xp.asarray(vector)
+    vector = jnp.asarray(vector)
     return dot(vector, matvec(matrix, vector))
 
 

@@ -171,12 +171,10 @@ def search(
         )
         return kept(at.point, best), numbers(*after, dtype=dtype)
 
-    most = xp.asarray(xp.inf, dtype)
-    nothing = Verdict(
-        xp.where(well_posed, FIRST, DONE), most, most, most, -most, 0, 0, 0, 1, 0, 0
-    )
-    going = lambda carry: carry[1][0] != DONE
-    return while_loop(going, body, (point, numbers(*nothing, dtype=dtype)))
+    # The verdict on nothing: the first residual is smaller, and the pair stabilisable.
+    most, kind = xp.inf, xp.where(well_posed, FIRST, DONE)
+    verdict = numbers(kind, most, most, most, -most, 0, 0, 0, 1, 0, 0, dtype=dtype)
+    return while_loop(lambda carry: carry[1][0] != DONE, body, (point, verdict))
 
 
 def weights(

@@ -221,9 +221,10 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
         terms = xp.where(left.terms[0] > 0, left.terms[0], xp.inf)
         return Attempt(
             left.point,
-            *left.bounds,
-            bound,
-            gap,
+            residual=left.bounds[0],
+            unscaled=left.bounds[1],
+            bound=bound,
+            gap=gap,
             rounding=rounding,
             near=xp.abs(gap) < reach,
             around=xp.abs(gap) < 4 * eps**0.125 * scale,
