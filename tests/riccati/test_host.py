@@ -93,10 +93,7 @@ def test_nothing_is_compiled(name):
             assert jnp.finfo(leaf.dtype).bits == bits
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name for name in EQUATIONS],
-)
+@pytest.mark.parametrize("name", EQUATIONS)
 def test_both_ways_agree(name):
     at_once, compiled = EQUATIONS[name](A), jax.jit(EQUATIONS[name])(A)
     assert at_once.result == compiled.result
