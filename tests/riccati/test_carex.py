@@ -13,15 +13,12 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-# Compiled once for each size.
-solve = jax.jit(lambda *problem: dlx.riccati.care(*problem, throw=False))
 SYSTEMS = riccati_systems.carex()
 
 
 def exam(name, *problem):
     A, B, Q, R = (np.asarray(M, float) for M in problem)
-    solution = solve(A, B, Q, R)
-    riccati_systems.check_both_ways(False, (A, B, Q, R), solution)
+    solution = dlx.riccati.care(A, B, Q, R, throw=False)
     X = np.asarray(solution.X)
     residual, loop = riccati_systems.continuous_residual(A, B, Q, R, X)
     if len(A) < 10:
@@ -50,6 +47,26 @@ def test_published_systems(number):
         return
     X = scipy.linalg.solve_continuous_are(A, B, Q, R)
     assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X)
+
+
+compiled = jax.jit(lambda *problem: dlx.riccati.care(*problem, throw=False))
+
+
+@pytest.mark.parametrize("number", [1, 2, 4, 9, 14])
+def test_compiled(number):
+    check_compiled(number)
+
+
+@minutes("a program is compiled for each size, the largest of 421 states")
+def test_all_compiled():
+    for number in range(1, 21):
+        check_compiled(number)
+
+
+def check_compiled(number):
+    _, *problem = SYSTEMS[number - 1]
+    problem = [np.asarray(M, float) for M in problem]
+    riccati_systems.check_both_ways(False, problem, compiled(*problem))
 
 
 def test_families():

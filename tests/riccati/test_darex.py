@@ -1,17 +1,14 @@
 """Published discrete-time systems, and families of them."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import needs_x64, once
+from helpers import minutes, needs_x64, once
 
 import delucax as dlx
-
-
-# Compiled once for each size.
-solve = jax.jit(lambda *problem: dlx.riccati.dare(*problem, throw=False))
 
 
 def as_floats(*problem):
@@ -22,8 +19,7 @@ def as_floats(*problem):
 
 def exam(name, *problem):
     A, B, Q, R = as_floats(*problem)
-    solution = solve(A, B, Q, R)
-    riccati_systems.check_both_ways(True, (A, B, Q, R), solution)
+    solution = dlx.riccati.dare(A, B, Q, R, throw=False)
     residual, loop = riccati_systems.discrete_residual(A, B, Q, R, solution.X)
     assert solution.result == dlx.RESULTS.successful, name
     assert residual < 1e-12 and solution.residual < 1e-12, name
@@ -49,6 +45,27 @@ def test_published_systems(size):
         assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X), name
 
 
+compiled = jax.jit(lambda *problem: dlx.riccati.dare(*problem, throw=False))
+
+
+@pytest.mark.parametrize("number", [1, 3, 6, 14])
+def test_compiled(number):
+    check_compiled(number)
+
+
+@minutes("a program is compiled for each size")
+def test_all_compiled():
+    for number in range(1, len(SYSTEMS) + 1):
+        check_compiled(number)
+
+
+def check_compiled(number):
+    _, *problem = SYSTEMS[number - 1]
+    kind = complex if any(map(np.iscomplexobj, problem)) else float
+    problem = [np.asarray(jnp.asarray(M, kind)) for M in problem]
+    riccati_systems.check_both_ways(True, problem, compiled(*problem))
+
+
 @needs_x64
 def test_families():
     systems = riccati_systems.darex_families(sizes=(4,))
@@ -63,8 +80,7 @@ def test_single_precision():
         if any(map(np.iscomplexobj, data)):
             continue
         single = [np.asarray(M, np.float32) for M in data]
-        solution = solve(*single)
-        riccati_systems.check_both_ways(True, single, solution)
+        solution = dlx.riccati.dare(*single, throw=False)
         X = np.asarray(solution.X, np.float64)
         residual, _ = riccati_systems.discrete_residual(*data, X)
         if name == "DAREX 14":

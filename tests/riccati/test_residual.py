@@ -147,7 +147,8 @@ def systems():
 
 @pytest.mark.parametrize("discrete, A, B, Q, R", list(systems()))
 def test_published_systems(discrete, A, B, Q, R):
-    solution = solved("dare" if discrete else "care")(A, B, Q, R)
+    solve = dlx.riccati.dare if discrete else dlx.riccati.care
+    solution = solve(A, B, Q, R, throw=False)
     if solution.result != dlx.RESULTS.successful:
         return
     true = riccati_systems.true_residual(discrete, A, B, Q, R, solution.X)

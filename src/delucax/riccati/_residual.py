@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Float
 
-from .._jax import matmul, numbers, vmap, while_loop, xp
+from .._jax import matmul, numbers, on_host, vmap, while_loop, xp
 from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts, units_of_sum
 from ..math._linear_solve import solve, symmetric
@@ -239,44 +239,47 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     """The residual in more digits.
 
     The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
-    place at which their matrix stands in the equation. One product gives all of them
-    and the sum.
+    place at which their matrix stands in the equation.
     """
     n, m = B.shape
     eps, nothing = xp.finfo(A.dtype).eps, xp.zeros_like(X)
-    right = dict(N=N, L=L, Y=Y, T=T)
-    if E is not None:
-        right |= dict(E=E, Z=Z)
-
-    def row(**factors):
-        """The row of a block matrix with these factors of N, L, ..."""
-        rows = len(next(iter(factors.values())))
-        blocks = (
-            factors.get(name, xp.zeros((rows, len(M)), A.dtype))
-            for name, M in right.items()
-        )
-        return xp.concatenate(list(blocks), axis=1)
-
-    # Each row: its factors, what is added, what is subtracted; and how a rest stands
-    # in the equation.
-    rows = [(row(N=B), A, L, 2 * Y), (row(N=R), S.T, T, N)]
+    right = dict(N=N, L=L, Y=Y, T=T) | ({} if E is None else dict(E=E, Z=Z))
+    # Each row: the factors of N, L, ..., what is added, what is subtracted; and how a
+    # rest stands in the equation.
+    rows = [(dict(N=B), A, L, 2 * Y), (dict(N=R), S.T, T, N)]
     if discrete:
-        rows.append((row(L=X), nothing, Y, L))
+        rows.append((dict(L=X), nothing, Y, L))
     if E is not None:
-        rows.append((row(E=X), nothing, Z, -E if discrete else 2 * L))
-    if not discrete:
-        whole = row(N=S, L=Y.T, Y=L.T, T=N.T)
-    elif E is None:
-        whole = row(N=S, Y=L.T, T=N.T)
+        rows.append((dict(E=X), nothing, Z, -E if discrete else 2 * L))
+    whole = dict(N=S, Y=L.T, T=N.T)
+    if discrete:
+        whole |= {} if E is None else dict(Z=-E.T)
     else:
-        whole = row(N=S, Y=L.T, T=N.T, Z=-E.T)
+        whole |= dict(L=Y.T)
     rows.append((whole, Q, X if discrete and E is None else nothing, nothing))
-    left, added, subtracted, factor = (
-        xp.concatenate(M) for M in zip(*rows, strict=True)
-    )
-    value, rounding = product(
-        left, xp.concatenate([*right.values()]), added, -subtracted
-    )
+    factors, added, subtracted, factor = zip(*rows, strict=True)
+    factor = xp.concatenate(factor)
+    if is_small(B) and not on_host():
+        # One product of block matrices compiles sooner. For larger ones it would mix
+        # blocks of different sizes, which the slices of a product do not like.
+        left = xp.concatenate([_block_row(right, blocks) for blocks in factors])
+        value, rounding = product(
+            left,
+            xp.concatenate([*right.values()]),
+            xp.concatenate(added),
+            -xp.concatenate(subtracted),
+        )
+    else:
+        pairs = [
+            product(
+                xp.concatenate([*blocks.values()], axis=1),
+                xp.concatenate([right[name] for name in blocks]),
+                plus,
+                -minus,
+            )
+            for blocks, plus, minus, _ in rows
+        ]
+        value, rounding = (xp.concatenate(M) for M in zip(*pairs, strict=True))
     rest, rest_lost, factor = value[:-n], rounding[:-n], factor[:-n].T
     sizes = xp.abs(rest)
     most = sizes + rest_lost
@@ -294,6 +297,14 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
         lost, around = lost + 2 * n * error_L * beside, around + beside
     gap_lost = matmul(xp.abs(B.T), around) + most[n : n + m] + (n + 4) * eps * xp.abs(T)
     return _Left(symmetric(error), symmetric(lost), matmul(B.T, Y) + T, gap_lost)
+
+
+def _block_row(columns: dict[str, Array], blocks: dict[str, Array]) -> Array:
+    """The blocks beside each other, zero where there is none."""
+    (height, dtype), *_ = ((len(M), M.dtype) for M in blocks.values())
+    nothing = (xp.zeros((height, len(M)), dtype) for M in columns.values())
+    pairs = zip(columns, nothing, strict=True)
+    return xp.concatenate([blocks.get(name, zero) for name, zero in pairs], axis=1)
 
 
 def _twice(M):
