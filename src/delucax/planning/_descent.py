@@ -75,7 +75,7 @@ class _Progress(NamedTuple):
     """The weight of the defects."""
     rounding: Array
     """By how much rounding may change the cost."""
-    begun: Array
+    started: Array
     """Whether the starts have been compared."""
     done: Array
 
@@ -143,20 +143,20 @@ def _iterate(
 ) -> _Progress:
     """A line search, and the model about where it led. The first one compares starts:
     the loop has one body, so that one roll-out is compiled."""
-    now, begun, tolerance = before.now, before.begun, options.tolerance
+    now, started, tolerance = before.now, before.started, options.tolerance
     trajectory, accepted, tried = _searched(problem, options, starts, count, before)
     states, controls, cost, defects = trajectory
-    lost = ~begun & ~jnp.isfinite(cost)
+    lost = ~started & ~jnp.isfinite(cost)
     # Fall back to Gauss-Newton if the exact Hessian is indefinite or the search failed.
     flatten = ~accepted & before.exact & options.second_order
     mu, delta = now.regularisation, before.delta
     changed = _schedule(accepted, mu, delta)
-    keep = lambda old, new: jnp.where(flatten | ~begun, old, new)
+    keep = lambda old, new: jnp.where(flatten | ~started, old, new)
     mu, delta = jax.tree.map(keep, (mu, delta), changed)
-    exact = jnp.where(flatten & begun, False, before.exact | accepted)
+    exact = jnp.where(flatten & started, False, before.exact | accepted)
     stuck = mu > MOST_MU
     failed = lost | stuck
-    iteration = now.iterations + begun
+    iteration = now.iterations + started
     # One linear-quadratic problem about the present trajectory.
     about = problem, states, controls, defects, options.second_order
     stages = model(*about, exact, options.finite_difference)
@@ -192,9 +192,9 @@ def _iterate(
     )
     penalty = _penalty(before.penalty, defects, policy)
     done = failed | converged | (iteration >= options.max_iterations)
-    begun = jnp.ones_like(begun)
+    started = jnp.ones_like(started)
     return _Progress(
-        after, policy, defects, delta, exact, penalty, rounding, begun, done
+        after, policy, defects, delta, exact, penalty, rounding, started, done
     )
 
 
@@ -213,7 +213,7 @@ def _searched(problem, options, starts, count, before: _Progress):
     slack = before.rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
     # Without a policy there is nothing to search along.
     halvings = jnp.where(policy.ok, HALVINGS, 0)
-    number = jnp.where(before.begun, halvings, count)
+    number = jnp.where(before.started, halvings, count)
     length_of = lambda i: 0.5 ** i.astype(now.cost.dtype)
 
     def trial(i):
@@ -221,11 +221,11 @@ def _searched(problem, options, starts, count, before: _Progress):
         # The feedback of a start is followed as it is: the change `k` is zero then.
         own = now.states, now.controls, policy.K
         given = starts.states, starts.controls, starts.gains
-        pick = lambda own, given: jnp.where(before.begun, own, given[i])
+        pick = lambda own, given: jnp.where(before.started, own, given[i])
         length = length_of(i)
         xs, us, K = jax.tree.map(pick, own, given)
-        found = roll_out(problem, xs, us, K, policy.k, length, defects)
-        *_, cost = found
+        path = roll_out(problem, xs, us, K, policy.k, length, defects)
+        *_, cost = path
         # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
         # times the defects, of which a step of length a closes that share.
         curvature = length * policy.curvature / 2
@@ -234,7 +234,7 @@ def _searched(problem, options, starts, count, before: _Progress):
         enough = decrease >= LEAST_SHARE * predicted - slack
         enough = enough & jnp.isfinite(cost)
         rank = jnp.where(enough, i.astype(cost.dtype), jnp.inf)
-        return jnp.where(before.begun, rank, cost), found
+        return jnp.where(before.started, rank, cost), path
 
     if options.line_search == "parallel":
         most = jnp.arange(max(HALVINGS, starts.count))
@@ -246,14 +246,14 @@ def _searched(problem, options, starts, count, before: _Progress):
 
         def body(carry):
             i, best, rank, candidate = carry
-            new, found = trial(i)
+            new, path = trial(i)
             lower = (new < rank) | (i == 0)
             keep = lambda new, old: jnp.where(lower, new, old)
-            return i + 1, *jax.tree.map(keep, (i, new, found), (best, rank, candidate))
+            return i + 1, *jax.tree.map(keep, (i, new, path), (best, rank, candidate))
 
         # Steps are tried until one is accepted, all starts are compared.
         going = lambda carry: (
-            (carry[0] < number) & ~(before.begun & jnp.isfinite(carry[2]))
+            (carry[0] < number) & ~(before.started & jnp.isfinite(carry[2]))
         )
         index = jnp.zeros((), int)
         last = now.states, now.controls, now.cost
@@ -262,7 +262,7 @@ def _searched(problem, options, starts, count, before: _Progress):
     accepted = jnp.isfinite(rank)
     # Of starts that all diverge the first one is left, for what it shows.
     keep = lambda new, old: jnp.where(
-        accepted | (~before.begun & (number > 0)), new, old
+        accepted | (~before.started & (number > 0)), new, old
     )
     last = now.states, now.controls, now.cost
     states, controls, cost = jax.tree.map(keep, candidate, last)

@@ -90,18 +90,18 @@ def model(
     if second_order:
         # The Hessian of the Hamiltonian, cost + costate' F: the curvature of the
         # dynamics is weighted by the costates, that of constraints by multipliers.
-        def bent(z, t, w, costate, push):
+        def lagrangian(z, t, w, costate, push):
             value = costate @ step(z, t, w)
             return value if push is None else value + push @ constraints(z, t)[0]
 
         # Forward over reverse is cheapest. Implicit solvers inside may have one mode
         # only.
-        slope = jax.grad(bent)
-        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(bent))
+        slope = jax.grad(lagrangian)
+        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(lagrangian))
         given = z, t, problem.w, costates_of(F, h, v), push
         # Both are computed where a flag of the loop decides, because the flag is
         # traced.
-        used = lambda bend: bend if use_exact is None else jnp.where(use_exact, bend, 0)
+        used = lambda M: M if use_exact is None else jnp.where(use_exact, M, 0)
         H = H + used(jax.vmap(first_possible(*ways))(*given))
         if end_push is not None:
             at_end = lambda x: end_push @ final_constraints(x)[0]
