@@ -97,10 +97,8 @@ def _product(left, right, *, precision, **_):
 
 
 def _sum_of_products(left, right, *, batched, precision):
-    if not batched:
-        if left.size * right.shape[1] > _FEW:
-            return jnp.matmul(left, right, precision=precision)
-        return jnp.sum(left[:, :, None] * right, axis=1)
+    if not batched and left.size * right.shape[1] > _FEW:
+        return jnp.matmul(left, right, precision=precision)
     # Barriers, or what is fused with the sum is computed for each of its terms.
     left, right = lax.optimization_barrier((left, right))
     terms = (
