@@ -99,8 +99,10 @@ def _product(left, right, *, precision, **_):
 def _sum_of_products(left, right, *, batched, precision):
     if not batched and left.size * right.shape[1] > _FEW:
         return jnp.matmul(left, right, precision=precision)
-    # Barriers, or what is fused with the sum is computed for each of its terms.
-    left, right = lax.optimization_barrier((left, right))
+    # Barriers, or what is fused with the sum is computed for each of its terms. For one
+    # product that is little, and compiles sooner than one more loop.
+    if batched:
+        left, right = lax.optimization_barrier((left, right))
     terms = (
         left[..., :, k, None] * right[..., None, k, :] for k in range(left.shape[-1])
     )
