@@ -84,7 +84,7 @@ def matmul(left: Any, right: Any) -> Any:
     XLA gives each product of a batch to its pool of threads, unless a flag turns the
     pool off. For matrices of a few rows that takes ten times as long as the product.
     And a loop over small arrays is compiled as a whole only if no library is called in
-    it: in half the time, and without a call for each operation of each step.
+    it: in less time, and without a call for each operation of each step.
     """
     if on_host() or left.shape[1] > _OUTER:
         return left @ right
