@@ -62,25 +62,23 @@ def in_both_modes(f):
     return derivatives
 
 
-def to_second_order(line, backwards=False):
-    """The value and the derivative, in both modes, of `line`, a number of a vector of
-    one entry; and the derivatives of these forwards, and backwards if asked for."""
+def check_second_order(line, backwards=False, step=1e-5):
+    """The derivatives of `line`, a number of a number, in both modes, and those of
+    these forwards, and backwards if asked for, are central differences."""
 
     def to_first_order(e):
         parts = in_both_modes(lambda e: line(e[0])[None])(e)
         return jnp.concatenate([part.ravel() for part in parts])
 
-    if backwards:
-        return in_both_modes(to_first_order)
-    return lambda e: jax.jvp(to_first_order, (e,), (jnp.ones(1),))
+    @jax.jit
+    def to_second_order(e):
+        if backwards:
+            return in_both_modes(to_first_order)(e)
+        return jax.jvp(to_first_order, (e,), (jnp.ones(1),))
 
-
-def check_second_order(line, backwards=False, step=1e-5):
-    """Derivatives to second order are central differences of those to first order."""
-    both = jax.jit(to_second_order(line, backwards))
-    low, high = (np.asarray(both(np.array([0.1 + h]))[0]) for h in (-step, step))
-    numeric = (high - low) / (2 * step)
-    values, *derivatives = both(np.array([0.1]))
+    low, high = (to_second_order(np.array([0.1 + h]))[0] for h in (-step, step))
+    numeric = np.asarray(high - low) / (2 * step)
+    values, *derivatives = to_second_order(np.array([0.1]))
     assert_close(values[1:], np.full(2, numeric[0]), rtol=1e-6)
     for slopes in derivatives:
         assert_close(slopes.ravel(), numeric, rtol=1e-6)
