@@ -113,7 +113,7 @@ def test_a_load_that_comes_and_goes_meets_all_simulators(monkeypatch):
 
 
 def test_several_seeds_descend_as_each_alone():
-    losses = _gradients.train_linear(5, range(2), progress=False).history.loss
+    losses = _gradients.train_linear(5, np.arange(2), progress=False).history.loss
     assert losses.shape == (5, 2)
     alone = _gradients.train_linear(5, 1, progress=False).history.loss
     np.testing.assert_allclose(losses[:, 1], alone, rtol=1e-5)

@@ -49,7 +49,7 @@ def policy_gradient(small: bool = False) -> Finding:
     rows: Any = [("through the rollout", 1, int(first is not None), first, exact[-1])]
     settings = list(itertools.product(scales, pairs))
     estimators = [training.EvolutionStrategies(s, 2 * count) for s, count in settings]
-    evolve = lambda estimator: losses(range(seeds), gradient=estimator)
+    evolve = lambda estimator: losses(np.arange(seeds), gradient=estimator)
     curves = dict(zip(settings, side_by_side(evolve, estimators), strict=True))
     fewest = []
     for (scale, count), runs in curves.items():
@@ -110,14 +110,14 @@ def _descent(rate: float) -> optax.GradientTransformation:
 
 
 def train_linear(
-    steps: int, seed: int | Sequence[int] = 0, rate: float = RATE, **options: Any
+    steps: int, seed: Any = 0, rate: float = RATE, **options: Any
 ) -> training.Fitted:
-    """Descend with a linear policy from zero, or several of them with a seed each; with
-    the options of `fit`."""
+    """Descend with a linear policy from zero, or with several for an array of seeds;
+    with the options of `fit`."""
     start, key_of = Linear(jnp.zeros((1, 2))), jr.key
-    if isinstance(seed, Sequence):
+    if np.ndim(seed):
         start = jax.tree.map(lambda K: jnp.stack([K] * len(seed)), start)
-        seed, key_of = np.asarray(seed), jax.vmap(jr.key)
+        key_of = jax.vmap(jr.key)
     options["key"] = key_of(seed)
     return training.fit(_mean_cost(), start, _descent(rate), steps, **options)
 
@@ -258,7 +258,7 @@ def _over_horizons(horizons: Sequence[int], draws: int) -> list[dict[str, Any]]:
         both = [(training.analytic, one, policy), (drawn, score, noisy)]
         each, guesses = _estimates(both, draws)
         norms = np.linalg.norm(each, axis=1)
-        row = {"horizon": horizon}
+        row: dict[str, Any] = {"horizon": horizon}
         row["analytic"] = float(np.sum(np.var(each, axis=0))) / DRAWN
         row["REINFORCE"] = float(np.sum(np.var(guesses, axis=0)))
         row["norm, median"] = float(np.median(norms))
@@ -271,12 +271,13 @@ def _estimates(
 ) -> list[Float[np.ndarray, "draws weights"]]:
     """Estimates of the gradient by the policy's own weights, a row each, by each
     estimator of a loss of a model."""
-    estimate = lambda one: np.asarray(_compiled_estimates(*one, draws))
-    return side_by_side(estimate, given)
+    return side_by_side(lambda one: np.asarray(_compiled_estimates(one, draws)), given)
 
 
 @eqx.filter_jit
-def _compiled_estimates(estimator, loss, model, draws):
+def _compiled_estimates(given, draws):
+    estimator, loss, model = given
+
     def estimate(key):
         _, gradient = estimator(loss, model, key)
         own = gradient.base if isinstance(gradient, Gaussian) else gradient

@@ -191,7 +191,7 @@ def lq_perturbations(small: bool = False) -> Finding:
     """Zero control diverges on this plant: LQR is the row to beat."""
     # Over fewer steps the time that GPC takes to learn would count for more.
     seeds, steps = 5 if small else 20, 1000
-    A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.0], [1.0]])
+    A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
     dynamics, cost = LinearDynamics(A, B), Quadratic(np.eye(2), np.eye(1))
     env = Environment(dynamics, cost)
     weights = np.eye(2), np.eye(1)
