@@ -145,16 +145,9 @@ class ClosedLoop(eqx.Module):
         self.memory = check_count(memory, "memory", where)
         self.response = self.first_response = None
         if tangents is not None:
-            first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
-            # Markov parameters: row j is the response to an impulse j + 1 steps ago.
-            step = lambda z, _: (first.transition @ z, first.output @ z)
-            response = lax.scan(step, first.input, length=self.horizon)[1]
+            given = tangents, self.horizon, dynamics.observation_size
+            response, self.first_response = _responses(*given)
             self.response = response if is_constant else None
-            moved = response[:, : dynamics.observation_size]
-            sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
-            # A control may take several steps to show; smaller responses are rounding.
-            slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
-            self.first_response = sizes[jnp.argmax(sizes > slack)]
 
     def __check_init__(self):
         _check_control(self.dynamics, self.base, "ClosedLoop")
@@ -361,25 +354,43 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
     return Tangents(by_state[: z.size], by_control[: z.size], by_state[z.size :])
 
 
+@eqx.filter_jit
+def _responses(tangents: Tangents, horizon: int, outputs: int) -> tuple[Array, Array]:
+    """The response to an impulse of added control, and the size of its first change of
+    the observation."""
+    first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
+    # Markov parameters: row j is the response to an impulse j + 1 steps ago.
+    step = lambda z, _: (first.transition @ z, first.output @ z)
+    response = lax.scan(step, first.input, length=horizon)[1]
+    sizes = jnp.sqrt(jnp.sum(response[:, :outputs] ** 2, axis=(1, 2)))
+    # A control may take several steps to show; smaller responses are rounding.
+    slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
+    return response, sizes[jnp.argmax(sizes > slack)]
+
+
 def _equilibrium_tangents(
     dynamics: AbstractDynamics, base: AbstractController
 ) -> Tangents | None:
     """The derivatives at the operating point, at each time if they depend on it; `None`
     if the dynamics define no such point."""
 
-    def at(t, x, u):
-        state = base.init(key=None)
-        u_base, _ = base(t, dynamics.observe(t, x), state)
-        return _tangents(dynamics, base, t, x, state, u - u_base)
-
     if isinstance(dynamics, LinearDynamics) and dynamics.is_time_varying:
         times = (jnp.arange(len(dynamics.A)) * dynamics.dt).astype(dynamics.A.dtype)
+        at = lambda *point: _tangents_at(dynamics, base, *point)
         return jax.vmap(at)(times, dynamics.x_ref, dynamics.u_ref)
     try:
         x, u = dynamics.equilibrium()
     except ValueError:
         return None
-    return at(jnp.zeros((), x.dtype), x, u)
+    return _tangents_at(dynamics, base, jnp.zeros((), x.dtype), x, u)
+
+
+@eqx.filter_jit
+def _tangents_at(dynamics, base, t, x, u) -> Tangents:
+    """The derivatives where the control is `u` and the base is at its start."""
+    state = base.init(key=None)
+    u_base, _ = base(t, dynamics.observe(t, x), state)
+    return _tangents(dynamics, base, t, x, state, u - u_base)
 
 
 def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> int:

@@ -312,6 +312,24 @@ def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None
 
 def _curvature(dynamics, cost, t, x, u, where):
     """The second derivatives of the cost, as weights of a regulator."""
+    H, *weights = _half_hessian(dynamics, cost, t, x, u)
+    if is_concrete(H):
+        H = np.asarray(H, float)
+        # Above the rounding of a Hessian in float32.
+        slack = 1e-6 * np.max(np.abs(H), initial=0)
+        curved = np.all(np.linalg.eigvalsh(H) >= -slack)
+        R = np.asarray(weights[1])
+        if not (curved and np.all(np.linalg.eigvalsh(R) > slack)):
+            raise ValueError(
+                f"{where}: base must be given, for a cost that is not convex, and "
+                "strictly so in u, at the operating point."
+            )
+    return weights
+
+
+@eqx.filter_jit
+def _half_hessian(dynamics, cost, t, x, u):
+    """Half of the second derivatives of the cost, as a whole and in blocks."""
     y, n = dynamics.observe(t, x), x.shape[0]
 
     def charged(z):
@@ -320,17 +338,6 @@ def _curvature(dynamics, cost, t, x, u, where):
         y_here = y + jax.jvp(lambda x: dynamics.observe(t, x), (x,), (z[:n],))[1]
         return cost(t, y_here, u + z[n:])
 
-    # c = dx'Q dx + ...: half of the second derivatives.
     H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
-    Q, R, S = H[:n, :n], H[n:, n:], H[:n, n:]
-    if is_concrete(H):
-        H = np.asarray(H, float)
-        # Above the rounding of a Hessian in float32.
-        slack = 1e-6 * np.max(np.abs(H), initial=0)
-        curved = np.all(np.linalg.eigvalsh(H) >= -slack)
-        if not (curved and np.all(np.linalg.eigvalsh(np.asarray(R)) > slack)):
-            raise ValueError(
-                f"{where}: base must be given, for a cost that is not convex, and "
-                "strictly so in u, at the operating point."
-            )
-    return Q, R, S
+    # c = dx'Q dx + ...
+    return H, H[:n, :n], H[n:, n:], H[:n, n:]
