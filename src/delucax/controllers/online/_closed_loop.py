@@ -1,5 +1,6 @@
 """The plant under its base controller, on top of which a learner acts."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -145,16 +146,9 @@ class ClosedLoop(eqx.Module):
         self.memory = check_count(memory, "memory", where)
         self.response = self.first_response = None
         if tangents is not None:
-            first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
-            # Markov parameters: row j is the response to an impulse j + 1 steps ago.
-            step = lambda z, _: (first.transition @ z, first.output @ z)
-            response = lax.scan(step, first.input, length=self.horizon)[1]
+            p = dynamics.observation_size
+            response, self.first_response = _responses(tangents, self.horizon, p)
             self.response = response if is_constant else None
-            moved = response[:, : dynamics.observation_size]
-            sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
-            # A control may take several steps to show; smaller responses are rounding.
-            slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
-            self.first_response = sizes[jnp.argmax(sizes > slack)]
 
     def __check_init__(self):
         _check_control(self.dynamics, self.base, "ClosedLoop")
@@ -361,17 +355,33 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
     return Tangents(by_state[: z.size], by_control[: z.size], by_state[z.size :])
 
 
+@eqx.filter_jit
+def _responses(tangents, horizon, observation_size):
+    """The response to an impulse, and the size of the first that shows."""
+    first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
+    # Markov parameters: row j is the response to an impulse j + 1 steps ago.
+    step = lambda z, _: (first.transition @ z, first.output @ z)
+    response = lax.scan(step, first.input, length=horizon)[1]
+    sizes = jnp.sqrt(jnp.sum(response[:, :observation_size] ** 2, axis=(1, 2)))
+    # A control may take several steps to show; smaller responses are rounding.
+    slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
+    return response, sizes[jnp.argmax(sizes > slack)]
+
+
+@eqx.filter_jit
+def _tangents_about(dynamics, base, t, x, u):
+    """The derivatives of a loop that begins at a point with this control."""
+    state = base.init(key=None)
+    u_base, _ = base(t, dynamics.observe(t, x), state)
+    return _tangents(dynamics, base, t, x, state, u - u_base)
+
+
 def _equilibrium_tangents(
     dynamics: AbstractDynamics, base: AbstractController
 ) -> Tangents | None:
     """The derivatives at the operating point, at each time if they depend on it; `None`
     if the dynamics define no such point."""
-
-    def at(t, x, u):
-        state = base.init(key=None)
-        u_base, _ = base(t, dynamics.observe(t, x), state)
-        return _tangents(dynamics, base, t, x, state, u - u_base)
-
+    at = functools.partial(_tangents_about, dynamics, base)
     if isinstance(dynamics, LinearDynamics) and dynamics.is_time_varying:
         times = (jnp.arange(len(dynamics.A)) * dynamics.dt).astype(dynamics.A.dtype)
         return jax.vmap(at)(times, dynamics.x_ref, dynamics.u_ref)

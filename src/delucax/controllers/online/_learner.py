@@ -310,8 +310,9 @@ def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None
         raise ValueError(f"{where}: cost must give a scalar, got {got}.")
 
 
-def _curvature(dynamics, cost, t, x, u, where):
-    """The second derivatives of the cost, as weights of a regulator."""
+@eqx.filter_jit
+def _half_hessian(dynamics, cost, t, x, u):
+    """Of the cost, with respect to state and control."""
     y, n = dynamics.observe(t, x), x.shape[0]
 
     def charged(z):
@@ -320,8 +321,13 @@ def _curvature(dynamics, cost, t, x, u, where):
         y_here = y + jax.jvp(lambda x: dynamics.observe(t, x), (x,), (z[:n],))[1]
         return cost(t, y_here, u + z[n:])
 
+    return jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
+
+
+def _curvature(dynamics, cost, t, x, u, where):
+    """The second derivatives of the cost, as weights of a regulator."""
     # c = dx'Q dx + ...: half of the second derivatives.
-    H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
+    H, n = _half_hessian(dynamics, cost, t, x, u), x.shape[0]
     Q, R, S = H[:n, :n], H[n:, n:], H[:n, n:]
     if is_concrete(H):
         H = np.asarray(H, float)
