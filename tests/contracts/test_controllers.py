@@ -122,7 +122,9 @@ def bandit(size):
 
 def build(model):
     cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
-    return c.gpc(model, cost, memory=2, horizon=3)
+    # A base by default is a Riccati equation, which the case `LQR` has.
+    base = c.Linear(FEEDBACK)
+    return c.gpc(model, cost, base=base, memory=2, horizon=3)
 
 
 def explorer(size):
