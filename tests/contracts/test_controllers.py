@@ -49,10 +49,13 @@ def hinfinity(size, horizon=None):
     return c.HInfinity(dynamics, *weights, gamma=100.0, horizon=horizon)
 
 
+def ramp(t):
+    return jnp.stack([0.1 * t, 0.1 + 0 * t])
+
+
 def finite(size):
-    dynamics = dlx.LinearDynamics(A, B, dt=DT)
-    eye, follow = jnp.eye(2), lambda t: jnp.stack([0.1 * t, 0.1 + 0 * t])
-    options = dict(final=size * eye, horizon=12, reference=follow)
+    dynamics, eye = dlx.LinearDynamics(A, B, dt=DT), jnp.eye(2)
+    options = dict(final=size * eye, horizon=12, reference=ramp)
     return c.FiniteHorizonLQR(dynamics, size * eye, jnp.eye(1), **options)
 
 

@@ -225,7 +225,8 @@ def test_hindsight_sees_the_noise_of_the_run():
     again = dlx.rollout(env, found.controller, **options)
     assert_close(found.trajectory.total_cost, again.total_cost, rtol=1e-9)
     assert again.total_cost < played.total_cost
-    short = dlx.rollout(env, learner, keep=("states", "disturbances"), **options)
+    kept = "states", "disturbances"
+    short = dlx.rollout(env, learner.fixed(), keep=kept, **options)
     with user_error(match="trajectory must have its observations"):
         c.best_in_hindsight(env, learner.fixed(), short)
 
