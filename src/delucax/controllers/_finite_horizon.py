@@ -132,7 +132,12 @@ class FiniteHorizonLQR(AbstractController):
 
 
 @eqx.filter_jit
-def _along(dynamics, signals, difference, T):
+def _along(
+    dynamics: LinearDynamics,
+    signals: tuple[Any, Any, Any],
+    difference: Difference | None,
+    T: int,
+) -> tuple[Array, Array, Array]:
     """The references at each step of the horizon, and the residuals of the state's."""
 
     def at(t):
