@@ -325,19 +325,19 @@ def test_online_newton_is_recursive_least_squares():
     J, target = rng.normal(size=(20, k, d)), rng.normal(size=(20, k))
     optimiser = c.online_newton(prior)
     assert optimiser == c.online_newton(prior)
-    theta = jnp.zeros(d)
-    state = optimiser.init(theta)
-    found = []
+    theta, found = np.zeros(d), []
+    state = optimiser.init(jnp.asarray(theta))
+
+    @jax.jit
+    def update(gradient, state, root):
+        # No step is too long.
+        options = dict(curvature=lambda: root, learning_rate=1e3)
+        return optimiser.update(gradient, state, **options)
+
     for A, b in zip(J, target, strict=True):
-        step, state = optimiser.update(
-            jnp.asarray(A.T @ (A @ np.asarray(theta) - b)),
-            state,
-            curvature=lambda A=A: jnp.asarray(A.T),
-            # No step is too long.
-            learning_rate=1e3,
-        )
-        theta = theta + 1e3 * step
-        found.append(np.asarray(theta))
+        step, state = update(A.T @ (A @ theta - b), state, A.T)
+        theta = theta + 1e3 * np.asarray(step)
+        found.append(theta)
     # While the prior follows the mean, all that was seen is rescaled with it.
     sizes = np.sum(J**2, axis=(1, 2))
     means = np.cumsum(sizes) / np.arange(1, 21)
