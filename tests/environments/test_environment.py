@@ -78,12 +78,13 @@ def test_randomise_is_domain_randomisation_without_compiling(key):
 
     keys = jax.random.split(key, 50)
     lengths, masses, costs = map(np.asarray, jax.jit(jax.vmap(cost))(keys))
-    first = traced.count
+    counts = [traced.count]
     assert np.all((lengths >= 0.8) & (lengths <= 1.2)) and len(np.unique(costs)) == 50
     assert_close(np.log(masses).std(), 0.1, rtol=0.3)
     for k in (3, 4):
         assert_close(cost(keys[k])[2], costs[k], rtol=1e-4)
-    assert first == 1 and traced.count == 2
+        counts.append(traced.count)
+    assert counts[0] == 1 and counts[1] == counts[2] <= 2
     with user_error(match="must be a pair"):
         dlx.randomise(env, key, {"dynamics.dt": 1.0})
     with user_error(match="low <= high"):
