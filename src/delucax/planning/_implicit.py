@@ -57,14 +57,13 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
-    return out, nothing._replace(**_tangents(out, *primals, change))
+    return out, nothing._replace(**_tangents(out, primals, change))
 
 
 @products_whole()
-def _tangents(
-    out: Outcome, problem: Problem, start: Start, options: Options, change: Any
-) -> dict[str, Array]:
+def _tangents(out: Outcome, primals: Any, change: Any) -> dict[str, Array]:
     """The tangents of the trajectory, its cost and the gains."""
+    problem, start, options = primals
     # Only what has a tangent is varied below, so that nothing else is differentiated.
     has_tangent = jax.tree.map(
         lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
