@@ -20,7 +20,7 @@ class Case:
 
     - `prepare`: gives what is waited for, and if there is, what comes after it: the
       same for other shapes.
-    - `limit`: seconds that the wait may last, `None` if a ratio is what counts.
+    - `limit`: seconds that the wait may last, if there is a limit.
     - `peer`: the case that does the same without delucax.
     - `at_most`: how many times the peer's wait it may last.
     """
@@ -359,6 +359,76 @@ def mpc():
     mpc = dlx.controllers.MPC(env.dynamics, env.cost, 20, bounds=(-10.0, 10.0))
     x0 = jnp.array([0.1, 0.1, 0.0, 0.0])
     return (lambda: mpc(jnp.asarray(0.0), x0, mpc.init()),)
+
+
+def sampled(planner: str) -> Callable[[], tuple[Thunk, ...]]:
+    """A plan of 50 steps of the pendulum by sampling."""
+
+    def prepare():
+        import jax
+        import jax.numpy as jnp
+
+        import delucax as dlx
+
+        env, key = dlx.make("pendulum"), jax.random.key(0)
+        plan = getattr(dlx.planning, planner)()
+        given = env.dynamics, env.cost, jnp.array([0.5, 0.0]), jnp.zeros((50, 1))
+        return (lambda: plan(*given, bounds=(-2.0, 2.0), key=key),)
+
+    return prepare
+
+
+case("MPPI")(sampled("MPPI"))
+case("CEM")(sampled("CEM"))
+
+
+def repeated(learn: str) -> Callable[[], tuple[Thunk, ...]]:
+    """Runs of a quadrotor in wind, of which the model does not know."""
+
+    def prepare():
+        import jax.numpy as jnp
+
+        import delucax as dlx
+
+        env = dlx.make("planar_quadrotor")
+        plant = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.4)
+        hover = jnp.tile(env.dynamics.equilibrium()[1], (50, 1))
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, env.initial_state, hover)
+        given = plant.dynamics, env.dynamics, env.cost, plan
+        return (lambda: getattr(dlx.planning, learn)(*given, iterations=10),)
+
+    return prepare
+
+
+case("ilc")(repeated("ilc"))
+case("igpc")(repeated("igpc"))
+
+
+def online(learner: str) -> Callable[[], tuple[Thunk, ...]]:
+    """The design of a learner for a double integrator, and an episode of it."""
+
+    def prepare():
+        import jax
+
+        import delucax as dlx
+
+        A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.0], [1.0]])
+        plant = dlx.LinearDynamics(A, B)
+        cost = dlx.costs.Quadratic(np.eye(2), np.eye(1))
+        push = dlx.disturbances.Constant(np.ones(2))
+        env, key = dlx.Environment(plant, cost, disturbance=push), jax.random.key(0)
+        design = getattr(dlx.controllers, learner)
+
+        def answer():
+            return dlx.rollout(env, design(plant, cost), key=key, horizon=99)
+
+        return (answer,)
+
+    return prepare
+
+
+for _learner in ("gpc", "drc", "sfc"):
+    case(f"{_learner} and an episode")(online(_learner))
 
 
 @case("fit, ten steps", peer="Optax by hand, ten steps", at_most=1.3)

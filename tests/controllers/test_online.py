@@ -522,3 +522,12 @@ def test_traced_dynamics_need_a_horizon():
     slope = jax.jit(jax.grad(lambda b: cost(b, horizon=10)))(1.0)
     numeric = (cost(1 + 1e-6, horizon=10) - cost(1 - 1e-6, horizon=10)) / 2e-6
     assert_close(slope, numeric, rtol=1e-5)
+
+
+def test_a_design_compiles_little(caplog):
+    """The derivatives of the cost and of the loop, each as one program."""
+    plant = dlx.LinearDynamics(A, B, dt=0.25)
+    with jax.log_compiles():
+        c.gpc(plant, dlx.costs.Quadratic(2 * Q, R))
+    compiled = [r for r in caplog.records if r.getMessage().startswith("Compiling")]
+    assert len(compiled) <= 6

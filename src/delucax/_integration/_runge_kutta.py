@@ -99,12 +99,12 @@ def runge_kutta_step(
     base = split_state(x)
     slopes: list[Sequence[Array]] = []
     for row, node in zip(rows, nodes, strict=True):
-        stage = join_state(_combine(base, row, slopes, h), size)
+        stage = join_state(_combine(base, row, slopes, h))
         # A time without a sum is exact, and known to be the start of the interval.
         slope = field(t + node * h if node else t, stage)
         # Every component of the next stage needs the whole slope: it is stored once.
         slopes.append(fence(*slope) if size <= COMPONENTS_UP_TO else (slope,))
-    return join_state(_combine(base, weights, slopes, h), size).astype(x.dtype)
+    return join_state(_combine(base, weights, slopes, h)).astype(x.dtype)
 
 
 def _combine(base, weights, slopes, h):

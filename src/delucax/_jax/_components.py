@@ -199,14 +199,14 @@ def _whole(value: Any) -> Any:
     return jnp.stack(value.entries) if isinstance(value, _Components) else value
 
 
-def split_state(x: Array) -> tuple[Array, ...]:
-    """A small state as its components, which is how loops carry it."""
-    return tuple(x) if x.shape[0] <= COMPONENTS_UP_TO else (x,)
+def split_state(x: Array, most: int = COMPONENTS_UP_TO) -> tuple[Array, ...]:
+    """A state of up to `most` components as these, which is how loops carry it."""
+    return tuple(x) if x.shape[0] <= most else (x,)
 
 
-def join_state(parts: tuple[Array, ...], size: int) -> Array:
+def join_state(parts: tuple[Array, ...]) -> Array:
     """The inverse of `split_state`."""
-    return jnp.stack(parts) if size <= COMPONENTS_UP_TO else parts[0]
+    return parts[0] if parts[0].ndim else jnp.stack(parts)
 
 
 def stack_steps(
@@ -230,4 +230,4 @@ def stack_steps(
             jnp.concatenate([a, b[None].astype(a.dtype)])
             for a, b in zip(parts, last, strict=True)
         )
-    return jnp.stack(parts, axis=1) if size <= COMPONENTS_UP_TO else parts[0]
+    return jnp.stack(parts, axis=1) if parts[0].ndim == 1 else parts[0]

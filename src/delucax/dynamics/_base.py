@@ -151,7 +151,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
     def body(parts, inputs):
         k, u, w = inputs
         t = t0 + k * dynamics.dt
-        x_next, result = dynamics.advance(t, join_state(parts, size), u, w)
+        x_next, result = dynamics.advance(t, join_state(parts), u, w)
         return split_state(x_next.astype(x0.dtype)), (parts, or_none(result))
 
     steps = jnp.arange(controls.shape[0])

@@ -255,13 +255,13 @@ class Discretized(AbstractDiscretization):
         def body(parts, index_and_increment):
             i, increment = index_and_increment
             # By i h, and no running sum, whose rounding would grow with the substeps.
-            x_next, result = step(i * h, join_state(parts, x.shape[0]), increment)
+            x_next, result = step(i * h, join_state(parts), increment)
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
         xs = jnp.arange(self.substeps), increments
         # The first failure of a substep is that of the interval.
         parts, results = lax.scan(body, split_state(x), xs)
-        return join_state(parts, x.shape[0]), first_of(results)
+        return join_state(parts), first_of(results)
 
     def _adaptive(self, x, args):
         solver, controller, adjoint = (

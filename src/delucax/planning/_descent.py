@@ -278,7 +278,7 @@ def _searched(problem, options, starts, count, before: _Progress):
 
 
 def first_accepted(
-    trial: Callable[[Array], tuple[Any, Array]], count: int, otherwise: Any
+    trial: Callable[[Array], tuple[Any, Array]], count: Array | int, otherwise: Any
 ) -> tuple[Array, Any, Array]:
     """Try the candidates `0, ..., count - 1` in turn until `trial` accepts one.
 

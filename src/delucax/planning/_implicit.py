@@ -19,6 +19,7 @@ from .._jax import by_lanes, nan_tangent
 from .._results import RESULTS
 from ..math import matvec
 from ..math._linear_solve import full_precision
+from ..math._small import products_whole
 from ._augmented import with_constraints
 from ._descent import Options, Outcome
 from ._lq import (
@@ -51,11 +52,18 @@ def solution(problem: Problem, start: Start, options: Options) -> Outcome:
 @full_precision
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     out = solution(*primals)
-    (problem, start, options), change = primals, tangents[0]
+    change = tangents[0]
     # None is a tangent of zero that is known to be one.
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
+    return out, nothing._replace(**_tangents(out, primals, change))
+
+
+@products_whole()
+def _tangents(out: Outcome, primals: Any, change: Any) -> dict[str, Array]:
+    """The tangents of the trajectory, its cost and the gains."""
+    problem, start, options = primals
     # Only what has a tangent is varied below, so that nothing else is differentiated.
     has_tangent = jax.tree.map(
         lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
@@ -85,7 +93,7 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite
     dX, dU, dK, dJ = (nan_tangent(d, ok) for d in (dX, dU, dK, dJ))
-    return out, nothing._replace(states=dX, controls=dU, gains=dK, cost=dJ)
+    return dict(states=dX, controls=dU, gains=dK, cost=dJ)
 
 
 def _change(

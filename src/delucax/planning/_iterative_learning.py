@@ -19,19 +19,20 @@ from .._check import (
     finite_rows,
 )
 from .._module import as_float_array
-from .._results import choose, RESULTS
+from .._results import choose, Result, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ._descent import first_accepted, LEAST_MU, MOST_MU
+from ._descent import first_accepted, LEAST_MU
 from ._lq import in_sequence, model as local_model, Policy
 from ._plan import Plan
 from ._planner import checked_plan
 from ._problem import Problem, roll_out
 
 
-_MU_GROWTH = 10.0
-"""The growth of the regularisation per pass, until the problem is convex."""
+_MU_GROWTH, _MU_COUNT = 10.0, 18
+"""The growth of the regularisation per pass, until the problem is convex, from 0 and
+`LEAST_MU` to 1e10."""
 _RATE_DECAY = 0.01
 """The factor of the learning rate after a failed search of `igpc`."""
 
@@ -217,57 +218,74 @@ def _learned(
     iterations = check_count(iterations, "iterations", where)
     check_number(step, "step", where)
     check_positive(step, "step", where)
-    x0 = plan.states[0].astype(plan.controls.dtype)
-    t0, bounds = plan.t0.astype(x0.dtype), None
-    if plan.low is not None and plan.high is not None:
-        bounds = plan.low, plan.high
-    # The model has no disturbance: `w` is part of the model mismatch.
-    true = Problem(plant, cost, x0, t0, w, bounds, plan.difference)
-    known = dataclasses.replace(true, dynamics=model, w=None)
     rates = as_float_array(step), as_float_array(rate)
-    out = _iterate(true, known, plan, *rates, iterations, online, bool(anneal))
+    given = plant, model, cost, plan, w
+    out, failure = _iterate(*given, *rates, iterations, online, bool(anneal))
     if not throw:
         return out
-    # That a search failed is no failure here, but how learning usually ends.
-    fine = choose(out.result == RESULTS.diverged, out.result, RESULTS.successful)
-    checked = checked_plan(eqx.tree_at(lambda p: p.result, out, fine), where)
+    checked = checked_plan(eqx.tree_at(lambda p: p.result, out, failure), where)
     return eqx.tree_at(lambda p: p.result, checked, out.result)
 
 
 class _Progress(NamedTuple):
     last: tuple[Array, Array, Array]
     """States, controls and cost of the run to improve."""
+    policy: Policy
+    """The policy by the model's derivatives along that run."""
+    mu: Array
+    """The regularisation of that policy."""
     step: Array
     rate: Array
     runs: Array
     trace: Array
     iteration: Array
+    started: Array
+    """Whether there is a policy to try."""
     done: Array
 
 
 @eqx.filter_jit
-def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan:
-    """Iterate from the first run, which follows the feedback of `plan`."""
+def _iterate(
+    plant, model, cost, plan, w, step, rate, iterations, online, anneal
+) -> tuple[Plan, Result]:
+    """The plan after iterations from the first run, which follows the feedback of
+    `plan`; and whether that run diverged.
+
+    That a search failed is no failure here, but how learning usually ends.
+    """
     dtype = plan.controls.dtype
-    zero = jnp.zeros((), dtype)
+    zero, bounds = jnp.zeros((), dtype), None
     about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
+    if plan.low is not None and plan.high is not None:
+        bounds = plan.low, plan.high
+    # The model has no disturbance: `w` is part of the model mismatch.
+    given = cost, about[0][0], plan.t0.astype(dtype)
+    plant = Problem(plant, *given, w, bounds, plan.difference)
+    model = dataclasses.replace(plant, dynamics=model, w=None)
     # The first run follows the plan's own feedback, without a change.
-    first = roll_out(plant, *about, jnp.zeros_like(plan.controls), zero)
+    unchanged = jnp.zeros_like(plan.controls)
+    first = roll_out(plant, *about, unchanged, zero)
     lost = ~jnp.isfinite(first[2])
 
-    def policy_of(states, controls) -> tuple[Array, Policy]:
-        """The policy by the model's derivatives along a run of the plant, with the
-        least regularisation tried that makes the problem convex."""
+    def policy_of(states, controls, before) -> tuple[Array, Policy]:
+        """The regularisation and the policy by the model's derivatives along a run of
+        the plant, the least one tried that makes the problem convex."""
         stages = local_model(model, states, controls, None, False)
         box = model.room(controls)
-        solved = lambda mu: (mu, in_sequence(stages, mu, False, box))
-        more = lambda now: solved(jnp.maximum(LEAST_MU, _MU_GROWTH * now[0]))
-        concave = lambda now: ~now[1].ok & (now[0] < MOST_MU)
-        return lax.while_loop(concave, more, solved(zero))
+
+        def trial(tried):
+            mu = LEAST_MU * jnp.asarray(_MU_GROWTH, dtype) ** (tried - 1)
+            mu = jnp.where(tried > 0, mu, 0)
+            policy = in_sequence(stages, mu, False, box)
+            return (mu, policy), policy.ok
+
+        return first_accepted(trial, _MU_COUNT, before)[1]
 
     def body(now):
-        states, controls, cost = now.last
-        _, policy = policy_of(states, controls)
+        """A search along the last policy, and the policy about where it led. The first
+        pass has none to search along: the loop has one body, so that it is compiled
+        once."""
+        (states, controls, cost), policy = now.last, now.policy
 
         def trial(tried):
             # One try above the last step, then ever shorter ones: 1.1^(1 - j^2) for
@@ -283,45 +301,53 @@ def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan
             return (length, after), good
 
         last = now.step, now.last
-        tried, (length, after), good = first_accepted(trial, 6 if anneal else 10, last)
+        most = jnp.where(now.started, 6 if anneal else 10, 0)
+        tried, (length, after), good = first_accepted(trial, most, last)
         keep = lambda new, old: jnp.where(good, new, old)
         after = jax.tree.map(keep, after, now.last)
-        iteration = now.iteration + 1
-        ended = iteration >= iterations
-        # Without a rate to lower, a failed search would only fail again.
-        ended = ended if anneal else ended | ~good
+        failed = now.started & ~good
+        iteration = now.iteration + now.started
+        ended = lost | (iteration >= iterations)
+        mu, policy = policy_of(*after[:2], (now.mu, policy))
         return _Progress(
             last=after,
+            policy=policy,
+            mu=mu,
             step=keep(length, now.step),
-            rate=keep(now.rate, _RATE_DECAY * now.rate) if anneal else now.rate,
+            rate=jnp.where(failed, _RATE_DECAY * now.rate, now.rate),
             runs=now.runs + tried,
             trace=now.trace.at[iteration].set(after[2]),
             iteration=iteration,
-            done=ended,
+            started=~lost,
+            # Without a rate to lower, a failed search would only fail again.
+            done=ended if anneal else ended | failed,
         )
 
     step, rate = (jnp.asarray(number, dtype) for number in (step, rate))
     trace, count = jnp.full((iterations + 1,), first[2]), jnp.asarray(0)
-    start = _Progress(first, step, rate, count + 1, trace, count, done=lost)
+    no = jnp.asarray(False)
+    policy = Policy(about[2], unchanged, unchanged, zero, zero, zero, no)
+    start = _Progress(
+        first, policy, zero, step, rate, count + 1, trace, count, started=no, done=no
+    )
     end = lax.while_loop(lambda now: ~now.done, body, start)
-    # Once more about the best run, for the gains and the residual of the plan.
     states, controls, cost = end.last
-    mu, policy = policy_of(states, controls)
     reached = jnp.arange(iterations + 1) <= end.iteration
     early = end.iteration < iterations
     result = choose(early, RESULTS.no_descent, RESULTS.successful)
-    return plant.plan(
+    learned = plant.plan(
         states,
         controls,
         cost,
-        gains=policy.K,
+        gains=end.policy.K,
         trace=jnp.where(reached, end.trace, cost),
-        residual=jnp.max(jnp.abs(policy.gradient)),
+        residual=jnp.max(jnp.abs(end.policy.gradient)),
         result=choose(lost, RESULTS.diverged, result),
         iterations=end.iteration,
         rollouts=end.runs,
-        regularisation=mu,
+        regularisation=end.mu,
     )
+    return learned, choose(lost, RESULTS.diverged, RESULTS.successful)
 
 
 def _perturbed(plant, model, states, controls, policy, length, rate, online):

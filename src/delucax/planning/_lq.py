@@ -57,6 +57,7 @@ class Policy(NamedTuple):
     ok: Array
 
 
+@products_whole()
 def model(
     problem: Problem,
     states: Array,
@@ -126,6 +127,7 @@ def model(
     return jax.tree.map(lambda a: a.astype(states.dtype), stages)
 
 
+@full_precision
 def expanded(
     cost: Callable[..., Array],
     constraints: Callable[..., Values],
@@ -146,15 +148,14 @@ def expanded(
         c, equal = constraints(z, *rest)
         return c, (c, equal)
 
-    with products_whole(), jax.default_matmul_precision("highest"):
-        H, h = jax.jacfwd(slope, has_aux=True)(z)
-        if y is None or rho is None:
-            return h, H, None
-        J, (c, equal) = jax.jacfwd(values, has_aux=True)(z)
-        force = y + rho * c
-        active = equal | (force > 0)
-        force, J = jnp.where(active, force, 0), jnp.where(active[:, None], J, 0)
-        return h + force @ J, H + rho * J.T @ J, force
+    H, h = jax.jacfwd(slope, has_aux=True)(z)
+    if y is None or rho is None:
+        return h, H, None
+    J, (c, equal) = jax.jacfwd(values, has_aux=True)(z)
+    force = y + rho * c
+    active = equal | (force > 0)
+    force, J = jnp.where(active, force, 0), jnp.where(active[:, None], J, 0)
+    return h + force @ J, H + rho * J.T @ J, force
 
 
 def costates_of(F: Array, h: Array, v: Array) -> Array:

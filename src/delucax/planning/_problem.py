@@ -1,6 +1,7 @@
 """The planning problem: dynamics, a cost, constraints; its trajectories."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -18,6 +19,10 @@ from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._small import products_whole
 from ._plan import Plan
+
+
+_SPLIT_UP_TO = 6
+"""Trajectories of more components are as fast in one piece, and a shorter program."""
 
 
 class Constraints(eqx.Module):
@@ -326,13 +331,14 @@ def roll_out(
     The cost is infinite if a step fails or a number is not finite.
     """
     size = problem.x0.shape[0]
+    split = functools.partial(split_state, most=_SPLIT_UP_TO)
 
     # The state is carried by its components, as in `delucax.rollout`: most of the time
     # of a planner is spent here.
     @by_components
     def body(parts, inputs):
         t, planned, u, K, k, defect, w = inputs
-        x = join_state(parts, size)
+        x = join_state(parts)
         # Omitted terms are not computed, rather than added as zeros.
         if k is not None:
             u = u - length * k
@@ -345,11 +351,11 @@ def roll_out(
         # the trajectory stays near the guess of the states.
         if defect is not None:
             x_next = x_next - (1 - length) * defect
-        return split_state(x_next), (parts, u, or_none(result))
+        return split(x_next), (parts, u, or_none(result))
 
     times = problem.times(controls.shape[0])[:-1]
     inputs = (times, states[:-1], controls, K, k, defects, problem.w)
-    last, (parts, controls, results) = lax.scan(body, split_state(problem.x0), inputs)
+    last, (parts, controls, results) = lax.scan(body, split(problem.x0), inputs)
     states = stack_steps(parts, size, last)
     # All states are checked, because a cost may ignore some of them, or clip them.
     cost = problem.total(states, controls)

@@ -184,7 +184,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         k, w, noise = inputs
         # By a product: a sum of steps would be rounded anew at each of them.
         t = (k * dt).astype(dtype)
-        x = join_state(parts, size)
+        x = join_state(parts)
         # The same value, with `decay` times its derivative.
         if decay is not None:
             x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
@@ -232,7 +232,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         if done is not None:
             incidents = {name: now & ~done for name, now in incidents.items()}
             cost, applied = jnp.where(done, 0, cost), jnp.where(done, 0, applied)
-            x_next = jnp.where(done, join_state(parts, size), x_next)
+            x_next = jnp.where(done, join_state(parts), x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
             # A result that is statically a success stays one, and costs nothing.
             if result is not RESULTS.successful:
@@ -262,7 +262,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
     inputs = (jnp.arange(horizon), w, noise)
     carry, (kept, results) = _scan(body, carry, inputs, horizon, checkpoint)
     parts, last, ended, total = carry
-    final_state = join_state(parts, size)
+    final_state = join_state(parts)
 
     def over_time(name: str, size: int, last: Any = ()) -> Any:
         values = kept.get(name)
