@@ -59,7 +59,9 @@ def smith(
         relative = relative_size(change, X)
         return X, tuple(matmul(power, power) for power in powers), relative, k + 1
 
-    start = (C, powers, xp.asarray(xp.inf, C.dtype), xp.asarray(0))
+    # Nothing is to be done where C is zero, as at the start of a refinement.
+    unknown = xp.where(largest(C) != 0, xp.asarray(xp.inf, C.dtype), 0)
+    start = (C, powers, unknown, xp.asarray(0))
     X, *_, iterations = while_loop(more, body, start)
     return X, iterations
 
@@ -94,7 +96,7 @@ def stable_sylvester(
         return X, left_over, residual, iterations + steps, going, k + 1
 
     unknown, zero = xp.asarray(xp.inf, C.dtype), xp.asarray(0)
-    start = xp.zeros_like(C), C, unknown, zero, xp.asarray(True), zero
+    start = xp.zeros_like(C), C, unknown, zero, largest(C) != 0, zero
     X, _, _, iterations, *_ = while_loop(more, body, start)
     return X, iterations
 
