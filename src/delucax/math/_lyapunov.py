@@ -16,15 +16,21 @@ MAX_DOUBLINGS = 60
 """2**60 steps: a spectral radius closer to 1 is not resolved in float64."""
 
 
-def lyapunov(discrete: bool, A: Square, Q: Square) -> Square:
+def lyapunov(
+    discrete: bool, A: Square, Q: Square, refinements: int = _REFINEMENTS
+) -> Square:
     """The solution of `A'X + XA + Q = 0`, or in discrete time of `X = A'XA + Q`, for a
-    stable `A`.
+    stable `A`; in continuous time with at most so many refinements.
 
     It is differentiated as the linear solve that it is, to any order and in either
     mode.
     """
-    equation = smith if discrete else stable_sylvester
-    solved = lambda A: lambda _, right: equation(A, None, right)[0]
+
+    def solved(A):
+        if discrete:
+            return lambda _, right: smith(A, None, right)[0]
+        return lambda _, right: stable_sylvester(A, None, right, refinements)[0]
+
     # The transposed equation is that of A'. The doubling is never differentiated.
     return lax.custom_linear_solve(
         lambda X: X - A.T @ X @ A if discrete else A.T @ X + X @ A,
@@ -67,7 +73,10 @@ def smith(
 
 
 def stable_sylvester(
-    A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+    A: Square,
+    B: Float[Array, "m m"] | None,
+    C: Float[Array, "n m"],
+    refinements: int = _REFINEMENTS,
 ) -> tuple[Float[Array, "n m"], Array]:
     """`A X + X B = C` for stable `A` and `B` (default `A'`), and the steps taken.
 
@@ -79,7 +88,7 @@ def stable_sylvester(
 
     def more(carry):
         *_, going, k = carry
-        return going & (k <= _REFINEMENTS)
+        return going & (k <= refinements)
 
     def body(carry):
         X, rest, residual, iterations, _, k = carry
