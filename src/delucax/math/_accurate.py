@@ -38,25 +38,23 @@ def _term_by_term(left, right, *added):
     Source: Ogita, Rump and Oishi, 2005.
     """
     eps, k = xp.finfo(left.dtype).eps, left.shape[1]
-    nothing = xp.zeros((len(left), right.shape[1]), left.dtype)
-    total, *added = added or (nothing,)
-    off, size = nothing, xp.abs(total)
+    column, row = left[:, :, None], right[None]
+    (high, low), (high_row, low_row) = _halves(column), _halves(row)
+    # Products without rounding: no fused operation changes these sums.
+    middle, off = _sum(high * low_row, low * high_row)
+    term, error = _sum(high * high_row, middle)
+    off = off + error + low * low_row
+
+    def add(one, other):
+        total, error = _sum(one[0], other[0])
+        return total, one[1] + other[1] + error, one[2] + other[2]
+
+    # A reduction is one loop, even of a batch, and nothing in it is stored.
+    terms, zero = (term, off, xp.abs(term)), xp.zeros((), left.dtype)
+    total, off, size = lax.reduce(terms, (zero, zero, zero), add, (1,))
     for part in added:
         total, error = _sum(total, part)
         off, size = off + error, size + xp.abs(part)
-
-    def add(carry, factors):
-        total, off, size = carry
-        column, row = factors
-        (high, low), (high_row, low_row) = _halves(column[:, None]), _halves(row)
-        # Products without rounding: no fused operation changes these sums.
-        for part in high * high_row, high * low_row, low * high_row:
-            total, error = _sum(total, part)
-            off = off + error
-        off = off + low * low_row
-        return (total, off, size + xp.abs(column[:, None] * row)), None
-
-    (total, off, size), _ = scan(add, (total, off, size), (left.T, right))
     total = total + off
     return total, eps * xp.abs(total) + (4 * (k + len(added) + 1) * eps) ** 2 * size
 

@@ -16,15 +16,21 @@ MAX_DOUBLINGS = 60
 """2**60 steps: a spectral radius closer to 1 is not resolved in float64."""
 
 
-def lyapunov(discrete: bool, A: Square, Q: Square) -> Square:
+def lyapunov(
+    discrete: bool, A: Square, Q: Square, refinements: int = _REFINEMENTS
+) -> Square:
     """The solution of `A'X + XA + Q = 0`, or in discrete time of `X = A'XA + Q`, for a
-    stable `A`.
+    stable `A`; in continuous time with at most so many refinements.
 
     It is differentiated as the linear solve that it is, to any order and in either
     mode.
     """
-    equation = smith if discrete else stable_sylvester
-    solved = lambda A: lambda _, right: equation(A, None, right)[0]
+
+    def solved(A):
+        if discrete:
+            return lambda _, right: smith(A, None, right)[0]
+        return lambda _, right: stable_sylvester(A, None, right, refinements)[0]
+
     # The transposed equation is that of A'. The doubling is never differentiated.
     return lax.custom_linear_solve(
         lambda X: X - A.T @ X @ A if discrete else A.T @ X + X @ A,
@@ -59,13 +65,18 @@ def smith(
         relative = relative_size(change, X)
         return X, tuple(matmul(power, power) for power in powers), relative, k + 1
 
-    start = (C, powers, xp.asarray(xp.inf, C.dtype), xp.asarray(0))
+    # Nothing is to be done where C is zero, as at the start of a refinement.
+    unknown = xp.where(largest(C) != 0, xp.asarray(xp.inf, C.dtype), 0)
+    start = (C, powers, unknown, xp.asarray(0))
     X, *_, iterations = while_loop(more, body, start)
     return X, iterations
 
 
 def stable_sylvester(
-    A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+    A: Square,
+    B: Float[Array, "m m"] | None,
+    C: Float[Array, "n m"],
+    refinements: int = _REFINEMENTS,
 ) -> tuple[Float[Array, "n m"], Array]:
     """`A X + X B = C` for stable `A` and `B` (default `A'`), and the steps taken.
 
@@ -77,7 +88,7 @@ def stable_sylvester(
 
     def more(carry):
         *_, going, k = carry
-        return going & (k <= _REFINEMENTS)
+        return going & (k <= refinements)
 
     def body(carry):
         X, rest, residual, iterations, _, k = carry
@@ -94,7 +105,7 @@ def stable_sylvester(
         return X, left_over, residual, iterations + steps, going, k + 1
 
     unknown, zero = xp.asarray(xp.inf, C.dtype), xp.asarray(0)
-    start = xp.zeros_like(C), C, unknown, zero, xp.asarray(True), zero
+    start = xp.zeros_like(C), C, unknown, zero, largest(C) != 0, zero
     X, _, _, iterations, *_ = while_loop(more, body, start)
     return X, iterations
 

@@ -4,10 +4,11 @@ from typing import Any
 
 from jaxtyping import ArrayLike
 
-from .._jax import lax, xp
+from .._jax import lax, on_host, xp
 from .._typing import Array
 
 
+_SMALL = 16
 ULPS = 4
 """The rounding error of a residual `F(x) - x`, in units of the last place of `x`."""
 
@@ -79,14 +80,15 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
 
 def size(matrix: Array) -> Array:
     """The Frobenius norm."""
-    # Scaled by the largest entry, whose square may overflow or underflow.
-    scale = _divisor(xp.max(xp.abs(matrix)))
-    return scale * _norm(matrix / scale)
+    unit = _unit(matrix)
+    return _norm(matrix * unit) / unit
 
 
 def largest(matrix: Array) -> Array:
     """The size of the largest entry."""
-    return xp.max(xp.abs(matrix))
+    if _is_large(matrix):
+        return abs(matrix).max()
+    return _reduced(lambda a, b: lax.max(xp.abs(a), xp.abs(b)), matrix, matrix.ndim)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
@@ -97,9 +99,11 @@ def relative_size(error: Array, *terms: Array) -> Array:
 def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
     """The norm of an equation's residual, or of a stack of residuals, over the sum of
     the norms of its stacked terms; and this sum."""
-    scale = _divisor(xp.max(xp.abs(terms)))
-    total = xp.sum(_norm(terms / scale))
-    return _norm(error / scale) / _divisor(total), scale * total
+    unit = _unit(terms)
+    total = xp.sum(_norm(terms * unit))
+    # `lax.max` propagates NaN, as a comparison would not.
+    divisor = lax.max(total, xp.finfo(total.dtype).tiny)
+    return _norm(error * unit) / divisor, total / unit
 
 
 def one_if_zero(x: Array) -> Array:
@@ -107,13 +111,32 @@ def one_if_zero(x: Array) -> Array:
     return x + (x == 0)
 
 
-def _divisor(x):
-    # `lax.max` propagates NaN, as a comparison would not.
-    return lax.max(x, xp.finfo(x.dtype).tiny)
+def _unit(matrix):
+    """A factor for entries whose squares may overflow or underflow. It makes the
+    largest one 4, as the reciprocal of a number of any size may itself underflow."""
+    return 4 / lax.max(largest(matrix), 2 * xp.finfo(matrix.dtype).tiny)
 
 
 def _norm(matrix):
-    return xp.sqrt(xp.sum(matrix * matrix, axis=(-2, -1)))
+    squares = matrix * matrix
+    if _is_large(matrix):
+        return xp.sqrt(xp.sum(squares, axis=(-2, -1)))
+    return xp.sqrt(_reduced(lambda a, b: xp.abs(a) + xp.abs(b), squares, 2))
+
+
+def _is_large(matrix):
+    return on_host() or matrix.shape[-1] > _SMALL
+
+
+def _reduced(join, array, axes):
+    """A reduction of so many last axes, of few entries.
+
+    XLA on CPU hands a plain sum or maximum to a library with a pool of threads, which
+    takes twice as long to compile, and for a batch of small matrices to run. It does
+    not know these operations, which are those of numbers that are not negative.
+    """
+    last = range(array.ndim)[-axes:]
+    return lax.reduce(array, xp.zeros((), array.dtype), join, tuple(last))
 
 
 def power_of_two(x: Array) -> Array:

@@ -103,8 +103,8 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
     def body(carry):
         before, _, k = carry
         after = composed(before, before)
-        # NaN and infinity, times zero, are NaN, which a sum keeps.
-        finite = xp.sum(0 * sum(after)) == 0
+        # NaN and infinity, times zero, are NaN, which is kept.
+        finite = largest(0 * sum(after)) == 0
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(

@@ -259,7 +259,8 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     J, iterations = double(element, X0 / unit)
     left = newton_refine(
         lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
-        functools.partial(_correction, discrete),
+        # The next step corrects what this one leaves: no refinement.
+        lambda *at: _correction(discrete, *at, 0),
         X0 + unit * J,
         controls=data.B.shape[1],
         units=1,
@@ -301,7 +302,7 @@ def _element(discrete, data, problem, gamma, X0):
     return short_element(H, 0.5 / one_if_zero(xp.linalg.norm(H))), unit
 
 
-def _correction(discrete, X, loop, error):
+def _correction(discrete, X, loop, error, *refinements):
     """The Newton step for an `error` of the equation.
 
     In continuous time it is solved in coordinates in which `X` is the identity: near
@@ -317,7 +318,8 @@ def _correction(discrete, X, loop, error):
     root = xp.where(xp.all(xp.isfinite(root)), root, eye)
     loop = solve(root, (root.T @ loop).T).T
     error = solve(root, solve(root, error).T)
-    return symmetric(root @ lyapunov(False, loop, symmetric(error)) @ root.T)
+    change = lyapunov(False, loop, symmetric(error), *refinements)
+    return symmetric(root @ change @ root.T)
 
 
 @functools.partial(custom_jvp, nondiff_argnums=(0,))

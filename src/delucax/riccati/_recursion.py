@@ -162,10 +162,10 @@ def composed(first: Element, second: Element) -> Element:
     n = A1.shape[0]
     eye = xp.eye(n, dtype=A1.dtype)
     solved = solve(eye + matmul(C1, J2), xp.concatenate([A1, C1], axis=1))
-    moved, weighted = solved[:, :n], solved[:, n:]
-    C = symmetric(C2 + matmul(matmul(A2, weighted), A2.T))
-    J = J1 + symmetric(matmul(A1.T, matmul(J2, moved)))
-    return matmul(A2, moved), C, J
+    after = matmul(A2, solved)
+    C = symmetric(C2 + matmul(after[:, n:], A2.T))
+    J = J1 + symmetric(matmul(A1.T, matmul(J2, solved[:, :n])))
+    return after[:, :n], C, J
 
 
 def linear_recursion(loop, added, final, parallel: bool, product):

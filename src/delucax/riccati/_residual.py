@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Float
 
-from .._jax import matmul, numbers, on_host, vmap, while_loop, xp
+from .._jax import matmul, numbers, vmap, while_loop, xp
 from .._typing import Array, BoolScalar, Scalar, Square
 from ..math._accurate import product, product_in_parts, units_of_sum
 from ..math._linear_solve import solve, symmetric
@@ -259,27 +259,16 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     rows.append((whole, Q, X if discrete and E is None else nothing, nothing))
     factors, added, subtracted, factor = zip(*rows, strict=True)
     factor = xp.concatenate(factor)
-    if is_small(B) and not on_host():
-        # One product of block matrices compiles sooner. For larger ones it would mix
-        # blocks of different sizes, which the slices of a product do not like.
-        left = xp.concatenate([_block_row(right, blocks) for blocks in factors])
-        value, rounding = product(
-            left,
-            xp.concatenate([*right.values()]),
-            xp.concatenate(added),
-            -xp.concatenate(subtracted),
+    pairs = [
+        product(
+            xp.concatenate([*blocks.values()], axis=1),
+            xp.concatenate([right[name] for name in blocks]),
+            plus,
+            -minus,
         )
-    else:
-        pairs = [
-            product(
-                xp.concatenate([*blocks.values()], axis=1),
-                xp.concatenate([right[name] for name in blocks]),
-                plus,
-                -minus,
-            )
-            for blocks, plus, minus, _ in rows
-        ]
-        value, rounding = (xp.concatenate(M) for M in zip(*pairs, strict=True))
+        for blocks, plus, minus in zip(factors, added, subtracted, strict=True)
+    ]
+    value, rounding = (xp.concatenate(M) for M in zip(*pairs, strict=True))
     rest, rest_lost, factor = value[:-n], rounding[:-n], factor[:-n].T
     sizes = xp.abs(rest)
     most = sizes + rest_lost
@@ -297,14 +286,6 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
         lost, around = lost + 2 * n * error_L * beside, around + beside
     gap_lost = matmul(xp.abs(B.T), around) + most[n : n + m] + (n + 4) * eps * xp.abs(T)
     return _Left(symmetric(error), symmetric(lost), matmul(B.T, Y) + T, gap_lost)
-
-
-def _block_row(columns: dict[str, Array], blocks: dict[str, Array]) -> Array:
-    """The blocks beside each other, zero where there is none."""
-    (height, dtype), *_ = ((len(M), M.dtype) for M in blocks.values())
-    nothing = (xp.zeros((height, len(M)), dtype) for M in columns.values())
-    pairs = zip(columns, nothing, strict=True)
-    return xp.concatenate([blocks.get(name, zero) for name, zero in pairs], axis=1)
 
 
 def _twice(M):

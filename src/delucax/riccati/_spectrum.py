@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from .._jax import fori_loop, matmul, while_loop, xp
+from .._jax import matmul, while_loop, xp
 from .._typing import BoolScalar, Scalar, Square
-from ..math._norms import power_of_two, size
+from ..math._norms import largest, power_of_two, size
 
 
 _SQUARINGS = 60
@@ -17,6 +17,7 @@ _LARGE = 16
 """From here on it pays to look for the few directions that a power has left."""
 _BLOCK = 4
 _TAYLOR_DEGREE = 12
+_SWEEPS = 24
 
 
 def spectral_radius(A: Square) -> Scalar:
@@ -108,21 +109,28 @@ def _growth(A, probing, limit=None):
     probes = np.random.default_rng(0).normal(size=(n, count)) if probing else 0.0
     probes = xp.asarray(probes, dtype)
 
+    def above(logarithm, weight):
+        # |A| is at most n times the largest entry; the weight is of the next power.
+        return logarithm + 2 * weight * math.log(n)
+
     def more(carry):
         *_, logarithm, weight, finished = carry
         # N = 1 / weight: for a log cond of up to 64 the bound is this close.
         rough = 64 * weight > _DIGITS * xp.maximum(xp.abs(logarithm), eps)
         if limit is not None:
-            rough = rough & (logarithm >= limit) & (logarithm - 64 * weight <= limit)
+            bound = above(logarithm, weight)
+            rough = rough & (bound >= limit) & (bound - 64 * weight <= limit)
         return ~finished & rough & (weight > 0.5**_SQUARINGS)
 
     def body(carry):
         power, span, kept, logarithm, weight, _ = carry
-        grown = size(power)
+        grown = largest(power)
         # A nilpotent matrix, whose radius is zero: no power of it is scaled any more.
         finished = ~(grown > 0)
-        scaled = power / xp.where(finished, 1, grown)
-        # log |A^2N| / 2N is this sum, as each square is of a matrix of norm one.
+        scaled = power * (1 / xp.where(finished, 1, grown))
+        # log |A^2N| / 2N is this sum, as each square is of a matrix of norm one. The
+        # norm is the largest entry, which for the flow of a short time is nearly one:
+        # logarithms of others would cancel.
         logarithm = logarithm + weight * xp.log(grown)
         if probing:
             # A basis of the range of the power, as the probes see it. What is as small
@@ -131,14 +139,15 @@ def _growth(A, probing, limit=None):
             pivots = xp.abs(xp.diagonal(triangle))
             kept = pivots > math.sqrt(eps) * xp.max(pivots)
             span = xp.where(kept, basis, 0)
-            left = size(scaled - span @ (span.T @ scaled))
+            left = largest(scaled - span @ (span.T @ scaled))
             finished = finished | (left < 4 * math.sqrt(n) * eps)
         return matmul(scaled, scaled), span, kept, logarithm, weight / 2, finished
 
     zero, one = xp.zeros((), dtype), xp.ones((), dtype)
     start = (A, probes, xp.zeros(count, bool), zero, one, xp.asarray(False))
-    _, span, kept, logarithm, _, finished = while_loop(more, body, start)
-    return logarithm, finished & xp.isfinite(logarithm), span, kept
+    _, span, kept, logarithm, weight, finished = while_loop(more, body, start)
+    narrow = finished & xp.isfinite(logarithm)
+    return above(logarithm, weight), narrow, span, kept
 
 
 def balanced(A: Square) -> Square:
@@ -147,7 +156,12 @@ def balanced(A: Square) -> Square:
     Powers of two, so that no digit is lost. Source: Osborne, 1960.
     """
 
-    def sweep(_, scale):
+    def more(carry):
+        k, _, ratio = carry
+        return (k < _SWEEPS) & (xp.max(xp.abs(xp.log2(ratio))) > 1)
+
+    def sweep(carry):
+        k, scale, _ = carry
         scaled = xp.abs(A) * scale[None, :] / scale[:, None]
         off = scaled - xp.diag(xp.diagonal(scaled))
         rows, columns = xp.sum(off, axis=1), xp.sum(off, axis=0)
@@ -156,10 +170,11 @@ def balanced(A: Square) -> Square:
         ratio = xp.where(usable, rows, 1) / xp.where(usable, columns, 1)
         # All at once: half of the step that each would take alone.
         scale = scale * ratio**0.25
-        return scale / xp.exp2(xp.round(xp.mean(xp.log2(scale))))
+        return k + 1, scale / xp.exp2(xp.round(xp.mean(xp.log2(scale)))), ratio
 
-    # A fixed number of sweeps: balancing need not be exact.
-    scale = fori_loop(0, 24, sweep, xp.ones(A.shape[0], A.dtype))
+    # Balancing need not be exact.
+    one = xp.ones(A.shape[0], A.dtype)
+    _, scale, _ = while_loop(more, sweep, (0, one, 4 * one))
     usable = xp.isfinite(scale) & (scale > 0)
     scale = power_of_two(xp.where(usable, scale, 1))
     return A * scale[None, :] / scale[:, None]
