@@ -1,7 +1,11 @@
 """What the numbers were measured on: the header of a results file."""
 
+import argparse
 import os
 import platform
+import subprocess
+import sys
+from collections.abc import Callable
 from datetime import datetime, UTC
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,16 +25,40 @@ def limit_cores(count: int) -> None:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
 
 
-PINNED = "One core, no threads for products"
-"""The setting that says what the arithmetic costs; users run with the defaults."""
+RESULTS = Path(__file__).parent / "results"
+FOLDERS = {"defaults": RESULTS, "pinned": RESULTS / "pinned"}
+"""Where each setting's results go. `defaults` is what a user has who sets nothing;
+`pinned` says what the arithmetic costs, on one core without threads for products."""
+INSIDE = "DELUCAX_BENCHMARK_SETTING"
 
 
-def pinned_environment() -> dict[str, str]:
-    """The environment of a process whose products have no threads; the process calls
-    `limit_cores(1)`."""
-    names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+def run_in_settings(
+    parser: argparse.ArgumentParser,
+    measure: Callable[[argparse.Namespace, Path], None],
+) -> None:
+    """Run `measure(options, folder)` under both settings, or under the one asked for.
+
+    Each is a process of its own, as threads are set when JAX and BLAS start.
+    """
+    parser.add_argument("--setting", choices=tuple(FOLDERS), help="one alone")
+    options = parser.parse_args()
+    inside = os.environ.get(INSIDE)
+    if inside:
+        if inside == "pinned":
+            limit_cores(1)
+        folder = FOLDERS[inside]
+        folder.mkdir(parents=True, exist_ok=True)
+        measure(options, folder)
+        return
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"
-    return os.environ | dict.fromkeys(names, "1") | {"XLA_FLAGS": flags.strip()}
+    names = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+    one_thread = dict.fromkeys(names, "1") | {"XLA_FLAGS": flags.strip()}
+    for name in [options.setting] if options.setting else FOLDERS:
+        print(f"\n===== {name} =====", flush=True)
+        changed = (one_thread if name == "pinned" else {}) | {INSIDE: name}
+        command = [sys.executable, *sys.orig_argv[1:]]
+        if code := subprocess.run(command, env=os.environ | changed).returncode:
+            sys.exit(code)
 
 
 def keep_programs() -> None:

@@ -2,7 +2,8 @@
 Gymnasium, in one run.
 
 Prints three tables and writes `benchmarks/results/environments.json`, of which
-`--table` prints those of `docs/benchmarks.md`. The pendulum has a command of its own,
+`--table` prints those of `docs/benchmarks.md`, and the same pinned to one core in
+`pinned/`. The pendulum has a command of its own,
 `benchmarks.pendulum`:
 
 - the whole of delucax against a raw `lax.scan` of the task's own vector field;
@@ -18,13 +19,13 @@ from typing import Any
 import pandas as pd
 
 from benchmarks import _adapter, _tasks
-from benchmarks._machine import compile_anew, describe, limit_cores
+from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._peers import gymnax_peer
 from benchmarks._problem import Episodes
 from benchmarks._timing import Contender, Missing, race, Timing
 
 
-RESULTS = Path(__file__).parent / "results"
+OUT = Path(__file__).parent / "results" / "environments.json"
 LANES = 1024
 # The starts are the same, and so is the arithmetic but for rounding.
 TOLERANCE = 1e-3
@@ -232,22 +233,8 @@ def _markdown(titles: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
 
 
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.environments")
-    parser.add_argument("--rounds", type=int, default=11)
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--tasks", nargs="*", help="these alone, and no file")
-    parser.add_argument("--out", default=str(RESULTS / "environments.json"))
-    parser.add_argument("--cores", type=int, default=1, help="cores to run on")
-    parser.add_argument(
-        "--table", action="store_true", help="run nothing, print the tables of --out"
-    )
-    options = parser.parse_args()
-    if options.table:
-        print(documented(json.loads(Path(options.out).read_text())))
-        return
-    limit_cores(options.cores)
+def measure(options: argparse.Namespace, folder: Path) -> None:
+    """Measure, print and write."""
     compile_anew()
     rounds = 3 if options.quick else options.rounds
     chain, batch = (5_000, 50) if options.quick else (50_000, 200)
@@ -269,8 +256,7 @@ def main() -> None:
     print("\nThe worst of each kind")
     print(pd.DataFrame(summary).to_string(index=False, float_format="%.2f"))
     if not options.quick and options.tasks is None:
-        out = Path(options.out)
-        out.parent.mkdir(parents=True, exist_ok=True)
+        out = folder / OUT.name
         content = {
             "machine": describe(),
             "gymnax version": gymnax_peer.versions(),
@@ -279,6 +265,21 @@ def main() -> None:
         }
         out.write_text(json.dumps(content, indent=1) + "\n")
         print(f"\nwritten: {out}")
+
+
+def main() -> None:
+    """Run under both settings."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.environments")
+    parser.add_argument("--rounds", type=int, default=11)
+    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
+    parser.add_argument("--tasks", nargs="*", help="these alone, and no file")
+    parser.add_argument(
+        "--table", action="store_true", help="run nothing, print the tables"
+    )
+    if parser.parse_known_args()[0].table:
+        print(documented(json.loads(OUT.read_text())))
+        return
+    run_in_settings(parser, measure)
 
 
 if __name__ == "__main__":

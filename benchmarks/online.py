@@ -2,7 +2,8 @@
 
 Speed in single precision; then, in double precision, the double integrator at the
 defaults, 20 plants at random, the values that were published for GPC, DRC and AdaGPC,
-and the plant that switches. Prints tables, and writes `benchmarks/results/online.json`.
+and the plant that switches. Prints tables, and writes `benchmarks/results/online.json`,
+and the speed pinned to one core in `pinned/`.
 
 The limits were written before the first run. The learners have their defaults unless a
 row says otherwise; nothing was tuned on these seeds and plants.
@@ -23,11 +24,10 @@ import pandas as pd
 from jaxtyping import Array
 
 import delucax as dlx
-from benchmarks._machine import compile_anew, describe, limit_cores
+from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._timing import compiled, race
 
 
-RESULTS = Path(__file__).parent / "results" / "online.json"
 LIMITS = {
     "GPC, us a step": 3.0,
     "AdaGPC, us a step": 10.0,
@@ -373,13 +373,9 @@ def switching(seeds: int) -> tuple[Table, list[dict[str, Any]]]:
     return table, rows
 
 
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.online")
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--part", choices=PARTS, help="one table alone, again")
-    options = parser.parse_args()
-    limit_cores(1)
+def measure(options: argparse.Namespace, folder: Path) -> None:
+    """Measure, print and write."""
+    out = folder / "online.json"
     compile_anew()
     quick = options.quick
     seeds = 4 if quick else SEEDS
@@ -393,16 +389,26 @@ def main() -> None:
     }
     content: dict[str, Any] = {"seeds": seeds, "limits": LIMITS}
     if options.part is not None:
-        content = json.loads(RESULTS.read_text())
+        content = json.loads(out.read_text()) if out.exists() else content
         parts = {options.part: parts[options.part]}
+    elif folder.name == "pinned":
+        parts = {"speed": parts["speed"]}
     for name, part in parts.items():
         jax.config.update("jax_enable_x64", name != "speed")
         table, rows = part()
         checks = {"checks": table.rows, "rows": rows}
         content[name] = {"machine": describe()} | checks
     if not quick:
-        RESULTS.write_text(json.dumps(content, indent=1) + "\n")
-        print(f"\nwritten: {RESULTS}")
+        out.write_text(json.dumps(content, indent=1) + "\n")
+        print(f"\nwritten: {out}")
+
+
+def main() -> None:
+    """Run under both settings; the costs of the learners are those of the first."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.online")
+    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
+    parser.add_argument("--part", choices=PARTS, help="one table alone, again")
+    run_in_settings(parser, measure)
 
 
 if __name__ == "__main__":

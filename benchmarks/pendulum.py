@@ -1,7 +1,8 @@
 """`python -m benchmarks.pendulum`: the pendulum against every peer, in one run.
 
 Prints a table a case, then the ratios that matter beside their limits, and writes
-`benchmarks/results/pendulum.json`; `--part chain` measures one part of it again.
+`benchmarks/results/pendulum.json`, and the same pinned to one core in `pinned/`.
+`--part chain` measures one part of it again.
 """
 
 import argparse
@@ -22,14 +23,13 @@ import pandas as pd
 
 import delucax as dlx
 from benchmarks import _ours
-from benchmarks._machine import compile_anew, describe, limit_cores
+from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._peers import c, gymnax_peer, raw
 from benchmarks._problem import Case
 from benchmarks._results import updated
 from benchmarks._timing import Contender, Missing, race, Timing
 
 
-RESULTS = Path(__file__).parent / "results"
 RAW = "raw, delucax.math"
 JNP = raw.NAME
 RUN = "delucax, run"
@@ -215,6 +215,9 @@ RACES = {
 }
 
 
+PARTS = (*RACES, "calls")
+
+
 def memory(steps: int = 1_000_000) -> dict[str, float]:
     """MB that the gradient of a long rollout needs, by what it stores."""
     case = Case("gradient", steps)
@@ -313,19 +316,11 @@ def merged(before: dict[str, Any], part: str, run: Run) -> dict[str, Any]:
     return {n: kept[n] + [{"part": part} | row for row in made[n]] for n in kept}
 
 
-def main() -> None:
+def measure(options: argparse.Namespace, folder: Path) -> None:
     """Run the parts, print them and write each when it is done."""
-    parts = (*RACES, "calls")
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.pendulum")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--part", choices=parts, help="one part alone, again")
-    parser.add_argument("--out", default=str(RESULTS / "pendulum.json"))
-    parser.add_argument("--cores", type=int, default=1, help="cores to run on")
-    options = parser.parse_args()
-    limit_cores(options.cores)
     compile_anew()
-    for part in [options.part] if options.part else parts:
+    out = folder / "pendulum.json"
+    for part in [options.part] if options.part else PARTS:
         run = Run(options.quick, 3 if options.quick else options.rounds)
         if part == "calls":
             made = measure_calls(run)
@@ -343,8 +338,17 @@ def main() -> None:
             machines = before.get("parts", {}) | {part: about}
             return {"parts": machines} | (made or merged(before, part, run))
 
-        updated(Path(options.out), change)
-        print(f"\nwritten: {options.out}")
+        updated(out, change)
+        print(f"\nwritten: {out}")
+
+
+def main() -> None:
+    """Run under both settings."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.pendulum")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
+    parser.add_argument("--part", choices=PARTS, help="one part alone, again")
+    run_in_settings(parser, measure)
 
 
 if __name__ == "__main__":

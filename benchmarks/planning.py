@@ -1,10 +1,10 @@
 """`python -m benchmarks.planning`: trajectory optimisation against its peers.
 
-In double precision on one core: the quadrotor of the docs against CasADi (FATROP and
+In double precision: the quadrotor of the docs against CasADi (FATROP and
 IPOPT) and trajax, all in one run; a thousand random starts; problems with bounds,
 obstacles and ends against IPOPT; warm steps of model predictive control; iterative
 learning; and how often the dynamics are called. Prints tables, and writes
-`benchmarks/results/planning.json`.
+`benchmarks/results/planning.json`, and the same pinned to one core in `pinned/`.
 
 CasADi and trajax are in virtual environments of their own. Google's trajax is installed
 from its repository, so where that cannot be reached it is missing from the table;
@@ -29,13 +29,12 @@ import numpy as np
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import compile_anew, describe, limit_cores
+from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._plans import CASES, Plans
 from benchmarks._timing import compiled, Contender, Missing, race, Timing
 from benchmarks._venv import interpreter, ROOT
 
 
-RESULTS = Path(__file__).parent / "results" / "planning.json"
 OPTIMUM = 5.389016
 LIMITS = {
     "objective, off the optimum": 1e-6,
@@ -461,14 +460,9 @@ def calls() -> Table:
     return table
 
 
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.planning")
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--part", help="one table alone, again")
-    parser.add_argument("--trajax", help="a checkout of Google's trajax")
-    options = parser.parse_args()
-    limit_cores(1)
+def measure(options: argparse.Namespace, folder: Path) -> None:
+    """Measure, print and write."""
+    out = folder / "planning.json"
     compile_anew()
     jax.config.update("jax_enable_x64", True)
     quick = options.quick
@@ -497,7 +491,7 @@ def main() -> None:
     }
     content: dict[str, Any] = {"limits": LIMITS, "peers": PEERS}
     if options.part is not None:
-        content = json.loads(RESULTS.read_text()) if RESULTS.exists() else content
+        content = json.loads(out.read_text()) if out.exists() else content
         parts = {options.part: parts[options.part]}
     try:
         for name, part in parts.items():
@@ -506,8 +500,17 @@ def main() -> None:
         for worker in workers:
             worker.close()
     if not quick:
-        RESULTS.write_text(json.dumps(content, indent=1) + "\n")
-        print(f"\nwritten: {RESULTS}")
+        out.write_text(json.dumps(content, indent=1) + "\n")
+        print(f"\nwritten: {out}")
+
+
+def main() -> None:
+    """Run under both settings."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.planning")
+    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
+    parser.add_argument("--part", help="one table alone, again")
+    parser.add_argument("--trajax", help="a checkout of Google's trajax")
+    run_in_settings(parser, measure)
 
 
 if __name__ == "__main__":

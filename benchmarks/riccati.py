@@ -4,14 +4,12 @@ A run asks for the solution, the residual, the spectral radius of the closed loo
 the result, and reads all of them; SciPy returns the solution alone. All of it is
 measured twice: with JAX and BLAS as they are for a user who sets nothing, and pinned to
 one core without threads for products. Prints the tables and writes
-`benchmarks/results/riccati.json`.
+`benchmarks/results/riccati.json`, and the same in `pinned/`.
 """
 
 import argparse
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +20,10 @@ import pandas as pd
 import scipy.linalg
 
 import delucax as dlx
-from benchmarks._machine import (
-    compile_anew,
-    describe,
-    limit_cores,
-    PINNED,
-    pinned_environment,
-)
+from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._timing import compiled, python, race, Timing
 
 
-OUT = Path(__file__).parent / "results" / "riccati.json"
 SIZES = (4, 20, 100, 300, 480)
 LANES = 1000
 
@@ -156,49 +147,27 @@ def measure(sizes: list[int], rounds: int) -> dict[str, Any]:
     }
 
 
-def pinned(sizes: list[int], rounds: int) -> dict[str, Any]:
-    """`measure` in a process of its own, as threads are set when JAX starts."""
-    command = [sys.executable, "-m", "benchmarks.riccati", "--rounds", str(rounds)]
-    command += ["--pinned", "--sizes", *map(str, sizes)]
-    run = subprocess.run(
-        command, env=pinned_environment(), stdout=subprocess.PIPE, text=True, check=True
-    )
-    return json.loads(run.stdout)
+def run(options: argparse.Namespace, folder: Path) -> None:
+    """Measure, print and write."""
+    compile_anew()
+    jax.config.update("jax_enable_x64", True)
+    content = {"scipy": scipy.__version__} | measure(options.sizes, options.rounds)
+    print(pd.DataFrame(content["timings"]).to_string(index=False, float_format="%.4g"))
+    print("\nWhat was found")
+    print(pd.DataFrame(content["found"]).to_string(index=False, float_format="%.2g"))
+    print("\nRatios of the best rounds")
+    print(pd.DataFrame(content["ratios"]).to_string(index=False, float_format="%.2f"))
+    out = folder / "riccati.json"
+    out.write_text(json.dumps(content, indent=1) + "\n")
+    print(f"\nwritten: {out}")
 
 
 def main() -> None:
-    """Run, print and write."""
+    """Run under both settings."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.riccati")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--sizes", type=int, nargs="*", default=list(SIZES))
-    parser.add_argument("--out", default=str(OUT))
-    parser.add_argument(
-        "--pinned", action="store_true", help="print the pinned rows as JSON alone"
-    )
-    options = parser.parse_args()
-    compile_anew()
-    if options.pinned:
-        limit_cores(1)
-    jax.config.update("jax_enable_x64", True)
-    if options.pinned:
-        print(json.dumps(measure(options.sizes, options.rounds)))
-        return
-
-    content = measure(options.sizes, options.rounds)
-    content |= {"scipy": scipy.__version__}
-    content["pinned"] = pinned(options.sizes, options.rounds)
-    for setting, rows in (("Defaults", content), (PINNED, content["pinned"])):
-        print(f"\n{setting}\n")
-        times = pd.DataFrame(rows["timings"])
-        print(times.to_string(index=False, float_format="%.4g"))
-        print("\nWhat was found")
-        print(pd.DataFrame(rows["found"]).to_string(index=False, float_format="%.2g"))
-        print("\nRatios of the best rounds")
-        print(pd.DataFrame(rows["ratios"]).to_string(index=False, float_format="%.2f"))
-    out = Path(options.out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(content, indent=1) + "\n")
-    print(f"\nwritten: {out}")
+    run_in_settings(parser, run)
 
 
 if __name__ == "__main__":

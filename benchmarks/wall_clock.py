@@ -2,7 +2,8 @@
 
 One pendulum, zero input, 1e7 steps in one call; the mean and deviation over 100 runs;
 the start-up over 100 cold compilations, timed apart; peak memory; and Gymnasium beside
-it, on 1e5 steps. Prints the table and writes `benchmarks/results/wall_clock.json`.
+it, on 1e5 steps. Prints the table and writes `benchmarks/results/wall_clock.json`, and
+the same pinned to one core in `pinned/`.
 """
 
 import argparse
@@ -21,10 +22,7 @@ import numpy as np
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import compile_anew, describe, limit_cores
-
-
-OUT = Path(__file__).parent / "results" / "wall_clock.json"
+from benchmarks._machine import compile_anew, describe, run_in_settings
 
 
 def simulate(steps: int) -> Any:
@@ -69,18 +67,9 @@ def peak_megabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
 
 
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.wall_clock")
-    parser.add_argument("--steps", type=int, default=10_000_000)
-    parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--gymnasium-steps", type=int, default=100_000)
-    parser.add_argument("--out", default=str(OUT))
-    parser.add_argument("--cores", type=int, default=1)
-    options = parser.parse_args()
-    limit_cores(options.cores)
+def run(options: argparse.Namespace, folder: Path) -> None:
+    """Measure, print and write."""
     compile_anew()
-
     compiles = np.array([cold_compile(options.steps) for _ in range(options.runs)])
     before = peak_megabytes()
     program, arguments = simulate(options.steps)
@@ -122,8 +111,7 @@ def main() -> None:
         f"memory: the program needs {memory.temp_size_in_bytes} bytes of scratch; the "
         f"process peaked at {after:.0f} MB ({before:.0f} MB before the runs)"
     )
-    out = Path(options.out)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    out = folder / "wall_clock.json"
     content = {
         "machine": describe(),
         "rows": rows,
@@ -134,6 +122,15 @@ def main() -> None:
     }
     out.write_text(json.dumps(content, indent=1) + "\n")
     print(f"written: {out}")
+
+
+def main() -> None:
+    """Run under both settings."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.wall_clock")
+    parser.add_argument("--steps", type=int, default=10_000_000)
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--gymnasium-steps", type=int, default=100_000)
+    run_in_settings(parser, run)
 
 
 if __name__ == "__main__":
