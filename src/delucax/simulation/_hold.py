@@ -83,18 +83,23 @@ def field(s, x, args):
     return args.length / args.intervals * dx
 
 
+def _of_controller(name: str) -> Any:
+    return property(lambda self: getattr(self.controller, name))
+
+
 class InTime(diffrax.AbstractAdaptiveStepSizeController):
     """A step-size controller that is told times, in a solve that counts intervals."""
 
     controller: diffrax.AbstractAdaptiveStepSizeController
     interval: Array
 
-    rtol = property(lambda self: self.controller.rtol)
-    atol = property(lambda self: self.controller.atol)
-    norm = property(lambda self: self.controller.norm)
+    rtol = _of_controller("rtol")
+    atol = _of_controller("atol")
+    norm = _of_controller("norm")
 
     def wrap(self, direction):
-        return InTime(self.controller.wrap(direction), self.interval)
+        inside = self.controller.wrap(direction)
+        return eqx.tree_at(lambda c: c.controller, self, inside)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         h = self.interval
@@ -204,7 +209,7 @@ class Hold(AbstractForwardingSolver):
 
             def act(held):
                 _, memory = held
-                return args.act(index.astype(t0.dtype), y0, memory)
+                return args.act(jnp.asarray(index, y0.dtype), y0, memory)
 
             held = lax.cond(switched, act, lambda held: held, held)
             args = eqx.tree_at(lambda a: a.u, args, held[0])

@@ -367,7 +367,7 @@ def _with_switches(options, held: bool, sampled: bool, length, intervals, subste
         if (controller := options.get("stepsize_controller")) is not None:
             # What a step costs depends on its length, what it approximates does not.
             interval = lax.stop_gradient(length / intervals)
-            controller = InTime(controller, interval)
+            controller = InTime(controller, interval)  # pyright: ignore
             # No adaptive step crosses a switch: its error estimate would be of two
             # fields.
             if held and intervals > 1:
