@@ -593,6 +593,15 @@ def steering():
     return (lambda: dlx.planning.ilqr(*given, constraints=constraints).states,)
 
 
+@case("python -m delucax --help", 0.3)
+def command_line():
+    import subprocess
+    import sys
+
+    command = [sys.executable, "-m", "delucax", "--help"]
+    return (lambda: subprocess.run(command, capture_output=True, check=True),)
+
+
 @case("gym.make and a step", 1.0)
 def gym():
     import gymnasium

@@ -1,4 +1,4 @@
-"""`import delucax`: it compiles and runs nothing, and imports the catalogue later."""
+"""`import delucax`: it compiles and runs nothing, and imports names at first use."""
 
 import ast
 import importlib
@@ -21,7 +21,7 @@ from jax._src import xla_bridge
 heard = []
 listen = jax.monitoring.register_event_duration_secs_listener
 listen(lambda name, *_, **__: heard.append(name))
-import delucax
+from delucax import make, math, rollout, simulate
 assert not xla_bridge.backends_are_initialized(), "a device was asked for"
 assert not heard, heard
 """
@@ -29,6 +29,12 @@ assert not heard, heard
 
 def test_import_compiles_and_runs_nothing():
     subprocess.run([sys.executable, "-c", _IMPORT], check=True)
+
+
+def test_help_is_shown_without_jax():
+    shown = "from delucax.__main__ import main; main([])"
+    check = "import sys; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", f"{shown}; {check}"], check=True)
 
 
 @pytest.mark.parametrize("package", ["", ".costs", ".environments", ".systems"])

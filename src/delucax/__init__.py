@@ -7,93 +7,108 @@ a controller, and differentiate, `vmap` or `jit` the whole.
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
-from . import (
-    costs as costs,
-    disturbances as disturbances,
-    dynamics as dynamics,
-    environments as environments,
-    math as math,
-    systems as systems,
-)
-from ._controller import (
-    AbstractController as AbstractController,
-    AbstractLearner as AbstractLearner,
-    AbstractStochasticPolicy as AbstractStochasticPolicy,
-)
-from ._module import (
-    bounded as bounded,
-    load as load,
-    parameter as parameter,
-    positive as positive,
-    replace as replace,
-    save as save,
-    weight as weight,
-)
-from ._results import RESULTS as RESULTS
-from .costs import AbstractCost as AbstractCost
-from .disturbances import AbstractDisturbance as AbstractDisturbance
-from .dynamics import (
-    AbstractDynamics as AbstractDynamics,
-    c2d as c2d,
-    d2c as d2c,
-    Discretized as Discretized,
-    LinearDynamics as LinearDynamics,
-    linearize as linearize,
-    open_loop as open_loop,
-    trim as trim,
-)
-from .environments import (
-    Environment as Environment,
-    make as make,
-    randomise as randomise,
-    register as register,
-)
-from .simulation import (
-    rollout as rollout,
-    simulate as simulate,
-    Trajectory as Trajectory,
-)
-from .systems import AbstractSystem as AbstractSystem, system as system
+from ._lazy import lazily as _lazily
 
 
 if TYPE_CHECKING:
     from . import (
         analysis as analysis,
         controllers as controllers,
+        costs as costs,
+        disturbances as disturbances,
+        dynamics as dynamics,
+        environments as environments,
         estimators as estimators,
         experiments as experiments,
         interop as interop,
         lung as lung,
+        math as math,
         planning as planning,
         plotting as plotting,
         references as references,
         riccati as riccati,
+        simulation as simulation,
         studies as studies,
+        systems as systems,
         training as training,
     )
+    from ._controller import (
+        AbstractController as AbstractController,
+        AbstractLearner as AbstractLearner,
+        AbstractStochasticPolicy as AbstractStochasticPolicy,
+    )
+    from ._module import (
+        bounded as bounded,
+        load as load,
+        parameter as parameter,
+        positive as positive,
+        replace as replace,
+        save as save,
+        weight as weight,
+    )
+    from ._results import RESULTS as RESULTS
+    from .costs import AbstractCost as AbstractCost
+    from .disturbances import AbstractDisturbance as AbstractDisturbance
+    from .dynamics import (
+        AbstractDynamics as AbstractDynamics,
+        c2d as c2d,
+        d2c as d2c,
+        Discretized as Discretized,
+        LinearDynamics as LinearDynamics,
+        linearize as linearize,
+        open_loop as open_loop,
+        trim as trim,
+    )
+    from .environments import (
+        Environment as Environment,
+        make as make,
+        randomise as randomise,
+        register as register,
+    )
     from .plotting import animate as animate, plot as plot
+    from .simulation import (
+        rollout as rollout,
+        simulate as simulate,
+        Trajectory as Trajectory,
+    )
+    from .systems import AbstractSystem as AbstractSystem, system as system
 
     __version__: str
 del TYPE_CHECKING
 
-_LAZY = """
-    analysis animate controllers estimators experiments interop lung planning plot
-    plotting references riccati studies training
+_PACKAGES = """
+    analysis controllers costs disturbances dynamics environments estimators experiments
+    interop lung math planning plotting references riccati simulation studies systems
+    training
 """.split()
+_name, _names = _lazily(
+    __name__,
+    {
+        "_controller": "AbstractController AbstractLearner AbstractStochasticPolicy",
+        "_module": "bounded load parameter positive replace save weight",
+        "_results": "RESULTS",
+        "costs": "AbstractCost",
+        "disturbances": "AbstractDisturbance",
+        "dynamics": "AbstractDynamics c2d d2c Discretized LinearDynamics linearize"
+        " open_loop trim",
+        "environments": "Environment make randomise register",
+        "plotting": "animate plot",
+        "simulation": "rollout simulate Trajectory",
+        "systems": "AbstractSystem system",
+    },
+)
 
 
 def __getattr__(name: str):
-    """Packages beyond the core, imported at first use."""
-    if name in ("animate", "plot"):
-        return getattr(_import_module(".plotting", __name__), name)
+    """Packages and names, imported at first use: the command line needs few."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("delucax")
-    if name in _LAZY:
+    if name in _PACKAGES:
         return _import_module(f".{name}", __name__)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _name(name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+    return sorted({*_names(), *_PACKAGES})

@@ -12,9 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ._controller import AbstractController
 from ._extras import extra
-from ._programs import forget_programs, keep_programs
 
 
 _SUITES = {"scoreboard": "delucax.studies._scoreboard"}
@@ -74,10 +72,14 @@ def main(arguments: list[str] | None = None) -> int:
     options = vars(_parser().parse_args(arguments))
     call = options.pop("call")
     folder, is_kept = options.pop("cache", None), options.pop("is_kept", None)
-    if is_kept:
-        keep_programs(folder)
-    elif is_kept is not None:
-        forget_programs()
+    if is_kept is not None:
+        # JAX is imported after the arguments are read, so that help is shown at once.
+        from ._programs import forget_programs, keep_programs
+
+        if is_kept:
+            keep_programs(folder)
+        else:
+            forget_programs()
     try:
         return call(**options) or 0
     except (OSError, ValueError, ImportError) as error:
@@ -182,7 +184,7 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
 
 def _list_names() -> None:
     """Print the names of tasks, controllers and suites."""
-    from . import controllers, environments
+    from . import AbstractController, controllers, environments
 
     def makes_controller(member: Any) -> bool:
         is_function = inspect.isfunction(member)

@@ -17,6 +17,7 @@ PENDULUM = dlx.systems.Pendulum(damping=0.1)
 FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
 INTEGRATOR = dlx.system(lambda t, x, u, w: u, states=1, controls=1)
 SWITCHED = dlx.system(lambda t, x, u, w: u - x, states=1, controls=1)
+DRIVEN = dlx.system(lambda t, x, u, w: t + u - x, states=1, controls=1)
 CONTROLS = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (4, 1)))
 HANGING = jnp.array([3.0, 0.5])
 UPRIGHT = jnp.array([0.1, 0.0])
@@ -131,6 +132,26 @@ def test_gradient_with_respect_to_the_end():
         return run.final_state[0]
 
     assert_close(jax.grad(f)(0.3), jnp.mean(CONTROLS), rtol=1e-12)
+
+
+@needs_x64
+@pytest.mark.parametrize(
+    "adjoint", [diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
+)
+def test_gradient_with_respect_to_both_ends(adjoint):
+    def f(t0, t1):
+        how = dict(stepsize_controller=TIGHT, adjoint=adjoint)
+        run = dlx.simulate(DRIVEN, CONTROLS[:1], t0, t1, jnp.ones(1), **how)
+        return run.final_state[0]
+
+    # dx/dt = t - x + u: x = t - 1 + u + c exp(-t).
+    def exact(t0, t1):
+        u = CONTROLS[0, 0]
+        return t1 - 1 + u + (2 - t0 - u) * jnp.exp(t0 - t1)
+
+    ends = 0.3, 0.8
+    got, expected = (jax.grad(g, argnums=(0, 1))(*ends) for g in (f, exact))
+    assert_close(jnp.stack(got), jnp.stack(expected), rtol=1e-7)
 
 
 def test_a_gradient_that_fails_is_loud():

@@ -62,27 +62,10 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
     check_instance(system, LinearSystem, "system", "c2d")
     check_step(dt, "c2d")
     check_choice(method, _METHODS, "method", "c2d")
-    n, inputs = system.state_size, _inputs(system, system.dx_ref)
-    if method == "zoh":
-        # exp([[A, B], [0, 0]] dt) holds exp(A dt) and the integral times B, however
-        # singular A is.
-        k = inputs.shape[1]
-        block = jnp.zeros((n + k, n + k), inputs.dtype)
-        block = block.at[:n, :n].set(system.A).at[:n, n:].set(inputs)
-        sampled = jsl.expm(block * dt)[:n]
-    else:
-        # x_next - x = dt (A (x + x_next) / 2 + B u).
-        half = system.A * (dt / 2)
-        eye = jnp.eye(n, dtype=half.dtype)
-        right = jnp.concatenate([eye + half, inputs * dt], axis=1)
-        # It raises where 2/dt is an eigenvalue of A.
-        operator = lx.MatrixLinearOperator(eye - half)
-        column = lambda b: lx.linear_solve(operator, b, lx.LU()).value
-        sampled = jax.vmap(column, in_axes=1, out_axes=1)(right)
-    B, drift, E = _parts(sampled[:, n:], system)
-    x_next = system.x_ref + drift
+    step = jnp.asarray(dt, system.A.dtype)
+    A, B, E, x_next = _sampled(system, step, method)
     about = _operating_point(system)
-    return LinearDynamics(sampled[:, :n], B, system.C, E, dt, x_next=x_next, **about)
+    return LinearDynamics(A, B, system.C, E, dt, x_next=x_next, **about)
 
 
 def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
@@ -159,6 +142,32 @@ def _parts(
 def _operating_point(model: LinearSystem | LinearDynamics) -> dict[str, Any]:
     names = "x_ref", "u_ref", "state_names", "control_names"
     return {name: getattr(model, name) for name in names}
+
+
+@eqx.filter_jit
+def _sampled(
+    system: LinearSystem, dt: Scalar, method: str
+) -> tuple[Matrix, Matrix, Matrix | None, Vector]:
+    """The matrices of `c2d`, and the state after the one at the operating point."""
+    n, inputs = system.state_size, _inputs(system, system.dx_ref)
+    if method == "zoh":
+        # exp([[A, B], [0, 0]] dt) holds exp(A dt) and the integral times B, however
+        # singular A is.
+        k = inputs.shape[1]
+        block = jnp.zeros((n + k, n + k), inputs.dtype)
+        block = block.at[:n, :n].set(system.A).at[:n, n:].set(inputs)
+        sampled = jsl.expm(block * dt)[:n]
+    else:
+        # x_next - x = dt (A (x + x_next) / 2 + B u).
+        half = system.A * (dt / 2)
+        eye = jnp.eye(n, dtype=half.dtype)
+        right = jnp.concatenate([eye + half, inputs * dt], axis=1)
+        # It raises where 2/dt is an eigenvalue of A.
+        operator = lx.MatrixLinearOperator(eye - half)
+        column = lambda b: lx.linear_solve(operator, b, lx.LU()).value
+        sampled = jax.vmap(column, in_axes=1, out_axes=1)(right)
+    B, drift, E = _parts(sampled[:, n:], system)
+    return sampled[:, :n], B, E, system.x_ref + drift
 
 
 @eqx.filter_jit

@@ -1,4 +1,8 @@
-"""Zero-order hold inside one solve, exact at the switch."""
+"""Zero-order hold inside one solve, exact at the switch.
+
+The solve counts its time `s` in intervals from the start, so that the switches are
+whole numbers, which rounding leaves alone, and constants of the compiled program.
+"""
 
 from typing import Any, NamedTuple
 
@@ -23,12 +27,19 @@ class Inputs(eqx.Module):
 
     system: AbstractSystem
     start: TimeOffset  # the time at which the solve's own begins
+    length: Array  # of the horizon
+    intervals: int = eqx.field(static=True)
     source: Any  # a controller, or a function of time; None for an array
     memory: Any  # the controller's first state
     controls: Array | None
     disturbances: Array | None
     index: Array
     u: Array | None  # the control that a held controller returned at the last switch
+
+    def since_start(self, s: Array) -> Array:
+        """The time that has passed after `s` intervals."""
+        # By a fraction of the length: the end is not rounded.
+        return self.length * (s / self.intervals)
 
     def control(self, t: Array, x: Array) -> Array:
         """The control at time `t`."""
@@ -55,7 +66,7 @@ class Inputs(eqx.Module):
 
     def act(self, s: Array, x: Array, memory: Any) -> tuple[Array, Any]:
         """The control of a held controller at a switch, and its state after it."""
-        t = self.start.t + s
+        t = self.start.t + self.since_start(s)
         state = eqx.combine(memory, eqx.filter(self.memory, eqx.is_array, inverse=True))
         u, after = call_controller(self.source, t, self.system.observe(t, x), state)
         check_control(u, self.source, self.system.control_size, "system")
@@ -67,8 +78,47 @@ class Inputs(eqx.Module):
 
 
 def field(s, x, args):
-    """The vector field at `s` after the start."""
-    return args.start.evaluate(s, lambda t: args.field(t, x))
+    """The change of the state per interval, after `s` intervals."""
+    dx = args.start.evaluate(args.since_start(s), lambda t: args.field(t, x))
+    return args.length / args.intervals * dx
+
+
+def _of_controller(name: str) -> Any:
+    return property(lambda self: getattr(self.controller, name))
+
+
+class InTime(diffrax.AbstractAdaptiveStepSizeController):
+    """A step-size controller that is told times, in a solve that counts intervals."""
+
+    controller: diffrax.AbstractAdaptiveStepSizeController
+    interval: Array
+
+    rtol = _of_controller("rtol")
+    atol = _of_controller("atol")
+    norm = _of_controller("norm")
+
+    def wrap(self, direction):
+        inside = self.controller.wrap(direction)
+        return eqx.tree_at(lambda c: c.controller, self, inside)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        h = self.interval
+        per_time = lambda terms, t, y, args: func(terms, t / h, y, args) / h
+        first, state = self.controller.init(
+            terms, t0 * h, t1 * h, y0, dt0, args, per_time, error_order
+        )
+        return first / h, state
+
+    def adapt_step_size(
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        h = self.interval
+        start, end = t0 * h, t1 * h
+        states = y0, y1_candidate, args, y_error, error_order, controller_state
+        keep, low, high, *rest = self.controller.adapt_step_size(start, end, *states)
+        # A step begins at an end of the last one, which is not rounded.
+        begin = jnp.where(low == start, t0, jnp.where(low == end, t1, low / h))
+        return keep, begin, high / h, *rest
 
 
 _index = lambda args: args.index
@@ -130,7 +180,7 @@ class Hold(AbstractForwardingSolver):
     """
 
     solver: diffrax.AbstractSolver
-    switches: Array
+    intervals: int = eqx.field(static=True)
     sampled: bool = eqx.field(static=True)
 
     @property
@@ -144,7 +194,7 @@ class Hold(AbstractForwardingSolver):
         return ends
 
     def init(self, terms, t0, t1, y0, args):
-        args = eqx.tree_at(_index, args, self._interval(terms, t0, t1))
+        args = eqx.tree_at(_index, args, self._interval(t0, t1))
         inner = self.solver.init(terms, t0, t1, y0, args)
         held = (args.u, eqx.filter(args.memory, eqx.is_array)) if self.sampled else None
         # No interval yet, so that the first step counts as a switch.
@@ -152,14 +202,14 @@ class Hold(AbstractForwardingSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         inner, last, held = solver_state
-        index = self._interval(terms, t0, t1)
+        index = self._interval(t0, t1)
         switched = index != last
         args = eqx.tree_at(_index, args, index)
         if self.sampled:
 
             def act(held):
                 _, memory = held
-                return args.act(self.switches[index], y0, memory)
+                return args.act(jnp.asarray(index, y0.dtype), y0, memory)
 
             held = lax.cond(switched, act, lambda held: held, held)
             args = eqx.tree_at(lambda a: a.u, args, held[0])
@@ -173,40 +223,31 @@ class Hold(AbstractForwardingSolver):
         return y1, error, dense_info, (inner, index, held), result
 
     def func(self, terms, t0, y0, args):
-        forwards = terms.direction == 1
-        t = jnp.where(forwards, t0, -t0)
-        both = interval_from(self.switches, t), interval_before(self.switches, t)
-        args = eqx.tree_at(_index, args, jnp.where(forwards, *both))
-        return self.solver.func(terms, t0, y0, args)
+        # A backward solve counts its time down in negative numbers.
+        forwards, s = terms.direction == 1, jnp.abs(t0)
+        last = interval_before(s, self.intervals)
+        index = jnp.where(forwards, interval_from(s, self.intervals), last)
+        return self.solver.func(terms, t0, y0, eqx.tree_at(_index, args, index))
 
-    def _interval(self, terms, t0, t1):
+    def _interval(self, t0, t1):
         """The interval that the step from `t0` to `t1` lies in.
 
-        A backward solve counts its time down in negative numbers. A step that begins
-        one rounding before a switch belongs to what comes after it.
+        A step that begins one rounding before a switch belongs to what comes after it.
         """
-        forwards = terms.direction == 1
-        low = jnp.where(forwards, t0, -t1)
-        high = jnp.where(forwards, t1, -t0)
-        index = interval_from(self.switches, low)
+        # A backward solve counts its time down in negative numbers.
+        ends = jnp.abs(t0), jnp.abs(t1)
+        low, high = jnp.minimum(*ends), jnp.maximum(*ends)
+        index = interval_from(low, self.intervals)
         # The interval in which the larger part of the step lies.
-        switch = self.switches[index + 1]
-        later = (high - switch > switch - low).astype(index.dtype)
-        return jnp.minimum(index + later, self.switches.shape[0] - 2)
+        later = (high - (index + 1) > (index + 1) - low).astype(index.dtype)
+        return jnp.minimum(index + later, self.intervals - 1)
 
 
-def interval_from(switches: Array, t: Array) -> Array:
-    """k with `switches[k] <= t < switches[k + 1]`, of equal intervals."""
-    count = switches.shape[0] - 1
-    # By division, as the intervals are equal: a search would cost a loop per step.
-    share = (t - switches[0]) / (switches[-1] - switches[0])
-    k = jnp.clip(jnp.floor(share * count).astype(jnp.int32), 0, count - 1)
-    # Rounding can put the quotient on the wrong side of a switch, never beyond it.
-    k = k + (t >= switches[k + 1]).astype(k.dtype) - (t < switches[k]).astype(k.dtype)
-    return jnp.clip(k, 0, count - 1)
+def interval_from(s: Array, intervals: int) -> Array:
+    """k with `k <= s < k + 1`."""
+    return jnp.clip(jnp.floor(s).astype(jnp.int32), 0, intervals - 1)
 
 
-def interval_before(switches: Array, t: Array) -> Array:
-    """k with `switches[k] < t <= switches[k + 1]`."""
-    k = interval_from(switches, t)
-    return jnp.maximum(k - (t == switches[k]).astype(k.dtype), 0)
+def interval_before(s: Array, intervals: int) -> Array:
+    """k with `k < s <= k + 1`."""
+    return jnp.clip(jnp.ceil(s).astype(jnp.int32) - 1, 0, intervals - 1)

@@ -5,6 +5,7 @@ from typing import Any, Literal
 import diffrax
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -31,7 +32,15 @@ from .._typing import Numbers, PRNGKey
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._controller_calls import check_control, controller_result
-from ._hold import field, Hold, Inputs, interval_before, save_fn, SavedState
+from ._hold import (
+    field,
+    Hold,
+    Inputs,
+    interval_before,
+    InTime,
+    save_fn,
+    SavedState,
+)
 from ._simulate_checks import (
     as_save_times,
     check_adjoint,
@@ -70,11 +79,12 @@ def simulate(
     the control of the interval that the step lies in. A step that starts at a switch
     uses nothing from before it.
 
-    The solve counts its time from `t0`, so that a late start costs no precision: its
-    switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in single
-    precision, however large `t0` is. The field, with a control that is not held, is
-    corrected for the rounding of `t0 + s` as in [`delucax.Discretized`][]; held
-    controllers receive the rounded time.
+    The solve counts its time in intervals from `t0`, so that a late start costs no
+    precision: its switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in
+    single precision, however large `t0` is. A step-size controller is told the time
+    since `t0`. The field, with a control that is not held, is corrected for the
+    rounding of `t0 + s` as in [`delucax.Discretized`][]; held controllers receive the
+    rounded time.
 
     There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
     `total_cost` are zero. It is already compiled, as [`delucax.rollout`][] is.
@@ -103,8 +113,8 @@ def simulate(
     - `adjoint`: any of `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()`, or
         `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller`, takes no
-        held controller, whose memory cannot be run backwards, and raises if a gradient
-        with respect to `t0` or `t1` is asked for.
+        held controller, whose memory cannot be run backwards, and with `ts` raises if a
+        gradient with respect to `t0`, `t1` or `ts` is asked for.
     - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 per
         interval if that is more.
     - `ts`: the times to save at, increasing and between `t0` and `t1`; by default the
@@ -227,25 +237,21 @@ def simulate(
 def _simulate(
     system, source, w, x0, t0, length, ts, key, hold, steps, substeps, options
 ):
-    # The solve's own time is from 0 to `length`, which is not rounded to what `t0` is.
-    dtype = x0.dtype
-    grid: Any = None
-    switches: Any = None
-    if steps is not None:
-        # By fractions of the length, and the end as it is: no sum of steps is rounded.
-        grid = length * (jnp.arange(steps * substeps + 1) / (steps * substeps))
-        grid = grid.astype(dtype).at[-1].set(length)
-        switches = grid[::substeps]
-    saves: Any = switches if ts is None else _since(t0, ts.astype(dtype), grid, length)
-    times: Any = t0 + saves if ts is None else ts.astype(dtype)
+    dtype, intervals = x0.dtype, steps or 1
+    if ts is None:
+        saves: Any = jnp.arange(intervals + 1, dtype=dtype)
+        times: Any = t0 + length * (saves / intervals)
+    else:
+        times = ts.astype(dtype)
+        saves = _since(t0, times, intervals, substeps, length)
     count = times.shape[0]
 
     sampled = hold == "zero" and isinstance(source, AbstractController)
-    args = _inputs(system, source, w, x0, t0, switches, key, hold)
+    args = _inputs(system, source, w, x0, t0, length, intervals, key, hold)
     if sampled:
         # The control at the start. The first step calls the controller again, in the
         # same state, because it is the first of its interval.
-        u, _ = args.act(grid[0], x0, eqx.filter(args.memory, eqx.is_array))
+        u, _ = args.act(jnp.zeros((), dtype), x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
     start = TimeOffset(t0, lambda t: args.field(t, x0))
     args = eqx.tree_at(lambda a: a.start, args, start)
@@ -257,14 +263,14 @@ def _simulate(
     held = hold == "zero" or w is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
-        t0=jnp.zeros((), dtype),
-        t1=length,
+        t0=0.0,
+        t1=float(intervals),
         dt0=None,
         y0=x0,
         args=args,
         saveat=diffrax.SaveAt(**saved),
         throw=False,
-        **_with_switches(options, held, sampled, grid, switches),
+        **_with_switches(options, held, sampled, length, intervals, substeps),
     )
     states: Any = solution.ys
     applied: Any = None
@@ -278,7 +284,7 @@ def _simulate(
         """The rows of a held sequence just before each save time but the first."""
         if held is None or ts is None:
             return held
-        return held[jax.vmap(lambda s: interval_before(switches, s))(saves[1:])]
+        return held[interval_before(saves[1:], intervals)]
 
     if applied is not None:
         controls = applied[1:count]
@@ -321,7 +327,7 @@ def _simulate(
     )
 
 
-def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
+def _inputs(system, source, w, x0, t0, length, intervals, key, hold) -> Inputs:
     """The arguments of the solve's vector field before a controller is called."""
     controls: Any = None
     memory: Any = None
@@ -340,26 +346,34 @@ def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
         controls = source
     elif hold == "zero":
         # A function of time that is held is an array: its values at the switches.
-        controls = jax.vmap(source)(t0 + switches[:-1])
+        switches = t0 + length * (jnp.arange(intervals, dtype=x0.dtype) / intervals)
+        controls = jax.vmap(source)(switches)
         check_control(controls[0], source, system.control_size, "system")
     if controls is not None:
         controls, source = controls.astype(x0.dtype), None
     index = jnp.zeros((), jnp.int32)
-    return Inputs(system, TimeOffset(t0), source, memory, controls, w, index, None)
+    horizon = TimeOffset(t0), length, intervals
+    return Inputs(system, *horizon, source, memory, controls, w, index, None)
 
 
-def _with_switches(options, held: bool, sampled: bool, grid, switches):
+def _with_switches(options, held: bool, sampled: bool, length, intervals, substeps):
     """The options of a solve whose steps end at the switches of what is held."""
+    dtype = length.dtype
 
     def fitted(options):
         options = dict(options)
         if held and "solver" in options:
-            options["solver"] = Hold(options["solver"], switches, sampled)
-        controller = options.get("stepsize_controller")
-        # No adaptive step crosses a switch: its error estimate would be of two fields.
-        if held and controller is not None and switches.shape[0] > 2:
-            clipped = diffrax.ClipStepSizeController(controller, step_ts=switches[1:-1])
-            options["stepsize_controller"] = clipped
+            options["solver"] = Hold(options["solver"], intervals, sampled)
+        if (controller := options.get("stepsize_controller")) is not None:
+            # What a step costs depends on its length, what it approximates does not.
+            interval = lax.stop_gradient(length / intervals)
+            controller = InTime(controller, interval)  # pyright: ignore
+            # No adaptive step crosses a switch: its error estimate would be of two
+            # fields.
+            if held and intervals > 1:
+                switches = jnp.arange(1, intervals, dtype=dtype)
+                controller = diffrax.ClipStepSizeController(controller, switches)
+            options["stepsize_controller"] = controller
         return options
 
     solver, adjoint = options["solver"], options["adjoint"]
@@ -372,21 +386,20 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
     adjoint = throwing_adjoint(adjoint)
     options = fitted(options | dict(solver=solver, adjoint=adjoint))
     if fixed:
-        options["stepsize_controller"] = diffrax.StepTo(grid)
+        ends = jnp.arange(intervals * substeps + 1, dtype=dtype) / substeps
+        options["stepsize_controller"] = diffrax.StepTo(ends)
     return options
 
 
-def _since(t0: Array, ts: Array, grid: Array | None, length: Array) -> Array:
-    """The save times `ts`, counted from `t0`.
+def _since(t0, ts, intervals: int, substeps: int, length) -> Array:
+    """The save times `ts`, counted in intervals from `t0`.
 
-    They are snapped to grid points within rounding, so that the interval before each is
-    unambiguous.
+    They are snapped to the ends of fixed steps within rounding, so that the interval
+    before each is unambiguous.
     """
-    saves = jnp.clip(ts - t0, 0, length)
-    if grid is None:
-        return saves
-    steps = grid.shape[0] - 1
-    near = grid[jnp.round(saves / length * steps).astype(int)]
+    scale = intervals / length
+    saves = jnp.clip((ts - t0) * scale, 0, intervals)
+    near = jnp.round(saves * substeps) / substeps
     # Both times are rounded to their own size, and so is their difference.
     slack = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(ts))
-    return jnp.where(jnp.abs(saves - near) <= slack, near, saves)
+    return jnp.where(jnp.abs(saves - near) <= slack * scale, near, saves)

@@ -258,14 +258,18 @@ def fit(
     metrics = _joined(blocks)
     columns = {name: metrics.pop(name) for name in COLUMNS}
     history = History(**columns, metrics=metrics)
-    return Fitted(run.finished(state), history, _outcome(state.fault))
+    if seeds is None:
+        outcome = RESULTS.diverged if faults else RESULTS.successful
+    else:
+        outcome = _outcomes(state.fault)
+    return Fitted(run.finished(state), history, outcome)
 
 
 @eqx.filter_jit
-def _outcome(fault: Array) -> Result:
+@jax.vmap
+def _outcomes(fault: Array) -> Result:
     """The status of each seed."""
-    outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
-    return outcome(fault) if fault.ndim == 0 else jax.vmap(outcome)(fault)
+    return choose(fault > 0, RESULTS.diverged, RESULTS.successful)
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:

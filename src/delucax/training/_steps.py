@@ -147,9 +147,9 @@ class Steps(NamedTuple):
         shape = () if self.seeds is None else (self.seeds,)
         if self.batch_size is not None:
             size = len(jax.tree.leaves(self.data)[0])
-            no_pass = jnp.full(shape, -1, jnp.int32)
-            order = jnp.zeros((*shape, size), jnp.int32), no_pass
-        fault = jnp.zeros(shape, jnp.int32)
+            order = np.zeros((*shape, size), np.int32), np.full(shape, -1, np.int32)
+        # Arrays of NumPy compile nothing on their way to the device.
+        order, fault = jax.device_put((order, np.zeros(shape, np.int32)))
         return State(values, state, memory, order, fault)
 
     def block(
@@ -182,9 +182,9 @@ class Steps(NamedTuple):
 
         first, stop = span[0], span[1]
         # Traced once, here: the loop needs the shapes of a row before it begins.
-        step: Any = eqx.filter_closure_convert(step_of_all, state, first)
+        step = jax.jit(step_of_all)
         empty = lambda entry: jnp.zeros((CAPACITY, *entry.shape), entry.dtype)
-        rows = jax.tree.map(empty, step.out_struct[1])
+        rows = jax.tree.map(empty, jax.eval_shape(step, state, first)[1])
 
         def going(carry):
             state, _, count = carry
@@ -253,8 +253,8 @@ class Steps(NamedTuple):
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
         # The step at fault is not made: what stays is the last good state.
-        kept = lambda new, old: jnp.where(fault == 0, new, old)
-        stepped: Any = jax.tree.map(kept, (moved, after, memory), before[:3])
+        after_step = moved, after, memory
+        stepped: Any = lax.cond(fault == 0, lambda: after_step, lambda: before[:3])
         row = {"loss": strip_weak_type(cost), "gradient_norm": norm, **metrics}
         return State(*stepped, order=order, fault=fault), row
 
