@@ -49,6 +49,41 @@ def central_difference(f, x, step=1e-6):
     return gradient
 
 
+def in_both_modes(f):
+    """A function of a vector, and its Jacobian forwards and backwards."""
+
+    def derivatives(x):
+        values, push = jax.linearize(f, x)
+        pull = jax.linear_transpose(push, x)
+        forwards = jax.vmap(push, out_axes=1)(jnp.eye(len(x)))
+        (backwards,) = jax.vmap(pull)(jnp.eye(len(values)))
+        return values, forwards, backwards
+
+    return derivatives
+
+
+def check_second_order(line, backwards=False, step=1e-5):
+    """The derivatives of `line`, a number of a number, in both modes, and those of
+    these forwards, and backwards if asked for, are central differences."""
+
+    def to_first_order(e):
+        parts = in_both_modes(lambda e: line(e[0])[None])(e)
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    @jax.jit
+    def to_second_order(e):
+        if backwards:
+            return in_both_modes(to_first_order)(e)
+        return jax.jvp(to_first_order, (e,), (jnp.ones(1),))
+
+    low, high = (to_second_order(np.array([0.1 + h]))[0] for h in (-step, step))
+    numeric = np.asarray(high - low) / (2 * step)
+    values, *derivatives = to_second_order(np.array([0.1]))
+    assert_close(values[1:], np.full(2, numeric[0]), rtol=1e-6)
+    for slopes in derivatives:
+        assert_close(slopes.ravel(), numeric, rtol=1e-6)
+
+
 @contextlib.contextmanager
 def as_a_user():
     """Without the type checks that only the tests switch on, so that our own errors
@@ -73,9 +108,20 @@ def assert_refuses_nan(module):
         path = path_string(path)
         if not eqx.is_inexact_array(leaf):
             continue
-        assert eqx.tree_equal(dlx.replace(module, {path: leaf}), module), path
+        assert_same(dlx.replace(module, {path: leaf}), module)
         with pytest.raises(ValueError):
-            dlx.replace(module, {path: jnp.full_like(leaf, jnp.nan)})
+            dlx.replace(module, {path: np.full_like(leaf, np.nan)})
+
+
+def assert_same(one, other):
+    """As `eqx.tree_equal`; numbers are compared by NumPy, which compiles nothing."""
+    pairs = [eqx.partition(module, eqx.is_inexact_array) for module in (one, other)]
+    (numbers, rest), (others, other_rest) = pairs
+    assert eqx.tree_equal(rest, other_rest)
+    assert jax.tree.structure(numbers) == jax.tree.structure(others)
+    for a, b in zip(jax.tree.leaves(numbers), jax.tree.leaves(others), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
 
 
 def ilqr(

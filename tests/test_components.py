@@ -6,7 +6,7 @@ import pytest
 from helpers import assert_close, needs_x64
 from jax.test_util import check_grads
 
-from delucax._jax import by_components
+from delucax._jax import by_components, with_stores
 
 
 pytestmark = needs_x64
@@ -103,3 +103,20 @@ def test_check_grads():
 def test_an_only_entry_meets_all():
     twice = lambda x: jax.lax.mul(jnp.stack([x[0], x[1]]), jnp.stack([x[0]]))
     assert_close(by_components(twice)(jnp.array([2.0, 3.0])), [4.0, 6.0])
+
+
+def test_stores_of_a_long_chain_change_no_derivative():
+    def chain(x, A, s):
+        for _ in range(8):
+            x = x + 0.1 * jnp.sin(x) * (x + s)
+        return A @ x
+
+    def at(f):
+        return jax.vmap(jax.jacfwd(jax.jacrev(f)), (0, None, None))
+
+    x, A, s = _arguments()
+    lanes = jnp.linspace(-1.0, 1.0, 4)[:, None] * x
+    stored = with_stores(by_components(chain), x, A, s)
+    assert str(jax.make_jaxpr(stored)(x, A, s)).count("fence") > 2
+    assert_close(stored(x, A, s), chain(x, A, s), rtol=1e-12)
+    assert_close(at(stored)(lanes, A, s), at(chain)(lanes, A, s), rtol=1e-10)

@@ -7,9 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import once
 
 import delucax as dlx
 
+
+pytestmark = once
 
 _IMPORT = """
 import jax

@@ -157,11 +157,7 @@ def assert_same_leaf(a, b):
         assert a == b
 
 
-@pytest.mark.parametrize(
-    "name",
-    # A simulated trajectory is one of another making, dear to make.
-    list(THINGS),
-)
+@pytest.mark.parametrize("name", THINGS)
 def test_round_trip_is_exact(name, tmp_path):
     thing = THINGS[name]()
     dlx.save(tmp_path / "thing.dlx", thing)

@@ -17,12 +17,17 @@ DOCS = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
-def draw(names, folder):
+def draw(names, folder, frames=None):
     """Run the first block of the page, and those that make the pictures of `names`, or
-    all of them, in `folder`; returns the files."""
+    all of them, in `folder`, with at most so many `frames`; returns the files."""
     first, *blocks = BLOCK.findall((DOCS / "gallery.md").read_text())
     namespace = {"__name__": "gallery"}
     exec(compile(first, "gallery.md", "exec"), namespace)
+    if frames is not None:
+        film = namespace["film"]
+        namespace["film"] = lambda *given, **named: film(
+            *given[:5], **(named | {"frames": frames})
+        )
     os.chdir(folder)
     for block in blocks:
         (name,) = re.findall(r'film\("(\w+)"', block)

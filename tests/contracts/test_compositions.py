@@ -5,6 +5,7 @@ wrappers around it, a disturbance, sensor noise, bounds, termination and a preci
 Its twin is the few lines of NumPy that a reader would write for it.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from helpers import assert_close, minutes, needs_x64, user_error
+from helpers import assert_close, minutes, needs_x64, once, user_error
 from hypothesis import given, HealthCheck, Phase, settings, strategies as st
 
 import delucax as dlx
@@ -477,7 +478,7 @@ quietly = dict(
 )
 
 
-@settings(max_examples=8, **quietly)
+@settings(max_examples=4, **quietly)
 @given(compositions)
 def test_a_random_loop(c):
     check(c)
@@ -504,16 +505,18 @@ def test_derivatives_behind_a_wrapper(wrappers, kind):
     )
     env, controller, twin, _, x0 = build(c)
 
-    def cost(x0, K):
+    @jax.jit
+    @functools.partial(jax.grad, argnums=(0, 1), has_aux=True)
+    def slopes(x0, K):
         there = eqx.tree_at(lambda c: c.K, controller, K)
-        return dlx.rollout(env, there, key=jr.key(0), x0=x0).total_cost
+        run = dlx.rollout(env, there, key=jr.key(0), x0=x0)
+        return run.total_cost, run.disturbances
 
-    run = dlx.rollout(env, controller, key=jr.key(0), x0=jnp.asarray(x0))
-    w = np.asarray(run.disturbances)
+    (by_x0, by_K), w = slopes(x0, controller.K)
+    w = np.asarray(w)
     times = jnp.arange(HORIZON) * c.dt
     noise = np.asarray(env.sensor_noise.sequence(jr.split(jr.key(0), 4)[2], times))
     K = np.asarray(controller.K)
-    by_x0, by_K = jax.grad(cost, (0, 1))(jnp.asarray(x0), controller.K)
 
     def total(x0, K):
         return loop(c, K, twin, x0, w, noise)["total_cost"]
@@ -529,6 +532,7 @@ def test_derivatives_behind_a_wrapper(wrappers, kind):
             assert_close(slope[i], difference, rtol=1e-6, atol=1e-6)
 
 
+@once
 @pytest.mark.parametrize("wrappers", STACKS, ids="+".join)
 def test_variance_behind_a_wrapper(wrappers):
     """Of Brownian motion over the horizon, whatever is around the plant."""
@@ -566,6 +570,7 @@ def test_variance_behind_a_wrapper(wrappers):
     assert abs(np.var(ends) / expected - 1) < 4 * np.sqrt(2 / 4000)
 
 
+@once
 def test_a_wrapper_forwards_every_property():
     """Those that the base classes declare and do not derive from others."""
     derived = {"state_size", "control_size", "observation_size", "advance"}
@@ -581,6 +586,7 @@ def test_a_wrapper_forwards_every_property():
     assert declared <= {name for kind in own for name in vars(kind)}
 
 
+@once
 def test_a_wrapper_that_observes_otherwise_says_so():
     class Half(dlx.dynamics.AbstractWrapper):
         dynamics: dlx.AbstractDynamics
@@ -599,6 +605,7 @@ def test_a_wrapper_that_observes_otherwise_says_so():
     assert not dlx.dynamics.Delayed(observed, sensor=1).observes_state
 
 
+@once
 def test_a_learner_takes_a_wrapped_plant_that_observes_its_state(key):
     A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
     plant = dlx.LinearDynamics(A, B, np.eye(2))
@@ -621,6 +628,7 @@ class ByHand(dlx.AbstractDynamics):
         return self.dynamics.advance(t, x, u, w)
 
 
+@once
 def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     class Says(ByHand):
         noise = property(lambda self: self.dynamics.noise)
@@ -665,6 +673,7 @@ def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     assert batch(jnp.full(3, 0.1)).dt.shape == (3,)
 
 
+@once
 def test_a_delay_of_nothing_observes_the_state():
     plant = dlx.Discretized(Spring(), dt=0.1)
     assert dlx.dynamics.Delayed(plant).observes_state

@@ -1,5 +1,6 @@
 """What every controller must do. A new one is covered by being listed here."""
 
+import functools
 import inspect
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import pytest
 from helpers import (
     assert_close,
     assert_refuses_nan,
+    needs_x32,
     needs_x64,
     once,
     tolerance,
@@ -47,10 +49,13 @@ def hinfinity(size, horizon=None):
     return c.HInfinity(dynamics, *weights, gamma=100.0, horizon=horizon)
 
 
+def ramp(t):
+    return jnp.stack([0.1 * t, 0.1 + 0 * t])
+
+
 def finite(size):
-    dynamics = dlx.LinearDynamics(A, B, dt=DT)
-    eye, follow = jnp.eye(2), lambda t: jnp.stack([0.1 * t, 0.1 + 0 * t])
-    options = dict(final=size * eye, horizon=12, reference=follow)
+    dynamics, eye = dlx.LinearDynamics(A, B, dt=DT), jnp.eye(2)
+    options = dict(final=size * eye, horizon=12, reference=ramp)
     return c.FiniteHorizonLQR(dynamics, size * eye, jnp.eye(1), **options)
 
 
@@ -120,7 +125,9 @@ def bandit(size):
 
 def build(model):
     cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
-    return c.gpc(model, cost, memory=2, horizon=3)
+    # A base by default is a Riccati equation, which the case `LQR` has.
+    base = c.Linear(FEEDBACK)
+    return c.gpc(model, cost, base=base, memory=2, horizon=3)
 
 
 def explorer(size):
@@ -245,6 +252,19 @@ def test_every_controller_is_listed():
     assert members >= {"Zero", "LQR", "PID", "MLP", "Gaussian"}
 
 
+def stacked(modules):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *modules)
+
+
+def drawn_for(key, count):
+    """Keys, and disturbances: they are given, because to draw them takes half of the
+    time that a rollout compiles."""
+    rng = np.random.default_rng(0)
+    w = 0.05 * rng.normal(size=(count, 8, 2)).astype(jnp.zeros(()).dtype)
+    return jax.random.split(key, count), w
+
+
+@needs_x32
 @every
 def test_jit_and_vmap(case, key):
     """It goes into plain `jax.jit`, where other numbers in it do not compile again; a
@@ -253,25 +273,24 @@ def test_jit_and_vmap(case, key):
 
     @jax.jit
     @jax.vmap
-    def run(controller, key):
+    def run(controller, key, w):
         nonlocal traced
         traced += 1
-        found = dlx.rollout(env, controller, key=key)
+        found = dlx.rollout(env, controller, key=key, w=w)
         return found.controls, found.total_cost
 
-    one, other = case.make(1.0), case.make(1.1)
-    pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), one, other)
-    turned = jax.tree.map(lambda leaf: leaf[::-1], pair)
-    keys = jax.random.split(key, 2)
-    (batch, costs), (_, turned_costs) = run(pair, keys), run(turned, keys[::-1])
+    pair, (keys, w) = [case.make(1.0), case.make(1.1)], drawn_for(key, 2)
+    batch, costs = map(np.asarray, run(stacked(pair), keys, w))
+    _, turned_costs = run(stacked(pair[::-1]), keys[::-1], w[::-1])
     assert np.all(np.isfinite(costs)) and costs[0] != costs[1]
     assert_close(turned_costs, costs[::-1], **CLOSE)
     assert traced == 1
     # Identification from few samples, in single precision, magnifies rounding.
-    close = dict(rtol=1e-3, atol=1e-3) if type(one).__name__ == "Explore" else CLOSE
-    for controls, controller, key in zip(batch, (one, other), keys, strict=True):
-        alone = dlx.rollout(env, controller, key=key).controls
-        assert_close(controls, alone, **close)
+    explores = type(pair[0]).__name__ == "Explore"
+    close = dict(rtol=1e-3, atol=1e-3) if explores else CLOSE
+    for i, controller in enumerate(pair):
+        alone = dlx.rollout(env, controller, key=keys[i], w=w[i]).controls
+        assert_close(batch[i], alone, **close)
 
 
 class Known(dlx.AbstractController):
@@ -292,54 +311,61 @@ class Known(dlx.AbstractController):
 
 @needs_x64
 @every
-def test_scan(case, key):
-    """Calling it by hand, its state carried by `lax.scan`, is what a rollout does."""
-    env, controller = environment(), case.make(1.0)
-    w = 0.05 * jax.random.normal(key, (8, 2))
-    known = jax.random.key(7)
-    run = dlx.rollout(env, Known(controller, known), key=key, w=w)
-    state = controller.init(key=known)
-    assert all(eqx.is_array(leaf) for leaf in jax.tree.leaves(state))
-
-    def step(carry, inputs):
-        x, state = carry
-        k, w = inputs
-        t = k * DT
-        u, state = controller(t, env.dynamics.observe(t, x), state)
-        step = env.step(t, x, u, w)
-        state = controller.applied(step.control, step.cost, state)
-        return (step.state, state), step.control
-
-    _, controls = lax.scan(step, (env.reset(key), state), (jnp.arange(8), w))
-    assert controls.shape == (8, 1)
-    assert_close(controls, run.controls, rtol=1e-11, atol=1e-12)
-
-
-@needs_x64
-@every
-def test_grad(case, key):
-    """Every number that it holds has a finite gradient, and the right one."""
-    env = environment()
-    arrays, static = eqx.partition(case.make(1.0), eqx.is_inexact_array)
+def test_grad_and_scan(case, key):
+    """Every number that it holds has a finite gradient, and the right one. A rollout
+    is what calling it by hand does, its state carried by `lax.scan`, in a batch."""
+    env, traced = environment(), 0
+    pair, (keys, w) = [case.make(1.0), case.make(1.1)], drawn_for(key, 2)
+    arrays, rest = eqx.partition(pair[0], eqx.is_inexact_array)
     flat, unravel = ravel_pytree(arrays)
 
     @jax.jit
-    @jax.value_and_grad
-    def cost(flat):
-        controller = eqx.combine(unravel(flat), static)
-        return dlx.rollout(env, controller, key=key).total_cost
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def cost(flat, known, w):
+        controller = Known(eqx.combine(unravel(flat), rest), known)
+        run = dlx.rollout(env, controller, key=key, w=w)
+        return run.total_cost, run.controls
 
-    _, gradient = cost(flat)
-    assert np.all(np.isfinite(gradient))
     # One direction a leaf, so that none hides behind a larger one.
+    (_, alone), gradient = cost(flat, keys[0], w[0])
+    assert np.all(np.isfinite(gradient))
     rng, start, h = np.random.default_rng(0), 0, 1e-6
     for path, leaf in jax.tree_util.tree_leaves_with_path(arrays):
         way = np.zeros(flat.shape)
         way[start : start + leaf.size] = rng.choice([-1.0, 1.0], size=leaf.size)
         start += leaf.size
-        exact = float(gradient @ way)
-        numeric = float(cost(flat + h * way)[0] - cost(flat - h * way)[0]) / (2 * h)
+        exact = np.dot(gradient, way)
+        up, down = (cost(np.asarray(flat) + s * way, keys[0], w[0]) for s in (h, -h))
+        numeric = float(up[0][0] - down[0][0]) / (2 * h)
         assert abs(exact - numeric) < 1e-5 * max(1.0, abs(exact)), path
+
+    @jax.jit
+    @jax.vmap
+    def by_hand(controller, known, w):
+        nonlocal traced
+        traced += 1
+        state = controller.init(key=known)
+        assert all(eqx.is_array(leaf) for leaf in jax.tree.leaves(state))
+
+        def step(carry, inputs):
+            x, state = carry
+            k, w = inputs
+            t = k * DT
+            u, state = controller(t, env.dynamics.observe(t, x), state)
+            step = env.step(t, x, u, w)
+            state = controller.applied(step.control, step.cost, state)
+            return (step.state, state), step.control
+
+        return lax.scan(step, (env.reset(key), state), (jnp.arange(8), w))[1]
+
+    batch = np.asarray(by_hand(stacked(pair), keys, w))
+    turned = np.asarray(by_hand(stacked(pair[::-1]), keys[::-1], w[::-1]))
+    assert_close(turned, batch[::-1], **CLOSE)
+    assert traced == 1
+    other = ravel_pytree(eqx.filter(pair[1], eqx.is_inexact_array))[0]
+    (_, other_alone), _ = cost(other, keys[1], w[1])
+    assert batch.shape == (2, 8, 1)
+    assert_close(batch, np.stack([alone, other_alone]), rtol=1e-11, atol=1e-12)
 
 
 @needs_x64
@@ -391,5 +417,6 @@ def test_saved_and_loaded(case, key, tmp_path):
     loaded = dlx.load(tmp_path / "controller.dlx", trust=[__name__])
     assert type(loaded) is type(controller)
     assert jax.tree.structure(loaded) == jax.tree.structure(controller)
-    run = lambda controller: dlx.rollout(env, controller, key=key).controls
+    (key, _), (w, _) = drawn_for(key, 2)
+    run = lambda controller: dlx.rollout(env, controller, key=key, w=w).controls
     np.testing.assert_array_equal(run(loaded), run(controller))

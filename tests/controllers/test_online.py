@@ -32,24 +32,21 @@ def run(controller, w, dynamics=PLANT, cost=COST, x0=None, **options):
     return dlx.rollout(env, controller, key=key, x0=x0, w=w, horizon=len(w))
 
 
+@eqx.filter_jit
 def follow(env, controller, x0, w):
     """Every state of a controller, and of the plant, along a run."""
 
-    @jax.jit
-    def loop(x0, w):
-        def step(carry, inputs):
-            x, state = carry
-            k, w = inputs
-            t = k * env.dt
-            u, state = controller(t, env.dynamics.observe(t, x), state)
-            here = env.step(t, x, u, w)
-            after = controller.applied(here.control, here.cost, state)
-            return (here.state, after), (state, here.control, u, here.cost)
+    def step(carry, inputs):
+        x, state = carry
+        k, w = inputs
+        t = k * env.dt
+        u, state = controller(t, env.dynamics.observe(t, x), state)
+        here = env.step(t, x, u, w)
+        after = controller.applied(here.control, here.cost, state)
+        return (here.state, after), (state, here.control, u, here.cost, x)
 
-        state = controller.init(key=jax.random.key(1))
-        return lax.scan(step, (x0, state), (jnp.arange(len(w)), w))[1]
-
-    return loop(jnp.asarray(x0), jnp.asarray(w))
+    state = controller.init(key=jax.random.key(1))
+    return lax.scan(step, (jnp.asarray(x0), state), (jnp.arange(len(w)), w))[1]
 
 
 PENDULUM = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
@@ -72,21 +69,19 @@ LEARNERS = {
 def test_recovered_disturbances(dynamics, make):
     """Exactly zero where there are none, and else what they were, under saturation."""
     env = dlx.Environment(dynamics, COST, control_bounds=(-0.4, 0.4))
-    learner, x0 = make(dynamics, COST), jnp.array([0.3, -0.5])
-    quiet, *_ = follow(env, learner, x0, jnp.zeros((12, dynamics.disturbance_size)))
+    learner, x0 = make(dynamics, COST), np.array([0.3, -0.5])
+    quiet, *_ = follow(env, learner, x0, np.zeros((12, dynamics.disturbance_size)))
     assert np.all(np.asarray(quiet.loop.signal) == 0)
     w = 0.2 * np.random.default_rng(0).normal(size=(12, dynamics.disturbance_size))
-    states, applied, asked, _ = follow(env, learner, x0, w)
+    states, applied, asked, _, x = follow(env, learner, x0, w)
     assert np.any(np.asarray(applied) != np.asarray(asked))
     if dynamics is PLANT:
         assert_close(states.loop.signal[1:, 0], w[:-1], rtol=0, atol=1e-14)
         return
-    found = dlx.rollout(env, learner, key=jax.random.key(1), x0=x0, w=w, horizon=12)
-    x = found.states
-    undisturbed = jax.vmap(lambda x, u: dynamics(0.0, x, u))(x[:-1], applied)
-    assert np.any(np.abs(states.loop.signal[1:, 0]) > 1e-3)
-    if not isinstance(learner, c.BPC):  # which draws another key in a rollout
-        assert_close(states.loop.signal[1:, 0], (x[1:] - undisturbed)[:-1], atol=1e-13)
+    undisturbed = jax.jit(jax.vmap(lambda x, u: dynamics(0.0, x, u)))(x, applied)
+    signal = np.asarray(states.loop.signal[1:, 0])
+    assert np.any(np.abs(signal) > 1e-3)
+    assert_close(signal, x[1:] - undisturbed[:-1], atol=1e-13)
 
 
 def partial(base=None):
@@ -102,7 +97,7 @@ def test_natures_output():
     w = np.random.default_rng(1).normal(size=(20, 2))
     start = np.array([0.1, -0.1])
     loud = eqx.tree_at(lambda d: d.policy.start, learner, jnp.full((1, 3), 0.3))
-    states, applied, asked, _ = follow(env, loud, start, w)
+    states, applied, asked, *_ = follow(env, loud, start, w)
     base = dlx.rollout(
         dlx.Environment(plant, COST, horizon=20),
         learner.loop.base,
@@ -168,18 +163,16 @@ def test_defaults_reach_what_is_possible():
     learner, base = c.gpc(PLANT, COST), c.LQR(PLANT, Q, R)
     rng = np.random.default_rng(0)
     w = np.stack([rng.normal(size=(STEPS, 2)), SLOW, np.ones((STEPS, 2))])
-    total = jax.jit(jax.vmap(lambda c, w: run(c, w).total_cost, (None, 0)))
-    costs, regulated = np.asarray(total(learner, w)), np.asarray(total(base, w))
+    whole = lambda c, cost, w: run(c, w, cost=cost).total_cost
+    total = jax.jit(jax.vmap(whole, (None, None, 0)))
+    costs, regulated = (np.asarray(total(c, COST, w)) for c in (learner, base))
     best = [hindsight_policy(A, B, np.asarray(base.K), each, 10) for each in w]
     assert np.all(costs <= np.array([1.05, 0.15, 0.15]) * regulated)
     assert np.all(costs <= 1.5 * np.array(best))
 
-    def scaled(size, w):
-        cost = dlx.costs.Quadratic(size * Q, size * R)
-        return run(c.gpc(PLANT, cost), size * w, cost=cost).total_cost
-
     for size in 1e-2, 1e2:
-        again = jax.vmap(scaled, (None, 0))(size, w)
+        cost = dlx.costs.Quadratic(size * Q, size * R)
+        again = total(c.gpc(PLANT, cost), cost, size * w)
         assert_close(again / size**3, costs, rtol=1e-6)
 
 
@@ -232,7 +225,8 @@ def test_hindsight_sees_the_noise_of_the_run():
     again = dlx.rollout(env, found.controller, **options)
     assert_close(found.trajectory.total_cost, again.total_cost, rtol=1e-9)
     assert again.total_cost < played.total_cost
-    short = dlx.rollout(env, learner, keep=("states", "disturbances"), **options)
+    kept = "states", "disturbances"
+    short = dlx.rollout(env, learner.fixed(), keep=kept, **options)
     with user_error(match="trajectory must have its observations"):
         c.best_in_hindsight(env, learner.fixed(), short)
 
@@ -316,7 +310,7 @@ def test_explore_identifies():
     learner = c.Explore(build, K, steps=3000, scale=3.0)
     env = dlx.Environment(PLANT, COST)
     w = np.concatenate([SLOW] * 4)
-    states, *_, costs = follow(env, learner, np.zeros(2), w)
+    states, *_, costs, _ = follow(env, learner, np.zeros(2), w)
     model = jax.tree.map(lambda leaf: leaf[-1], states.model)
     assert np.max(np.abs(model.A - A)) < 0.1 and np.max(np.abs(model.B - B)) < 0.1
     known = run(c.gpc(PLANT, COST), w).costs
@@ -331,19 +325,19 @@ def test_online_newton_is_recursive_least_squares():
     J, target = rng.normal(size=(20, k, d)), rng.normal(size=(20, k))
     optimiser = c.online_newton(prior)
     assert optimiser == c.online_newton(prior)
-    theta = jnp.zeros(d)
-    state = optimiser.init(theta)
-    found = []
+    theta, found = np.zeros(d), []
+    state = optimiser.init(jnp.asarray(theta))
+
+    @jax.jit
+    def update(gradient, state, root):
+        # No step is too long.
+        options = dict(curvature=lambda: root, learning_rate=1e3)
+        return optimiser.update(gradient, state, **options)
+
     for A, b in zip(J, target, strict=True):
-        step, state = optimiser.update(
-            jnp.asarray(A.T @ (A @ np.asarray(theta) - b)),
-            state,
-            curvature=lambda A=A: jnp.asarray(A.T),
-            # No step is too long.
-            learning_rate=1e3,
-        )
-        theta = theta + 1e3 * step
-        found.append(np.asarray(theta))
+        step, state = update(A.T @ (A @ theta - b), state, A.T)
+        theta = theta + 1e3 * np.asarray(step)
+        found.append(theta)
     # While the prior follows the mean, all that was seen is rescaled with it.
     sizes = np.sum(J**2, axis=(1, 2))
     means = np.cumsum(sizes) / np.arange(1, 21)

@@ -7,6 +7,7 @@ from helpers import assert_close, once, user_error
 import delucax as dlx
 
 
+pytestmark = once
 Q = jnp.array([[2.0, 0.5], [0.5, 1.0]])
 R = jnp.array([[0.1]])
 
@@ -75,7 +76,6 @@ def test_weights_are_differentiable():
     assert_close(jax.jit(jax.grad(value))(3.0), 2.0)
 
 
-@once
 @pytest.mark.parametrize(
     "make, match",
     [
@@ -171,7 +171,6 @@ def test_targets_of_costs_that_are_made_of_others():
         assert cost.targets is None
 
 
-@once
 def test_what_cannot_be_added():
     cost = dlx.costs.PendulumCost()
     for function in (lambda: cost + 1, lambda: cost * cost, lambda: 1 + cost):

@@ -13,16 +13,14 @@ COST = dlx.costs.PendulumCost()
 
 
 @once
-@pytest.mark.parametrize("name", dlx.environments.registered())
-def test_every_task(name, key):
-    arguments = {"key": key} if name in ("lds", "neural") else {}
-    env = dlx.make(name, **arguments)
-    x0 = env.reset(key)
-    step = eqx.filter_jit(env.step)(0.0, x0, jnp.zeros(env.control_size))
+def test_a_step_compiles_as_a_method_and_as_a_function(key):
+    """What holds for every task is in `contracts/test_tasks.py`."""
+    env = dlx.make("pendulum")
+    x0, u = env.reset(key), jnp.zeros(1)
+    step = eqx.filter_jit(env.step)(0.0, x0, u)
     assert step.state.shape == x0.shape == (env.state_size,)
     assert step.cost.shape == () and step.result == dlx.RESULTS.successful
-    assert env.encode(jnp.zeros(env.observation_size)).shape == (env.feature_size,)
-    same = jax.jit(dlx.Environment.step)(env, 0.0, x0, jnp.zeros(env.control_size))
+    same = jax.jit(dlx.Environment.step)(env, 0.0, x0, u)
     assert_close(same.state, step.state, rtol=1e-6)
 
 
@@ -59,6 +57,7 @@ def test_replace():
         dlx.replace(env, {"dynamics.dt.size": 1.0})
 
 
+@once
 def test_randomise_is_domain_randomisation_without_compiling(key):
     env = dlx.make("pendulum")
     ranges = {
@@ -78,14 +77,14 @@ def test_randomise_is_domain_randomisation_without_compiling(key):
         return plant.dynamics.system.length, plant.dynamics.system.mass, run.total_cost
 
     keys = jax.random.split(key, 50)
-    lengths, masses, costs = jax.vmap(cost)(keys)
-    first = traced.count
+    lengths, masses, costs = map(np.asarray, jax.jit(jax.vmap(cost))(keys))
+    counts = [traced.count]
     assert np.all((lengths >= 0.8) & (lengths <= 1.2)) and len(np.unique(costs)) == 50
-    assert_close(jnp.log(masses).std(), 0.1, rtol=0.3)
-    one = cost(keys[3])
-    assert_close(one[2], costs[3], rtol=1e-4)
-    jax.vmap(cost)(keys[:7])
-    assert first == 1 and traced.count <= 3
+    assert_close(np.log(masses).std(), 0.1, rtol=0.3)
+    for k in (3, 4):
+        assert_close(cost(keys[k])[2], costs[k], rtol=1e-4)
+        counts.append(traced.count)
+    assert counts[0] == 1 and counts[1] == counts[2] <= 2
     with user_error(match="must be a pair"):
         dlx.randomise(env, key, {"dynamics.dt": 1.0})
     with user_error(match="low <= high"):

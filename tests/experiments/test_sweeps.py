@@ -179,8 +179,8 @@ def test_the_command_line(file, capsys):
 
 
 SHARDED = """
-import jax, jax.numpy as jnp, numpy as np, equinox as eqx
-from jax.sharding import AxisType, NamedSharding, PartitionSpec
+import jax, numpy as np
+from jax.sharding import AxisType
 import delucax as dlx
 from delucax import experiments
 from delucax.experiments import experiment
@@ -188,26 +188,13 @@ from delucax.experiments import experiment
 assert jax.device_count() == 8
 env = dlx.make("pendulum")
 controller = dlx.controllers.mlp_policy(env, width=4, depth=1, key=jax.random.key(1))
-keys = jax.random.split(jax.random.key(0), 64)
-
-@eqx.filter_jit
-@eqx.filter_value_and_grad
-def mean_cost(controller, keys):
-    run = lambda key: dlx.rollout(env, controller, key=key, horizon=20, throw=False)
-    return jnp.mean(jax.vmap(run)(keys).total_cost)
-
-mesh = jax.make_mesh((8,), ("batch",), axis_types=(AxisType.Auto,))
-spread = jax.device_put(keys, NamedSharding(mesh, PartitionSpec("batch")))
-assert len(spread.sharding.device_set) == 8
-one, eight = mean_cost(controller, keys), mean_cost(controller, spread)
-for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(eight), strict=True):
-    np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-5)
 
 @experiment.seeds(16)
 def cost(key):
     return dlx.rollout(env, controller, key=key, horizon=20).total_cost
 
 a = experiments.run(cost, progress=False)
+mesh = jax.make_mesh((8,), ("batch",), axis_types=(AxisType.Auto,))
 b = experiments.run(cost, progress=False, mesh=mesh)
 np.testing.assert_allclose(
     [row["value"] for row in a.rows], [row["value"] for row in b.rows], rtol=1e-5
@@ -217,7 +204,7 @@ print("equal")
 
 
 def test_eight_devices_agree_with_one():
-    """A batch of rollouts, its gradient, and an experiment's seeds."""
+    """Over the seeds of an experiment; a gradient is below, over two processes."""
     flags = "--xla_force_host_platform_device_count=8"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", SHARDED]

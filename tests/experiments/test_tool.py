@@ -1,9 +1,9 @@
 """The experiment tool, in one process."""
 
 import errno
+import importlib
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from helpers import once, user_error
 import delucax as dlx
 from delucax import experiments
 from delucax.experiments import experiment, Results
+from delucax.experiments._fingerprint import fingerprint
 from delucax.experiments._results import TIMES
 
 
@@ -330,7 +331,7 @@ def test_a_change_of_code_or_values_runs_again(tmp_path):
     assert done == [] and values(results) == [8.0, 20.0]
 
 
-def test_what_a_class_inherits_and_a_module_imports_is_code_too(tmp_path):
+def test_what_a_class_inherits_and_a_module_imports_is_code_too(tmp_path, monkeypatch):
     first = {
         "deep": "def factor():\n    return 1\n",
         "base": "import deep\n\nclass Base:\n    def f(self):\n"
@@ -338,27 +339,26 @@ def test_what_a_class_inherits_and_a_module_imports_is_code_too(tmp_path):
         "case": "from base import Base\n\nclass Mine(Base):\n    pass\n\n"
         "def run():\n    return Mine().f()\n",
     }
-    look = "import case; from delucax.experiments._fingerprint import fingerprint\n"
-    look += "print(fingerprint(case.run))"
     found = []
-    for change in (
-        None,
-        None,
-        ("deep", "return 1", "return 2"),
-        ("base", "()", "() + 1"),
+    for k, change in enumerate(
+        (
+            None,
+            None,
+            ("deep", "return 1", "return 2"),
+            ("base", "()", "() + 1"),
+        )
     ):
+        folder = tmp_path / str(k)
+        folder.mkdir()
         for name, text in first.items():
             if change is not None and change[0] == name:
                 text = text.replace(*change[1:])
-            (tmp_path / f"{name}.py").write_text(text)
-        done = subprocess.run(
-            [sys.executable, "-B", "-c", look],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        found.append(done.stdout)
+            (folder / f"{name}.py").write_text(text)
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(folder)
+            found.append(fingerprint(importlib.import_module("case").run))
+        for name in first:
+            del sys.modules[name]
     assert found[0] == found[1] and len(set(found)) == 3
 
 

@@ -31,7 +31,8 @@ def test_explored_breaths(breaths):
     assert 0.17 < np.std(noise) < 0.23 and abs(np.mean(noise)) < 0.05
     assert_close(breaths.truth[:, :3], 5.0, rtol=1e-6)
     with user_error(match="hardly|some breaths stay below"):
-        lung.explore(lung.double_compartment(), 2, key=KEY, abort=5.1, length=9)
+        same = dict(key=KEY, length=40, scale=0.5)  # compiled before
+        lung.explore(lung.double_compartment(), 12, abort=5.1, **same)
 
 
 def test_segments_are_inspirations():

@@ -9,6 +9,7 @@ from helpers import (
     assert_close,
     ilqr,
     needs_x64,
+    once,
     original_ilqr,
     tolerance,
     user_error,
@@ -140,7 +141,7 @@ def test_a_plan_is_a_controller():
         plan(0.0, jnp.zeros(3), None)
 
 
-@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=needs_x64)])
 def test_gains_are_those_of_the_regulator_of_a_linear_problem(parallel):
     A, B = jnp.array([[1.0, 0.1], [0.3, 0.9]]), jnp.array([[0.0], [0.1]])
     Q, R, Qf = jnp.diag(jnp.array([1.0, 0.2])), 0.1 * jnp.eye(1), 3 * jnp.eye(2)
@@ -155,6 +156,7 @@ def test_gains_are_those_of_the_regulator_of_a_linear_problem(parallel):
     assert plan.rollouts <= tolerance(4, 2)
 
 
+@needs_x64
 def test_cross_terms_of_the_cost():
     class Crossed(dlx.AbstractCost):
         def __call__(self, t, x, u):
@@ -165,15 +167,16 @@ def test_cross_terms_of_the_cost():
     known = dlx.riccati.dre(A, B, jnp.eye(2), 0.5 * jnp.eye(1), S, horizon=15)
     linear, x0 = dlx.LinearDynamics(A, B, dt=0.1), jnp.array([1.0, -1.0])
     plan = ilqr(linear, Crossed(), x0, jnp.zeros((15, 1)))
-    assert_close(plan.gains, known.K, rtol=tolerance(1e-3, 1e-9), atol=1e-6)
+    assert_close(plan.gains, known.K, rtol=1e-9, atol=1e-6)
 
 
+@needs_x64
 def test_known_disturbances_and_time():
     dynamics, cost = pendulum()
     w = 0.1 * jnp.ones((20, 2))
     plan = swing(w=w, t0=3.0)
     followed = dlx.open_loop(dynamics, plan.states[0], plan.controls, w)
-    assert_close(plan.states, followed, atol=tolerance(1e-5, 1e-12))
+    assert_close(plan.states, followed, atol=1e-12)
     u, _ = plan(3.1, plan.states[1], None)
     assert_close(u, plan.controls[1], rtol=1e-6)
     # It is better than the plan that does not know of it.
@@ -182,6 +185,7 @@ def test_known_disturbances_and_time():
     assert plan.cost < end + cost.final(0.0, unaware[-1])
 
 
+@once
 def test_bounds_hold_and_their_gains_are_zero():
     free, plan = swing(), swing(bounds=(-4.0, [5.0]))
     assert jnp.min(free.controls) < -4.0
@@ -271,6 +275,7 @@ def test_a_quadratic_program_between_bounds():
     assert jnp.max(off) < 1e-10 and jnp.max(slope) < 1e-10
 
 
+@once
 def test_a_concave_control_cost_is_regularised_and_it_shows():
     class Concave(dlx.AbstractCost):
         def __call__(self, t, x, u):
@@ -294,6 +299,7 @@ def stiff():
     return dlx.Discretized(system, dt=0.5)
 
 
+@once
 def test_candidates_that_diverge_are_rejected():
     cost = dlx.costs.Quadratic([1.0], [1e-4], final=[10.0], state_target=[1.0])
     plan = ilqr(stiff(), cost, jnp.zeros(1), jnp.zeros((12, 1)), throw=False)
@@ -302,6 +308,7 @@ def test_candidates_that_diverge_are_rejected():
     assert plan.rollouts > plan.iterations
 
 
+@once
 def test_a_start_that_diverges():
     cost = dlx.costs.Quadratic([1.0], [1.0])
     start = stiff(), cost, jnp.array([0.7]), jnp.zeros((12, 1))
@@ -315,6 +322,7 @@ def test_a_start_that_diverges():
     assert plan.cost < 1e4
 
 
+@once
 def test_no_descent():
     class Kinked(dlx.AbstractCost):
         def __call__(self, t, x, u):
@@ -328,6 +336,7 @@ def test_no_descent():
         ilqr(dynamics, Kinked(), jnp.zeros(2), jnp.zeros((4, 1)))
 
 
+@needs_x64
 @pytest.mark.parametrize("line_search", ["backtracking", "parallel"])
 def test_a_bad_member_of_a_batch_harms_no_other(line_search):
     cost = dlx.costs.Quadratic([1.0], [0.1], final=[1.0])
@@ -342,9 +351,10 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
     found, ok = jax.vmap(cost_of)(x0)
     assert ok.tolist() == [True, False, False, True]
     alone = jnp.stack([cost_of(x)[0] for x in (x0[0], x0[3])])
-    assert_close(found[jnp.array([0, 3])], alone, rtol=tolerance(1e-4, 1e-10))
+    assert_close(found[jnp.array([0, 3])], alone, rtol=1e-10)
 
 
+@once
 @pytest.mark.parametrize(
     "arguments, match",
     [
@@ -391,6 +401,7 @@ def test_bad_arguments_are_named(arguments, match):
         ilqr(**(given | arguments))
 
 
+@once
 def test_it_compiles_once():
     dynamics, cost = pendulum()
 

@@ -90,8 +90,8 @@ def test_learning_in_wind_and_online(windy):
     assert 100 < ours.cost < 104
     # Without a rate it learns nothing online.
     plain = igpc(*windy, step=0.2, learning_rate=0, anneal=False, iterations=3)
-    same = ilc(*windy, step=0.2, iterations=3)
-    assert_close(plain.trace, same.trace, rtol=1e-9)
+    same = ilc(*windy, step=0.2)
+    assert_close(plain.trace, same.trace[:4], rtol=1e-9)
 
 
 class Arm(dlx.AbstractDynamics):
@@ -166,15 +166,14 @@ def test_where_the_problem_is_not_convex():
 def test_batches_of_winds(windy):
     _, sim, cost, plan = windy
 
-    def learned(strength, learner):
+    def learned(strength):
         plant = dlx.make("planar_quadrotor", wind="constant", wind_strength=strength)
-        return learner(plant.dynamics, sim, cost, plan, iterations=5, throw=False).trace
+        return igpc(plant.dynamics, sim, cost, plan, iterations=5, throw=False).trace
 
-    for learner in (ilc, igpc):
-        winds = jnp.array([0.05, 0.1])
-        batch = jax.vmap(lambda s, learner=learner: learned(s, learner))(winds)
-        for i, wind in enumerate(winds):
-            assert_close(batch[i], learned(wind, learner), rtol=1e-8)
+    winds = jnp.array([0.05, 0.1])
+    batch = jax.vmap(learned)(winds)
+    for i, wind in enumerate(winds):
+        assert_close(batch[i], learned(wind), rtol=1e-8)
 
 
 @pytest.mark.parametrize("learner", [ilc, igpc])

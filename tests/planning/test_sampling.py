@@ -66,8 +66,8 @@ def test_what_diverges_has_no_part_in_it(planner, options):
     plan = planned(planner, dynamics, Cliff(), x0, U, scale=0.2, **options)
     assert jnp.all(jnp.isfinite(plan.controls)) and jnp.all(plan.controls <= 0.5)
     assert 0 <= plan.cost < 8 == plan.trace[0]
-    grads = jax.grad(lambda x: planned(planner, dynamics, Cliff(), x, U).cost)(x0)
-    assert jnp.all(jnp.isfinite(grads))
+    cost = lambda x: planned(planner, dynamics, Cliff(), x, U).cost
+    assert jnp.all(jnp.isfinite(jax.jit(jax.grad(cost))(x0)))
     start = dict(scale=1e-3, iterations=2)
     lost = planned(planner, dynamics, Cliff(), x0, U + 1, throw=False, **start)
     assert lost.result == dlx.RESULTS.diverged and jnp.isinf(lost.cost)
@@ -99,13 +99,14 @@ def test_bounds_batches_and_derivatives(planner, options):
 
     keys = jax.random.split(KEY, 2)
     starts = jnp.stack([X0, -2 * X0])
-    costs, controls = jax.vmap(optimal)(starts, keys)
+    costs, controls = jax.jit(jax.vmap(optimal))(starts, keys)
     assert jnp.all((controls >= -0.2) & (controls <= 0.3))
     assert jnp.min(controls) < -0.18 and jnp.max(controls) > 0.28
     assert_close(costs[1], optimal(starts[1], keys[1])[0], rtol=1e-12)
-    slope = jax.grad(lambda x: optimal(x, KEY)[0])(X0)
+    both = jax.jit(jax.value_and_grad(lambda x: optimal(x, KEY)[0]))
+    slope = both(X0)[1]
     for i, way in enumerate(jnp.eye(2)):
-        up, down = (optimal(X0 + h * way, KEY)[0] for h in (1e-6, -1e-6))
+        up, down = (both(X0 + h * way)[0] for h in (1e-6, -1e-6))
         assert_close(slope[i], (up - down) / 2e-6, rtol=1e-5)
 
 

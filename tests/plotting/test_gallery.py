@@ -41,7 +41,7 @@ def test_code_of_the_page_draws_its_pictures(tmp_path, monkeypatch):
     spec = importlib.util.spec_from_file_location("gallery_figures", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    pictures = module.draw([], tmp_path)
+    pictures = module.draw([], tmp_path, frames=2)
     assert {picture.stem for picture in pictures} == TASKS
 
 

@@ -5,6 +5,7 @@ from helpers import assert_close, once, user_error
 import delucax as dlx
 
 
+@once
 def test_signals():
     constant = dlx.references.Constant(jnp.array([1.0, 2.0]))
     assert_close(constant(3.0), [1, 2])

@@ -17,24 +17,26 @@ RESULTS = dlx.RESULTS
 
 
 @pytest.mark.parametrize("name", ["dare", "care"])
-def test_gradients_beside_bad_members(name):
+def test_bad_members_harm_no_other(name):
     good = np.array([[-0.9, 0.3], [0.1, -0.2]])
-    bad = (
-        np.diag([2.0, -0.5]),
-        np.diag([np.nan, -0.5]),
-    )
+    good = np.stack([good, -good, good.T, np.array([[1.0, 1.0], [0.0, 1.0]])])
+    spoilt = good.copy()
+    spoilt[1], spoilt[2] = np.diag([2.0, -0.5]), np.diag([np.nan, -0.5])
 
-    def value(A):
-        found = getattr(dlx.riccati, name)(A, B, EYE, EYE[:1, :1], throw=False)
+    def value(A, Q):
+        found = getattr(dlx.riccati, name)(A, B, Q, EYE[:1, :1], throw=False)
         return jnp.sum(found.X) + jnp.sum(found.K), found.result == RESULTS.successful
 
-    both = jax.value_and_grad(value, has_aux=True)
-    (values, solved), gradients = jax.jit(jax.vmap(both))(np.stack([good, *bad]))
-    np.testing.assert_array_equal(solved, [True, False, False])
-    (alone, _), gradient = jax.jit(both)(good)
-    assert_close(values[0], alone, rtol=1e-12)
-    assert_close(gradients[0], gradient, rtol=1e-10)
-    assert_close(gradients[1:], np.zeros((2, 2, 2)))
+    both = jax.value_and_grad(value, argnums=(0, 1), has_aux=True)
+    both = jax.jit(jax.vmap(both, (0, None)))
+    (values, solved), gradients = both(good, EYE)
+    np.testing.assert_array_equal(solved, [True] * 4)
+    (beside, solved), gradients_beside = both(spoilt, EYE)
+    np.testing.assert_array_equal(solved, [True, False, False, True])
+    assert_close(beside[::3], values[::3])
+    for found, expected in zip(gradients_beside, gradients, strict=True):
+        assert_close(found[::3], expected[::3], rtol=1e-12)
+        assert_close(found[1:3], np.zeros((2, 2, 2)))
 
 
 def test_asymmetry_that_cannot_be_seen():

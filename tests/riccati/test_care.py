@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import assert_close, tolerance, user_error
+from helpers import assert_close, once, tolerance, user_error
 
 import delucax as dlx
 
@@ -18,11 +18,11 @@ Q, R = jnp.eye(2), jnp.eye(1)
 def test_double_integrator():
     solution = dlx.riccati.care(A, B, Q, R)
     root = np.sqrt(3)
-    assert_close(solution.X, [[root, 1], [1, root]], rtol=tolerance(1e-5, 1e-12))
-    assert_close(solution.K, [[1, root]], rtol=tolerance(1e-5, 1e-12))
+    assert_close(solution.X, [[root, 1], [1, root]], rtol=tolerance(1e-6, 1e-14))
+    assert_close(solution.K, [[1, root]], rtol=tolerance(1e-6, 1e-14))
     assert_close(solution.closed_loop, A - B @ solution.K)
     abscissa = np.max(np.linalg.eigvals(solution.closed_loop).real)
-    assert_close(solution.spectral_abscissa, abscissa, rtol=tolerance(1e-4, 1e-7))
+    assert_close(solution.spectral_abscissa, abscissa, rtol=tolerance(1e-5, 1e-8))
     assert solution.spectral_radius is None
     assert solution.result == dlx.RESULTS.successful
     true = riccati_systems.true_residual(False, A, B, Q, R, solution.X)
@@ -40,11 +40,11 @@ def test_cross_weight_and_descriptor():
     Q, R, S = weight[:3, :3], weight[3:, 3:], weight[:3, 3:]
     solution = dlx.riccati.care(A, B, Q, R, S, E)
     X = scipy.linalg.solve_continuous_are(A, B, Q, R, E, S)
-    assert np.linalg.norm(solution.X - X) < tolerance(1e-3, 1e-10) * np.linalg.norm(X)
+    assert np.linalg.norm(solution.X - X) < tolerance(1e-4, 1e-12) * np.linalg.norm(X)
     gain = np.linalg.solve(R, B.T @ X @ E + S.T)
-    assert_close(solution.K, gain, atol=tolerance(1e-2, 1e-9))
+    assert_close(solution.K, gain, atol=tolerance(1e-5, 1e-13))
     loop = np.linalg.solve(E, A - B @ gain)
-    assert_close(solution.closed_loop, loop, atol=tolerance(1e-2, 1e-9))
+    assert_close(solution.closed_loop, loop, atol=tolerance(1e-4, 1e-12))
     assert solution.spectral_abscissa < 0
 
 
@@ -85,11 +85,12 @@ def test_least_energy():
     unstable = jnp.array([[2.0, 1.0], [0.0, 1.5]])
     solution = dlx.riccati.care(unstable, B, jnp.zeros((2, 2)), R)
     moved = np.sort(np.linalg.eigvals(solution.closed_loop).real)
-    assert_close(moved, [-2, -1.5], rtol=tolerance(1e-3, 1e-9))
+    assert_close(moved, [-2, -1.5], rtol=tolerance(1e-5, 1e-12))
 
 
 def test_ill_posed_where_it_cannot_be_seen():
-    solve = jax.jit(lambda A, R: dlx.riccati.care(A, B, Q, R, throw=False).result)
+    care = jax.jit(lambda *data: dlx.riccati.care(*data, throw=False).result)
+    solve = lambda A, R: care(A, B, Q, R)
     ill_posed = dlx.RESULTS.ill_posed
     assert solve(A, R) == dlx.RESULTS.successful
     assert solve(A.at[0, 0].set(jnp.nan), R) == ill_posed
@@ -97,39 +98,15 @@ def test_ill_posed_where_it_cannot_be_seen():
     assert solve(A, -R) == ill_posed
 
 
-def test_one_bad_member_harms_no_other():
-    As = np.stack([A, A - np.eye(2), A + 0.1 * np.eye(2)])
-    spoilt = np.stack([As[0], np.diag([1.3, 0.2]), As[2]])
-
-    @jax.jit
-    def total_of_two(As, Q):
-        def total(As, Q):
-            batch = jax.vmap(lambda A: dlx.riccati.care(A, B, Q, R, throw=False))(As)
-            good = batch.result == dlx.RESULTS.successful
-            # What a failed member holds is not looked at.
-            costs = jnp.where(good[:, None, None], batch.X, 0)
-            return jnp.sum(costs[::2]), (batch.X, good)
-
-        return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(As, Q)
-
-    (value, (X, good)), (gradient, shared) = total_of_two(As, Q)
-    (value_beside, (X_beside, good_beside)), gradients = total_of_two(spoilt, Q)
-    np.testing.assert_array_equal(good, [True] * 3)
-    np.testing.assert_array_equal(good_beside, [True, False, True])
-    assert_close(X_beside[::2], X[::2])
-    assert_close(value_beside, value)
-    assert_close(gradients[0][::2], gradient[::2])
-    assert_close(gradients[1], shared, rtol=1e-6)
-
-
 def test_complex_data():
     turn = np.diag(np.exp([0.3j, -0.4j]))
     plain = dlx.riccati.care(A, B, Q, R)
     turned = dlx.riccati.care(turn @ A @ turn.conj(), turn @ B, Q, R)
     X = turn @ plain.X @ turn.conj()
-    assert_close(turned.X, X, atol=tolerance(1e-4, 1e-12))
+    assert_close(turned.X, X, atol=tolerance(1e-5, 1e-14))
 
 
+@once
 @pytest.mark.parametrize(
     "change, match",
     [

@@ -1,5 +1,3 @@
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,7 +34,7 @@ def equation(A, B, Q, R, S, E, X):
 
 def test_double_integrator():
     solution = dlx.riccati.dare(A, B, Q, R)
-    assert_close(solution.K, [[0.42208244, 1.24392885]], rtol=tolerance(1e-5, 1e-8))
+    assert_close(solution.K, [[0.42208244, 1.24392885]], rtol=tolerance(1e-6, 1e-8))
     X = [[2.94712, 2.36921], [2.36921, 4.61313]]
     assert_close(solution.X, X, rtol=1e-5)
     assert_close(jnp.trace(solution.X), 7.56026, rtol=1e-6)
@@ -61,7 +59,7 @@ def test_matches_scipy(n, m):
         assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X)
         residual, gain = equation(A, B, Q, R, S, np.eye(n), np.asarray(solution.X))
         assert residual < 1e-13 and solution.residual < 1e-12
-        assert_close(solution.K, gain, rtol=1e-9, atol=1e-9)
+        assert_close(solution.K, gain, rtol=1e-13, atol=1e-13)
 
 
 @needs_x64
@@ -75,9 +73,9 @@ def test_descriptor_form():
         assert np.linalg.norm(E.T @ solution.X @ E - Y) < 1e-9 * np.linalg.norm(Y)
         residual, gain = equation(A, B, Q, R, S, E, np.asarray(solution.X))
         assert residual < 1e-13 and solution.residual < 1e-12
-        assert_close(solution.K, gain, rtol=1e-9, atol=1e-9)
+        assert_close(solution.K, gain, rtol=1e-12, atol=1e-12)
         loop = np.linalg.solve(E, A - B @ gain)
-        assert_close(solution.closed_loop, loop, atol=1e-9)
+        assert_close(solution.closed_loop, loop, atol=1e-12)
         # A bound, so from above but for rounding, and a close one.
         radius = np.max(np.abs(np.linalg.eigvals(loop)))
         assert -1e-12 < float(solution.spectral_radius) - radius < 1e-8
@@ -146,44 +144,16 @@ def test_least_energy():
     unstable = jnp.array([[2.0, 1.0], [0.0, 1.5]])
     solution = dlx.riccati.dare(unstable, B, jnp.zeros((2, 2)), R)
     moved = np.sort(np.abs(np.linalg.eigvals(solution.closed_loop)))
-    assert_close(moved, [1 / 2, 1 / 1.5], rtol=tolerance(1e-4, 1e-9))
+    assert_close(moved, [1 / 2, 1 / 1.5], rtol=tolerance(1e-4, 1e-12))
 
 
 @needs_x64
 def test_free_control():
     # R = 0: one-step dead-beat control of what B reaches.
     solution = dlx.riccati.dare(2 * jnp.eye(2), jnp.eye(2), Q, jnp.zeros((2, 2)))
-    assert_close(solution.K, 2 * np.eye(2), atol=1e-12)
-    assert_close(solution.X, np.eye(2), atol=1e-12)
+    assert_close(solution.K, 2 * np.eye(2), atol=1e-14)
+    assert_close(solution.X, np.eye(2), atol=1e-14)
     assert solution.spectral_radius < 1e-5
-
-
-@needs_x64
-def test_one_bad_member_harms_no_other():
-    As = np.stack([A, 0.5 * A, 0.9 * A])
-    spoilt = np.stack([A, np.diag([1.3, 0.2]), 0.9 * A])
-
-    @jax.jit
-    @functools.partial(jax.value_and_grad, argnums=(0, 1))
-    def total_of_two(As, Q):
-        batch = jax.vmap(lambda A: dlx.riccati.dare(A, B, Q, R, throw=False))(As)
-        return jnp.sum(
-            jnp.trace(batch.X[::2] + batch.K.mT[::2] @ batch.K[::2], 0, 1, 2)
-        )
-
-    solve = jax.jit(jax.vmap(lambda A: dlx.riccati.dare(A, B, Q, R, throw=False)))
-    good, bad = solve(As), solve(spoilt)
-    assert np.all(good.result == dlx.RESULTS.successful)
-    np.testing.assert_array_equal(
-        bad.result == dlx.RESULTS.successful, [True, False, True]
-    )
-    assert_close(bad.X[::2], good.X[::2])
-    value, (gradient, shared) = total_of_two(As, Q)
-    value_beside, (gradient_beside, shared_beside) = total_of_two(spoilt, Q)
-    assert_close(value_beside, value)
-    assert_close(gradient_beside[::2], gradient[::2])
-    assert_close(gradient_beside[1], np.zeros((2, 2)))
-    assert_close(shared_beside, shared, rtol=1e-6)
 
 
 @needs_x64
@@ -192,8 +162,8 @@ def test_complex_data():
     plain = dlx.riccati.dare(A, B, Q, R)
     turned = dlx.riccati.dare(turn @ A @ turn.conj(), turn @ B, Q, R)
     X = turn @ plain.X @ turn.conj()
-    assert_close(turned.X, X, atol=1e-12)
-    assert_close(turned.K, plain.K @ turn.conj(), atol=1e-12)
+    assert_close(turned.X, X, atol=1e-13)
+    assert_close(turned.K, plain.K @ turn.conj(), atol=1e-13)
 
 
 @needs_x64

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, check_second_order, needs_x64, user_error
 
 import delucax as dlx
 
@@ -212,15 +212,6 @@ def test_one_bad_member_harms_no_other(parallel):
     assert gradient[1] == 0
 
 
-def assert_second_order(line, h):
-    """First and second derivative of `line` at 0 against differences."""
-    both = jax.jit(lambda e: jax.jvp(jax.value_and_grad(line), (e,), (1.0,)))
-    (_, first), (forwards, second) = both(0.0)
-    (low, first_low), (high, first_high) = both(-h)[0], both(h)[0]
-    assert_close([first, forwards], np.full(2, (high - low) / (2 * h)), rtol=1e-7)
-    assert_close(second, (first_high - first_low) / (2 * h), rtol=1e-6)
-
-
 @pytest.mark.parametrize("parallel", [False, True])
 def test_derivatives_of_the_recursion(parallel):
     stages = random_stages(3, 3, 2, 1)
@@ -235,7 +226,7 @@ def test_derivatives_of_the_recursion(parallel):
         parts = solution.X, solution.K, solution.k, solution.p, solution.s
         return sum(jnp.sum(jnp.sin(part)) for part in parts)
 
-    assert_second_order(line, 1e-6)
+    check_second_order(line)
 
 
 def test_differential_equation():
@@ -311,7 +302,7 @@ def test_derivatives_of_the_differential_equation():
         solution = dlx.riccati.cre(A, B, Q, R, S, **options)
         return jnp.sum(jnp.sin(solution.X)) + jnp.sum(jnp.sin(solution.K))
 
-    assert_second_order(line, 1e-5)
+    check_second_order(line)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import needs_x64
 
-from delucax.math._linear_solve import is_definite, solve
+from delucax.math._linear_solve import SMALL, solve
 from delucax.riccati._spectrum import spectral_abscissa, spectral_radius
 
 
@@ -17,7 +17,6 @@ def matrices(n):
     return A, A - A.T, np.triu(A), A @ np.diag(np.logspace(-3, 3, n))
 
 
-@needs_x64
 @pytest.mark.parametrize("n", [3, 40])
 def test_radius_and_abscissa(n):
     radius, abscissa = jax.jit(spectral_radius), jax.jit(spectral_abscissa)
@@ -35,7 +34,7 @@ def test_nilpotent():
     assert abs(jax.jit(spectral_abscissa)(0 * A)) < 1e-6
 
 
-@pytest.mark.parametrize("n", [1, 2, 4, 5, 6])
+@pytest.mark.parametrize("n", [1, 4, SMALL, SMALL + 1])
 def test_solve(n):
     rng = np.random.default_rng(n)
     # A zero in the corner, so that rows have to be exchanged.
@@ -48,21 +47,6 @@ def test_solve(n):
     error = np.max(np.abs(found - exact)) / np.max(np.abs(exact))
     assert error < 1e-12
     transposed = jax.linear_transpose(lambda b: solve(matrix[0], b), right[0])
-    (back,) = transposed(right[0])
+    (back,) = jax.jit(transposed)(right[0])
     exact = np.linalg.solve(matrix[0].T, right[0])
     assert np.max(np.abs(back - exact)) < 1e-11 * np.max(np.abs(exact))
-
-
-def test_singular_is_not_finite():
-    singular = jnp.array([[1.0, 2.0], [2.0, 4.0]])
-    assert not np.all(np.isfinite(solve(singular, jnp.eye(2))))
-
-
-@pytest.mark.parametrize("n", [2, 5, 7])
-def test_definite(n):
-    rng = np.random.default_rng(n)
-    root = rng.normal(size=(n, n))
-    positive = jnp.asarray(root @ root.T)
-    least = np.linalg.eigvalsh(positive)[0]
-    assert is_definite(positive)
-    assert not is_definite(positive - 1.1 * least * jnp.eye(n))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import riccati_systems
-from helpers import dtype, tolerance
+from helpers import dtype, needs_x64, tolerance
 
 import delucax as dlx
 
@@ -16,9 +16,9 @@ N, M = 4, 2
 
 
 @functools.cache
-def solved(name):
-    solve = getattr(dlx.riccati, name)
-    return jax.jit(lambda *data: solve(*data, throw=False))
+def solver(name, compiled=False):
+    solve = functools.partial(getattr(dlx.riccati, name), throw=False)
+    return jax.jit(lambda *data: solve(*data)) if compiled else solve
 
 
 def problem(seed, descriptor):
@@ -36,22 +36,23 @@ def in_units(units, A, B, Q, R, S, E):
 
 
 def as_dtype(data):
-    return tuple(None if D is None else jnp.asarray(D, dtype()) for D in data)
+    return tuple(None if D is None else np.asarray(D, dtype()) for D in data)
 
 
 @pytest.mark.parametrize("descriptor", [False, True])
 @pytest.mark.parametrize("name", ["dare", "care"])
 def test_the_gain_is_that_of_the_plain_problem(name, descriptor):
+    solve = solver(name, compiled=descriptor)
     rng = np.random.default_rng(0)
     for seed in range(8):
         plain = problem(seed, descriptor)
         power = tolerance(2, 5)
         units = 10.0 ** rng.uniform(-power, power, N)
         data = as_dtype(in_units(units, *plain))
-        wanted, solution = solved(name)(*as_dtype(plain)), solved(name)(*data)
+        wanted, solution = solve(*as_dtype(plain)), solve(*data)
         assert solution.result == wanted.result == dlx.RESULTS.successful
-        error = jnp.max(jnp.abs(solution.K * units - wanted.K))
-        assert error < tolerance(1e-3, 1e-11) * jnp.max(jnp.abs(wanted.K))
+        error = np.max(np.abs(solution.K * units - wanted.K))
+        assert error < tolerance(1e-3, 1e-11) * np.max(np.abs(wanted.K))
         A, B, Q, R, S, E = data
         true = riccati_systems.true_residual(
             name == "dare", A, B, Q, R, solution.X, S, E
@@ -59,6 +60,7 @@ def test_the_gain_is_that_of_the_plain_problem(name, descriptor):
         assert true <= solution.residual
 
 
+@needs_x64
 def test_derivatives():
     plain = problem(0, False)
     units = np.array([1e-3, 1.0, 1e2, 1e3])
@@ -71,7 +73,7 @@ def test_derivatives():
     here, there = (
         slope(1.0, *as_dtype(data)[:4]) for data in (plain, in_units(units, *plain))
     )
-    np.testing.assert_allclose(there * units[0], here, rtol=tolerance(1e-2, 1e-10))
+    np.testing.assert_allclose(there * units[0], here, rtol=1e-10)
 
 
 def test_a_gain_in_single_precision():
@@ -79,7 +81,7 @@ def test_a_gain_in_single_precision():
     s = 10**5.6
     A = jnp.array([[1.0025, 0.0497 / s], [0.0995 * s, 0.9877]])
     B, Q = jnp.array([[0.00125], [0.05 * s]]), jnp.diag(jnp.array([1.0, s**-2]))
-    K = solved("dare")(A, B, Q, jnp.eye(1)).K
+    K = solver("dare")(A, B, Q, jnp.eye(1)).K
     np.testing.assert_allclose(K * jnp.array([1, s]), [[4.067, 2.676]], rtol=1e-3)
 
 
@@ -104,14 +106,14 @@ def test_chains_of_integrators(name, chain, rows):
     E = np.eye(n) + np.ones((n, n)) / 8 if rows else None
     R = np.eye(1)
     for weight in np.diag([1.0] + [0.0] * (n - 1)), np.eye(n):
-        wanted = solved(name)(*as_dtype((A, B, weight, R, None, E))).K
+        wanted = solver(name)(*as_dtype((A, B, weight, R, None, E))).K
         for power in tolerance((1, 2), (4, 8)):
             d = 10.0 ** np.linspace(-power, power, n)
             for by in (d, 1 / d, d / d[0]):
                 *data, F = in_units(by, A, B, weight, R, None, E)
                 if rows:
                     data[0], data[1], F = (M / by[:, None] ** 2 for M in (*data[:2], F))
-                solution = solved(name)(*as_dtype((*data, F)))
+                solution = solver(name)(*as_dtype((*data, F)))
                 assert solution.result == dlx.RESULTS.successful
-                error = jnp.max(jnp.abs(solution.K * by - wanted))
-                assert error < tolerance(1e-3, 1e-9) * jnp.max(jnp.abs(wanted))
+                error = np.max(np.abs(solution.K * by - wanted))
+                assert error < tolerance(1e-3, 1e-9) * np.max(np.abs(wanted))

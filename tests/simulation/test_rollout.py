@@ -11,6 +11,7 @@ from helpers import (
     central_difference,
     CountCalls,
     needs_x64,
+    once,
     tolerance,
     user_error,
 )
@@ -70,6 +71,7 @@ def test_matches_a_loop_by_hand(key):
     assert_close(run.final_state, run.states[-1])
 
 
+@once
 def test_shapes_and_times(key):
     run = dlx.rollout(dlx.make("pendulum"), FEEDBACK, key=key, horizon=7)
     assert run.states.shape == (8, 2) and run.controls.shape == (7, 1)
@@ -90,6 +92,7 @@ def test_time_is_not_summed(key):
     assert_close(run.controls[-1, 0], 999.9, rtol=1e-7)
 
 
+@once
 def test_applied_sees_the_saturated_control(key):
     env = lds(control_bounds=(-1.0, 1.0))
     run = dlx.rollout(env, ShowsApplied(), key=key, horizon=4, x0=jnp.zeros(2))
@@ -107,6 +110,7 @@ def test_a_batch_is_vmap(key):
         assert_close(batch.times[i], one.times)
 
 
+@needs_x64
 @pytest.mark.parametrize("horizon", [1, 16, 23])
 def test_checkpoints_change_no_number(key, horizon):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
@@ -125,8 +129,8 @@ def test_checkpoints_change_no_number(key, horizon):
     K = jnp.array([[5.0, 1.0]])
     values = [jax.value_and_grad(cost)(K, c) for c in ("step", "sqrt", None)]
     for value, gradient in values[1:]:
-        assert_close(value, values[0][0], rtol=tolerance(1e-5, 1e-12))
-        assert_close(gradient, values[0][1], rtol=tolerance(1e-3, 1e-10))
+        assert_close(value, values[0][0], rtol=1e-12)
+        assert_close(gradient, values[0][1], rtol=1e-10)
 
 
 @needs_x64
@@ -168,6 +172,7 @@ class Final(dlx.AbstractCost):
         return x[0]
 
 
+@once
 def test_keep(key):
     env = dlx.make("pendulum")
     full = dlx.rollout(env, FEEDBACK, key=key, horizon=9)
@@ -182,6 +187,7 @@ def test_keep(key):
         dlx.rollout(env, FEEDBACK, key=key, keep=("state",))
 
 
+@once
 def test_one_recorded_step(key):
     one = dlx.disturbances.FromArray(jnp.array([[0.3, -0.2]]))
     env = lds(disturbance=one, sensor_noise=one)
@@ -192,6 +198,7 @@ def test_one_recorded_step(key):
         dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=2)
 
 
+@once
 def test_sensor_noise_reaches_the_controller_alone(key):
     env = lds(sensor_noise=dlx.disturbances.Constant(1.0, size=2))
     K = jnp.array([[0.4, 1.2]])
@@ -202,6 +209,7 @@ def test_sensor_noise_reaches_the_controller_alone(key):
     assert_close(run.controls[0], -K @ (jnp.ones(2) + 1), rtol=1e-6)
 
 
+@once
 def test_termination_holds_the_state_and_charges_the_end_once(key):
     class Cost(dlx.AbstractCost):
         def __call__(self, t, x, u):
@@ -226,6 +234,7 @@ def test_termination_holds_the_state_and_charges_the_end_once(key):
     assert_close(gradient, [300.0])
 
 
+@once
 def test_no_second_compilation(key):
     traced = CountCalls()
 
@@ -255,10 +264,11 @@ def test_no_second_compilation(key):
     assert traced.count == with_start
 
 
+@once
 def test_divergence_is_an_error_or_a_status(key):
     env = dlx.make("lds", A=1e5 * jnp.eye(1), B=jnp.eye(1))
     zero = dlx.controllers.Zero(1)
-    horizon = tolerance(50, 200)
+    horizon = 50
     arguments = dict(key=key, x0=jnp.ones(1), horizon=horizon)
     with pytest.raises(RuntimeError, match=r"NaN or infinite.*step \d+ \(t = "):
         dlx.rollout(env, zero, **arguments)
@@ -282,6 +292,7 @@ def test_a_step_that_overflows_is_found_by_the_rollout(key):
     assert run.result == dlx.RESULTS.diverged
 
 
+@once
 def test_one_bad_lane_harms_no_other(key):
     env = dlx.make("lds", A=1e5 * jnp.eye(1), B=jnp.eye(1))
     zero = dlx.controllers.Zero(1)
@@ -293,6 +304,7 @@ def test_one_bad_lane_harms_no_other(key):
     assert run.total_cost[0] == 0
 
 
+@once
 @pytest.mark.parametrize(
     "arguments, match",
     [
@@ -312,6 +324,7 @@ def test_bad_arguments(key, arguments, match):
         dlx.rollout(dlx.make("pendulum"), FEEDBACK, **({"key": key} | arguments))
 
 
+@once
 def test_wrong_kinds(key):
     env = dlx.make("pendulum")
     with user_error(match="environment must be an Environment"):
@@ -324,6 +337,7 @@ def test_wrong_kinds(key):
         dlx.rollout(env, dlx.controllers.Zero(2), key=key)
 
 
+@once
 def test_slicing_in_time(key):
     run = dlx.rollout(dlx.make("pendulum"), FEEDBACK, key=key, horizon=10)
     part = run[2:5]
@@ -336,6 +350,7 @@ def test_slicing_in_time(key):
         run[3]
 
 
+@once
 def test_tables(key):
     env = dlx.make("pendulum")
     run = dlx.rollout(env, FEEDBACK, key=key, horizon=4)
@@ -351,6 +366,7 @@ def test_tables(key):
     assert_close(batch.summary()["total_cost"], batch.total_cost)
 
 
+@once
 def test_integer_actions(key):
     table = jnp.array([[-1.0], [1.0]])
     env = lds(actions=table, control_bounds=(-0.5, 0.5))
@@ -363,6 +379,7 @@ def test_integer_actions(key):
     assert run.controls[0, 0] == 0.5
 
 
+@once
 def test_random_controller_state_is_kept(key):
     env = lds()
     explore = dlx.controllers.Random(jnp.ones(1))
@@ -391,6 +408,7 @@ def test_what_follows_the_end_does_not_reach_the_gradient(key):
     assert_close(jax.grad(cost)(x0), central_difference(cost, x0), rtol=1e-6)
 
 
+@once
 def test_a_system_without_controls(key):
     decay = dlx.system(lambda t, x, u, w: -x, states=1, controls=0)
     env = dlx.Environment(
@@ -404,6 +422,7 @@ def test_a_system_without_controls(key):
     assert_close(run.final_state, [np.exp(-1.0)], rtol=1e-3)
 
 
+@once
 def test_a_changed_step_reaches_the_noise(key):
     """Euler-Maruyama increments follow the step that is taken."""
 
@@ -427,6 +446,7 @@ def test_a_changed_step_reaches_the_noise(key):
     assert_close(end(short), 0.1 * end(env), rtol=1e-5)
 
 
+@once
 def test_tables_keep_every_column(key):
     names = dict(states=("time", "cost", "x"), controls=("x",))
     plant = dlx.system(lambda t, x, u, w: jnp.concatenate([u, x[:2]]), **names)
@@ -440,6 +460,7 @@ def test_tables_keep_every_column(key):
     assert list(table)[-1] == "cost"
 
 
+@once
 def test_statistics_of_a_batch(key):
     """Of members that go up and away, and end at different times."""
     dynamics = dlx.LinearDynamics(np.eye(1), np.ones((1, 1)), dt=1.0)
@@ -475,6 +496,7 @@ class Faulty(dlx.AbstractSystem):
         return u - x
 
 
+@once
 def test_few_frames_lie_between_the_scan_and_the_vector_field():
     """Of this library's, in the traceback that a wrong field of a user's gives."""
     cost = dlx.costs.Quadratic(jnp.ones(1), jnp.ones(1))

@@ -6,12 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from helpers import (
-    assert_close,
-    dtype,
-    tolerance,
-    user_error,
-)
+from helpers import assert_close, dtype, needs_x64, once, tolerance, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -109,6 +104,14 @@ def test_switches_are_exact(how):
         assert_close(run.controls, controls)
 
 
+@jax.jit
+def intervals(switches, low, high, direction):
+    """Those that steps from `low` to `high` lie in."""
+    hold = Hold(diffrax.Tsit5(), switches, False)
+    terms = SimpleNamespace(direction=direction)
+    return jax.vmap(lambda a, b: hold._interval(terms, a, b))(low, high)
+
+
 @pytest.mark.parametrize(
     "count, t0, t1",
     [(1, -0.3, 0.1), (200, 0.0, 10.0), (200, 100.0, 101.7), (200, -0.3, 0.1)],
@@ -116,15 +119,6 @@ def test_switches_are_exact(how):
 def test_interval_of_a_step(count, t0, t1):
     grid = np.linspace(t0, t1, count + 1).astype(dtype())
     switches = jnp.asarray(grid)
-    hold = Hold(diffrax.Tsit5(), switches, False)
-    interval = jax.jit(
-        jax.vmap(
-            lambda a, b, forwards: hold._interval(
-                SimpleNamespace(direction=forwards), a, b
-            ),
-            in_axes=(0, 0, None),
-        )
-    )
     tiny = np.finfo(grid.dtype).tiny  # below it XLA flushes to zero
     below = np.where(grid == 0, -tiny, np.nextafter(grid, grid.dtype.type(-9)))
     above = np.where(grid == 0, tiny, np.nextafter(grid, grid.dtype.type(999)))
@@ -137,23 +131,23 @@ def test_interval_of_a_step(count, t0, t1):
         # Diffrax may begin one rounding before a switch and go on from there.
         (below[:-1], grid[1:]),
     ]:
-        assert_close(interval(low, high, 1), here)
-        assert_close(interval(-high, -low, -1), here)
-    assert_close(interval(-above[1:], -grid[:-1], -1), here)
-    before = jax.vmap(lambda t: interval_before(switches, t))
-    assert_close(before(grid[1:]), here)
-    assert_close(before(above[:-1]), here)
+        assert_close(intervals(switches, low, high, 1), here)
+        assert_close(intervals(switches, -high, -low, -1), here)
+    assert_close(intervals(switches, -above[1:], -grid[:-1], -1), here)
+    before = jax.jit(jax.vmap(interval_before, (None, 0)))
+    assert_close(before(switches, grid[1:]), here)
+    assert_close(before(switches, above[:-1]), here)
 
 
 @pytest.mark.parametrize(
     "solver",
     [
-        diffrax.Euler(),
-        diffrax.Heun(),
-        dlx.dynamics.RK4(),
         diffrax.Tsit5(),
-        diffrax.Dopri5(),
         diffrax.Kvaerno3(),
+        pytest.param(diffrax.Euler(), marks=needs_x64),
+        pytest.param(diffrax.Heun(), marks=needs_x64),
+        pytest.param(dlx.dynamics.RK4(), marks=needs_x64),
+        pytest.param(diffrax.Dopri5(), marks=needs_x64),
     ],
     ids=lambda solver: type(solver).__name__,
 )
@@ -187,18 +181,19 @@ def test_adaptive_steps_agree_with_scipy():
     assert_close(run.times, np.linspace(0.5, 1.5, 21), atol=tolerance(1e-6, 1e-14))
 
 
+@needs_x64
 def test_held_disturbances():
     controls, w = switching(10), switching(10, seed=1)
     run = dlx.simulate(SWITCHED, controls, 0.0, 1.0, jnp.ones(1), w=w)
     dynamics = dlx.Discretized(SWITCHED, 0.1, diffrax.Tsit5())
     expected = dlx.open_loop(dynamics, jnp.ones(1), controls, w)
-    assert_close(run.states, expected, atol=tolerance(2e-6, 1e-13))
+    assert_close(run.states, expected, atol=1e-13)
     assert_close(run.disturbances, w)
     # They are held under a control that is not, and say how long the intervals are.
     zero = dlx.controllers.Zero(1)
     run = dlx.simulate(SWITCHED, zero, 0.0, 1.0, jnp.ones(1), w=w, hold=None)
     expected = dlx.open_loop(dynamics, jnp.ones(1), jnp.zeros((10, 1)), w)
-    assert_close(run.states, expected, atol=tolerance(2e-6, 1e-13))
+    assert_close(run.states, expected, atol=1e-13)
 
 
 # Feedback.
@@ -219,6 +214,7 @@ def test_sampled_feedback_is_that_of_a_rollout(controller, how, key):
         assert_close(a, b, atol=tolerance(2e-5, 3e-7))
 
 
+@needs_x64
 def test_continuous_feedback_agrees_with_scipy():
     run = dlx.simulate(
         Sensed(),
@@ -239,17 +235,18 @@ def test_continuous_feedback_agrees_with_scipy():
         rtol=1e-13,
         atol=1e-13,
     )
-    assert_close(run.states, exact.y.T, atol=tolerance(1e-5, 1e-10))
+    assert_close(run.states, exact.y.T, atol=1e-10)
     seen = (1 + exact.t[:-1]) * exact.y[0, :-1]
-    assert_close(run.observations[:, 0], seen, atol=tolerance(1e-5, 1e-10))
-    assert_close(run.controls[:, 0], -4 * seen, atol=tolerance(5e-5, 1e-9))
+    assert_close(run.observations[:, 0], seen, atol=1e-10)
+    assert_close(run.controls[:, 0], -4 * seen, atol=1e-9)
 
 
+@needs_x64
 def test_a_function_of_time():
     signal = lambda t: jnp.stack([jnp.cos(t)])
     exact = np.sin(np.linspace(0, 1, 11))
     run = dlx.simulate(INTEGRATOR, signal, 0.0, 1.0, jnp.zeros(1), hold=None, dt=0.1)
-    assert_close(run.states[:, 0], exact, atol=tolerance(1e-6, 1e-10))
+    assert_close(run.states[:, 0], exact, atol=1e-10)
     assert_close(run.controls[:, 0], np.cos(0.1 * np.arange(10)), atol=1e-6)
     held = dlx.simulate(INTEGRATOR, signal, 0.0, 1.0, jnp.zeros(1), dt=0.1)
     sums = np.cumsum(np.cos(0.1 * np.arange(10))) * 0.1
@@ -257,6 +254,7 @@ def test_a_function_of_time():
     assert_close(held.controls[:, 0], np.cos(0.1 * np.arange(10)), atol=1e-6)
 
 
+@once
 def test_a_controller_that_draws(key):
     noise = dlx.controllers.Random(jnp.ones(1))
     run = dlx.simulate(INTEGRATOR, noise, 0.0, 1.0, jnp.zeros(1), dt=0.1, key=key)
@@ -270,6 +268,7 @@ def test_a_controller_that_draws(key):
 # What is saved.
 
 
+@needs_x64
 def test_save_times():
     controls = switching(10)
     ts = np.array([0.05, 0.1, 0.3, 0.35, 1.0])
@@ -278,12 +277,13 @@ def test_save_times():
     ends = np.concatenate([[0], np.cumsum(np.asarray(controls, float)[:, 0]) * 0.1])
     exact = np.interp(ts, np.linspace(0, 1, 11), ends)
     assert_close(run.times, ts, rtol=1e-6)
-    assert_close(run.states[:, 0], exact, atol=tolerance(2e-6, 1e-12))
+    assert_close(run.states[:, 0], exact, atol=1e-12)
     assert_close(run.controls, controls[np.array([0, 2, 3, 9])])
     assert run.steps == 4 and run.length == 4
     assert_close(run.final_state, run.states[-1])
 
 
+@once
 def test_what_a_trajectory_of_it_holds():
     run = dlx.simulate(PENDULUM, switching(5), 0.0, 0.25, UPRIGHT)
     assert run.costs is None and run.terminated is None
@@ -297,6 +297,7 @@ def test_what_a_trajectory_of_it_holds():
     assert list(table.columns[:4]) == ["time", "angle", "velocity", "torque"]
 
 
+@needs_x64
 def test_batches():
     controls, decay = switching(4), np.exp(-0.25)
     starts = jnp.array([[0.5], [1.0], [4.0]])
@@ -308,9 +309,10 @@ def test_batches():
     x = np.asarray(starts, float)
     for k in range(4):
         x = decay * x + (1 - decay) * float(controls[k, 0])
-        assert_close(batch.states[:, k + 1], x, atol=tolerance(1e-4, 1e-8))
+        assert_close(batch.states[:, k + 1], x, atol=1e-8)
 
 
+@once
 def test_compiles_once():
     count = 0
 
@@ -327,6 +329,7 @@ def test_compiles_once():
     assert count == first
 
 
+@once
 def test_progress_meter(capfd):
     meter = diffrax.TextProgressMeter()
     run = dlx.simulate(
@@ -340,6 +343,7 @@ def test_progress_meter(capfd):
 # What goes wrong.
 
 
+@once
 @pytest.mark.parametrize(
     "how, words, at",
     [
@@ -361,6 +365,7 @@ PID = diffrax.PIDController(rtol=1e-6, atol=1e-6)
 U, X = jnp.zeros((4, 1)), jnp.zeros(2)
 
 
+@once
 @pytest.mark.parametrize(
     "change, words",
     [
@@ -456,6 +461,7 @@ def test_errors(change, words):
         dlx.simulate(*positional, **arguments)
 
 
+@once
 def test_traced_intervals_are_an_error():
     f = lambda dt: dlx.simulate(PENDULUM, FEEDBACK, 0.0, 1.0, X, dt=dt).final_state
     with user_error(match="must be known numbers, not traced ones"):

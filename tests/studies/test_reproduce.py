@@ -1,19 +1,24 @@
 """The report of the paper, from studies that take no time."""
 
+import base64
 import csv
 
+import jax
 import numpy as np
 import pytest
 from helpers import once, user_error
 from matplotlib.figure import Figure
 
-from delucax import studies
+from delucax import studies, training
+from delucax.controllers import mlp_policy
+from delucax.environments import pendulum
+from delucax.studies._swing_up import spread_starts
 from delucax.studies.paper import (
     _gradients,
     _reproduce,
     _wall_clock,
 )
-from delucax.studies.paper._finding import Claim, Finding
+from delucax.studies.paper._finding import Claim, Finding, side_by_side
 
 
 pytestmark = once
@@ -58,7 +63,8 @@ def test_the_report_holds_claims_tables_and_images(tmp_path, made_up):
     page = (tmp_path / "report.html").read_text()
     assert "1 of 3 claims hold" in page
     assert "One is &lt; two. Measured: 1, small is True" in page
-    assert page.count("<svg") == 1 and (tmp_path / "line.png").is_file()
+    image = base64.b64encode((tmp_path / "line.png").read_bytes()).decode()
+    assert f'<img src="data:image/png;base64,{image}" alt="line">' in page
     assert '<img src="data:image/gif;base64,R0lGODlh" alt="breath">' in page
     assert "RuntimeError: no &lt;plant&gt;" in page
     assert "no <plant>" in (tmp_path / "broken.txt").read_text()
@@ -104,3 +110,28 @@ def test_a_load_that_comes_and_goes_meets_all_simulators(monkeypatch):
     seconds = _wall_clock.take_turns([taking(0.01), taking(1.0)], 6)
     assert seconds.shape == (6, 2) and seconds.std(axis=0).min() > 0
     np.testing.assert_allclose(seconds[:, 1] / seconds[:, 0], 100)
+
+
+def test_several_seeds_descend_as_each_alone():
+    losses = _gradients.train_linear(5, np.arange(2), progress=False).history.loss
+    assert losses.shape == (5, 2)
+    alone = _gradients.train_linear(5, 1, progress=False).history.loss
+    np.testing.assert_allclose(losses[:, 1], alone, rtol=1e-5)
+
+
+def test_a_horizon_that_is_data_gives_the_same_variance():
+    draws = 4
+    short, _ = _gradients._over_horizons((2, 5), draws)
+    env = spread_starts(pendulum())
+    policy = mlp_policy(env, width=32, depth=1, key=jax.random.key(0))
+    loss = training.expected_cost(env, batch=1, horizon=2)
+    (each,) = _gradients._estimates([(training.analytic, loss, policy)], draws)
+    variance = np.sum(np.var(each, axis=0)) / _gradients.DRAWN
+    np.testing.assert_allclose(short["analytic"], variance, rtol=1e-4)
+    assert short["REINFORCE"] > short["analytic"]
+
+
+def test_side_by_side_keeps_the_order_and_raises():
+    assert side_by_side(lambda x: 2 * x, range(4)) == [0, 2, 4, 6]
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(lambda x: 1 / x, (1, 0))

@@ -1,5 +1,6 @@
 """Tanks, a motor, masses on springs and oscillators."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,12 @@ s = dlx.systems
 
 def field(system, x, u, w=None):
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
-    return system.vector_field(0.0, x, u, None if w is None else jnp.asarray(w))
+    return vector_field(system, x, u, None if w is None else jnp.asarray(w))
+
+
+@eqx.filter_jit
+def vector_field(system, x, u, w):
+    return system.vector_field(0.0, x, u, w)
 
 
 def test_tanks_drain_by_torricelli():

@@ -27,6 +27,7 @@ def test_parameters_follow_the_precision(value):
         assert dx.dtype == precision
 
 
+@once
 def test_parameters_are_leaves():
     gradient = eqx.filter_grad(
         lambda s: s.vector_field(0.0, jnp.ones(2), jnp.zeros(1), None)[1]
@@ -45,6 +46,7 @@ def test_illegal_parameters():
         Spring(float("inf"))
 
 
+@once
 def test_names_are_needed():
     class Nameless(dlx.AbstractSystem):
         state_names = "x"
@@ -57,6 +59,7 @@ def test_names_are_needed():
         Nameless()
 
 
+@once
 def test_sizes_and_defaults():
     spring = Spring()
     assert (spring.state_size, spring.control_size, spring.disturbance_size) == (
@@ -71,6 +74,7 @@ def test_sizes_and_defaults():
         spring.equilibrium()
 
 
+@once
 def test_system_from_a_function():
     car = dlx.system(
         lambda t, x, u, w: jnp.stack([x[1], u[0] + w[0]]),
@@ -89,6 +93,7 @@ def test_system_from_a_function():
         dlx.system(3.0, states=1, controls=1)
 
 
+@once
 def test_pendulum_angles_wrap():
     pendulum = dlx.systems.Pendulum()
     x = jnp.array([3.0, 1.0])
@@ -97,6 +102,7 @@ def test_pendulum_angles_wrap():
     )
 
 
+@once
 def test_angles_are_states():
     class Arm(Spring):
         angle_names = ("y",)
@@ -105,6 +111,7 @@ def test_angles_are_states():
         Arm()
 
 
+@once
 def test_linear_system():
     A, B = jnp.array([[0.0, 1.0], [-2.0, -3.0]]), jnp.array([[0.0], [1.0]])
     point = dict(x_ref=jnp.ones(2), u_ref=jnp.ones(1), dx_ref=jnp.array([0.5, 0.0]))

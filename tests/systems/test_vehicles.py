@@ -1,5 +1,6 @@
 """The quadrotors, the winds, the cars and the arm."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,12 @@ HOVER = [0.4905, 0.4905]
 
 def field(system, x, u, w=None):
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
-    return system.vector_field(0.0, x, u, None if w is None else jnp.asarray(w))
+    return vector_field(system, x, u, None if w is None else jnp.asarray(w))
+
+
+@eqx.filter_jit
+def vector_field(system, x, u, w):
+    return system.vector_field(0.0, x, u, w)
 
 
 def test_planar_quadrotor_turns_and_leans_as_the_paper_says():

@@ -170,7 +170,7 @@ def test_level_of_the_intervals():
         lambda level: sysid.linear(states, controls, level=level),
         lambda level: sysid.arx(states, controls, **back, level=level),
         lambda level: sysid.physical(
-            GUESS, pendulum[:41], torques[:40], "system.length", level=level
+            GUESS, pendulum, torques, ("system.length", "system.mass"), level=level
         ),
     )
     for fitted in fits:

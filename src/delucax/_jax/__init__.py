@@ -22,6 +22,7 @@ from ._components import (
     join_state as join_state,
     split_state as split_state,
     stack_steps as stack_steps,
+    with_stores as with_stores,
 )
 from ._derivatives import (
     first_possible as first_possible,

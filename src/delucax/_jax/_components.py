@@ -10,7 +10,7 @@ A loop carries the state in the same way: each component of a batch is then a ve
 its own that stays in registers.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -24,6 +24,9 @@ from ._batches import fence
 
 COMPONENTS_UP_TO = 16
 """Vectors with more entries are left whole, to keep programs short."""
+
+_REPEATED_UP_TO = 300
+"""A value of more operations is stored."""
 
 _STACKED_FIRST_UP_TO = 6
 """Trajectories of more components are extended before they are stacked."""
@@ -85,15 +88,57 @@ def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     out = _on_components(primitive, params, shape, values)
     if out is not None:
         return out
-    bound = primitive.get_bind_params(params)
-    # JAX before 0.11 returns the functions inside apart from the other parameters.
-    functions, bound = bound if isinstance(bound, tuple) else ((), bound)
-    out = primitive.bind(*functions, *map(_whole, values), **bound)
-    out = out if primitive.multiple_results else [out]
+    out = _bind(equation, map(_whole, values))
     # The sines of `delucax.math` are stored once. A solve has several outputs, and a
     # fence around them would ask for a cotangent of those that have none.
     single = primitive.name == "custom_jvp_call" and len(out) == 1 and shape == ()
     return fence(*out) if single else out
+
+
+def _bind(equation: Any, values: Iterable[Any]) -> Sequence[Any]:
+    primitive = equation.primitive
+    bound = primitive.get_bind_params(equation.params)
+    # JAX before 0.11 returns the functions inside apart from the other parameters.
+    functions, bound = bound if isinstance(bound, tuple) else ((), bound)
+    out = primitive.bind(*functions, *values, **bound)
+    return out if primitive.multiple_results else [out]
+
+
+def with_stores(function: Callable[..., Any], *like: Any) -> Callable[..., Any]:
+    """`function` with long chains of operations behind fences.
+
+    XLA repeats cheap operations wherever their value is used, and so it repeats the
+    start of a chain, such as the stages of a step, in each of its later programs. What
+    would be repeated is counted, and a value of too many operations is stored.
+
+    **Arguments:**
+
+    - `function`: of pytrees of arrays, such as `by_components` returns.
+    - `like`: the shapes of its arguments. It is traced here, and not in each
+        derivative.
+
+    **Returns:** a function with the same values, which compiles in less time.
+    """
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*like)
+    jaxpr = closed.jaxpr
+
+    def replayed(*args):
+        repeated: dict[Any, int] = {}
+        env = dict(zip(jaxpr.constvars, closed.consts, strict=True))
+        env.update(zip(jaxpr.invars, jax.tree.leaves(args), strict=True))
+        read = lambda atom: atom.val if isinstance(atom, Literal) else env[atom]
+        for equation in jaxpr.eqns:
+            out = _bind(equation, map(read, equation.invars))
+            if equation.primitive.name in _ELEMENTWISE:
+                given = [v for v in equation.invars if not isinstance(v, Literal)]
+                count = 1 + sum(repeated.get(v, 0) for v in given)
+                out = out if count <= _REPEATED_UP_TO else fence(*out)
+                count = count if count <= _REPEATED_UP_TO else 0
+                repeated[equation.outvars[0]] = count
+            env.update(zip(equation.outvars, out, strict=True))
+        return jax.tree.unflatten(jax.tree.structure(shapes), map(read, jaxpr.outvars))
+
+    return replayed
 
 
 def _on_components(

@@ -243,7 +243,7 @@ def hinf_norm(
             system = dlx.systems.LinearSystem(A, B, C=jnp.array([[1.0, 0.0]]))
             return dlx.analysis.hinf_norm(system).gain
 
-        jax.grad(peak)(0.1)
+        jax.jit(jax.grad(peak))(0.1)
         ```
     """
     peak = peak_gain(state_space(model, inputs, "hinf_norm"))

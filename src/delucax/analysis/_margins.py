@@ -89,7 +89,6 @@ def disk_margin(
         A = jnp.array([[-1.0, 0.5], [0.0, -2.0]])
         loop = dlx.systems.LinearSystem(A, jnp.eye(2), 3 * jnp.eye(2))
         dlx.analysis.disk_margin(loop).margin
-        dlx.analysis.disk_margin(loop, channel=0).margin
         ```
     """
     where = "disk_margin"
@@ -237,9 +236,9 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
         import delucax as dlx
         import jax.numpy as jnp
 
-        upright = dlx.linearize(dlx.make("pendulum").dynamics)
-        K = dlx.riccati.dare(upright.A, upright.B, jnp.eye(2), jnp.eye(1)).K
-        loop = dlx.LinearDynamics(upright.A, upright.B, C=K, dt=upright.dt)
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        K = dlx.riccati.care(upright.A, upright.B, jnp.eye(2), jnp.eye(1)).K
+        loop = dlx.systems.LinearSystem(upright.A, upright.B, C=K)
         dlx.analysis.margins(loop).phase_margin
         ```
     """

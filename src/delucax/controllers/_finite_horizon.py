@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -110,23 +111,7 @@ class FiniteHorizonLQR(AbstractController):
             check_at_most(T, steps, "horizon", where, "steps of dynamics")
         given = reference, control_reference, disturbance
         signals = as_signals(dynamics, given, where)
-
-        def along(t):
-            here = KnownSignals(dynamics.at(t), *signals, difference)
-            return here.state(t), here.control(t), here.next_state(t)
-
-        self.x_ref, self.u_ref, x_next = jax.vmap(along)(jnp.arange(T) * dynamics.dt)
-        end = T * dynamics.dt
-        # The last step needs the reference one step beyond the horizon.
-        if signals[0] is not None:
-            last = signals[0](end)
-        elif steps == T:
-            last = dynamics.x_next[-1]
-        else:
-            last = dynamics.at(end).x_ref
-        targets = jnp.concatenate([self.x_ref[1:], last[None]])
-        # d[k], by which the dynamics miss r[k+1] from r[k]: e_next = A e + B v + d.
-        d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
+        self.x_ref, self.u_ref, d = _along(dynamics, signals, difference, T)
         A, B = (a if steps is None else a[:T] for a in (dynamics.A, dynamics.B))
         # With the residual d of the reference the cost to go has a linear term, whose
         # share of the control is the feed-forward k.
@@ -144,3 +129,31 @@ class FiniteHorizonLQR(AbstractController):
         x_ref, u_ref, K, k = row_at((self.x_ref, self.u_ref, self.K, self.k), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference)) - k
         return u.astype(y.dtype), state
+
+
+@eqx.filter_jit
+def _along(
+    dynamics: LinearDynamics,
+    signals: tuple[Any, Any, Any],
+    difference: Difference | None,
+    T: int,
+) -> tuple[Array, Array, Array]:
+    """The references at each step of the horizon, and the residuals of the state's."""
+
+    def at(t):
+        here = KnownSignals(dynamics.at(t), *signals, difference)
+        return here.state(t), here.control(t), here.next_state(t)
+
+    x_ref, u_ref, x_next = jax.vmap(at)(jnp.arange(T) * dynamics.dt)
+    end = T * dynamics.dt
+    # The last step needs the reference one step beyond the horizon.
+    if signals[0] is not None:
+        last = signals[0](end)
+    elif dynamics.is_time_varying and dynamics.A.shape[0] == T:
+        last = dynamics.x_next[-1]
+    else:
+        last = dynamics.at(end).x_ref
+    targets = jnp.concatenate([x_ref[1:], last[None]])
+    # d[k], by which the dynamics miss r[k+1] from r[k]: e_next = A e + B v + d.
+    d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
+    return x_ref, u_ref, d

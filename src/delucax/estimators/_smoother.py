@@ -105,7 +105,7 @@ def run_filter(
             kalman = dlx.estimators.KalmanFilter(dynamics, jnp.eye(1), V)
             return dlx.estimators.run_filter(kalman, y).log_likelihood
 
-        jax.grad(log_likelihood)(0.0)
+        jax.jit(jax.grad(log_likelihood))(0.0)
         ```
     """
     where = "run_filter"

@@ -107,23 +107,20 @@ class _Elimination(lx.AbstractLinearSolver):
 
         # Of a batch of vectors with one matrix, the matrix is eliminated once.
         def step(k, carry):
-            matrix, x, order = carry
+            matrix, x, unused, order = carry
             column = _entry(matrix, k, axis=1)
             # The pivot is the largest entry in a row that has had none.
-            pivot = xp.argmax(xp.where(order < n, -1, xp.abs(column)))
+            pivot = xp.argmax(xp.where(unused, xp.abs(column), -1))
             here = rows == pivot
             value = _entry(column, pivot)
             row, entry = _entry(matrix, pivot) / value, _entry(x, pivot) / value
             matrix = xp.where(here[:, None], row, matrix - column[:, None] * row)
             x = xp.where(here, entry, x - column * entry)
-            return matrix, x, xp.where(here, k, order)
+            return matrix, x, unused & ~here, xp.where(rows == k, pivot, order)
 
-        _, x, order = lax.fori_loop(0, n, step, (state, vector, xp.full(n, n)))
-        x = (
-            xp.zeros_like(x)
-            .at[order]
-            .set(x, mode="promise_in_bounds", unique_indices=True)
-        )
+        start = state, vector, xp.full(n, True), rows
+        _, x, _, order = lax.fori_loop(0, n, step, start)
+        x = x.at[order].get(mode="promise_in_bounds", unique_indices=True)
         return x, lx.RESULTS.successful, {}
 
     def transpose(self, state, options):

@@ -75,6 +75,8 @@ class _Progress(NamedTuple):
     """The weight of the defects."""
     rounding: Array
     """By how much rounding may change the cost."""
+    negligible: Array
+    """Whether the decrease that `policy` predicts is less than that."""
     started: Array
     """Whether the starts have been compared."""
     done: Array
@@ -123,7 +125,7 @@ def optimise(
         )
     no, nothing = jnp.asarray(False), jnp.zeros_like(controls)
     policy = Policy(now.gains, nothing, nothing, zero, zero, zero, no)
-    first = _Progress(now, policy, defects, zero + 1, ~no, zero, zero, no, no)
+    first = _Progress(now, policy, defects, zero + 1, ~no, zero, zero, no, no, no)
     body = functools.partial(_iterate, problem, options, starts, count)
     now = lax.while_loop(lambda progress: ~progress.done, body, first).now
     counts = jnp.arange(options.max_iterations + 1)
@@ -171,9 +173,11 @@ def _iterate(
     terms = terms + jnp.sum(jnp.abs(stages.v * states[-1]))
     rounding = jnp.finfo(z.dtype).eps * (jnp.abs(cost) + terms)
     # The predicted decrease may be below the rounding of the cost. Full steps still
-    # lower the gradient then; once they no longer do, the iteration has converged.
+    # lower the gradient then; once they no longer do, the iteration has converged. A
+    # gradient that rises may lift the prediction above the rounding again.
     predicted = -policy.slope - policy.curvature / 2
-    spent = (jnp.abs(predicted) <= rounding) & (mu == 0) & (tolerance > 0)
+    negligible = (jnp.abs(predicted) <= rounding) & (mu == 0) & (tolerance > 0)
+    spent = negligible | (before.negligible & accepted)
     spent = spent & (residual >= now.residual)
     converged = policy.ok & closed & (settled | spent) & ~failed
     result = choose(converged, RESULTS.successful, RESULTS.not_converged)
@@ -192,10 +196,8 @@ def _iterate(
     )
     penalty = _penalty(before.penalty, defects, policy)
     done = failed | converged | (iteration >= options.max_iterations)
-    started = jnp.ones_like(started)
-    return _Progress(
-        after, policy, defects, delta, exact, penalty, rounding, started, done
-    )
+    changing = delta, exact, penalty, rounding, negligible, jnp.ones_like(started)
+    return _Progress(after, policy, defects, *changing, done)
 
 
 def _searched(problem, options, starts, count, before: _Progress):

@@ -251,7 +251,7 @@ def ilqr(
             plan = dlx.planning.ilqr(heavier, cost, jnp.array([0.5, 0.0]), start)
             return plan.cost
 
-        plan.cost, jax.grad(optimal)(1.0)
+        plan.cost, jax.jit(jax.grad(optimal))(1.0)
         ```
     """
     planner = ILQR(max_iterations, tolerance)

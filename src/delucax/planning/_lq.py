@@ -12,7 +12,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._jax import first_possible
+from .._jax import (
+    by_components,
+    first_possible,
+    join_state,
+    split_state,
+    with_stores,
+)
 from ..math import matvec
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..math._small import products_whole
@@ -71,7 +77,16 @@ def model(
     # State and control are one vector, so that each derivative is taken once, with its
     # cross terms.
     z = jnp.concatenate([states[:-1], controls], axis=1)
-    step = lambda z, t, w: problem.step(t, z[:size], z[size:], w)
+    like = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), (z, t, problem.w)
+    )
+
+    @by_components
+    def advance(parts, t, w):
+        z = join_state(parts, like[0].size)
+        return problem.step(t, z[:size], z[size:], w)
+
+    step = with_stores(lambda z, t, w: advance(split_state(z), t, w), *like)
     cost = lambda z, t: problem.cost(t, z[:size], z[size:])
     final_cost = lambda x: problem.cost.final(end, x)
     constraints = lambda z, t: problem.stage_constraints(t, z[:size], z[size:])

@@ -57,9 +57,9 @@ class Plan(AbstractController):
         import jax
         import jax.numpy as jnp
 
-        env = dlx.make("planar_quadrotor", horizon=40)
+        env = dlx.make("planar_quadrotor", horizon=30)
         _, hover = env.dynamics.equilibrium()
-        start = jnp.tile(hover, (40, 1))
+        start = jnp.tile(hover, (30, 1))
         plan = dlx.planning.ilqr(env.dynamics, env.cost, env.initial_state, start)
         dlx.rollout(env, plan, key=jax.random.key(0)).total_cost
         ```

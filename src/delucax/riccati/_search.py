@@ -2,7 +2,7 @@
 perturbed problems that tell why there is no solution."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Float, Int
 
@@ -171,10 +171,15 @@ def search(
         )
         return kept(at.point, best), numbers(*after, dtype=dtype)
 
-    # The verdict on nothing: the first residual is smaller, and the pair stabilisable.
-    most, kind = xp.inf, xp.where(well_posed, FIRST, DONE)
-    verdict = numbers(kind, most, most, most, -most, 0, 0, 0, 1, 0, 0, dtype=dtype)
-    return while_loop(lambda carry: carry[1][0] != DONE, body, (point, verdict))
+    start = point, no_verdict(xp.where(well_posed, FIRST, DONE), dtype)
+    return while_loop(lambda carry: carry[1][0] != DONE, body, start)
+
+
+def no_verdict(kind: Any, dtype: Any) -> Array:
+    """The verdict before an attempt of this kind: the first residual is smaller, and
+    the pair stabilisable."""
+    most = xp.inf
+    return numbers(kind, most, most, most, -most, 0, 0, 0, 1, 0, 0, dtype=dtype)
 
 
 def weights(

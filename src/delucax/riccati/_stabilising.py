@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 
-from .._jax import compiled_unless_on_host, custom_jvp, stop_gradient, xp
+from .._jax import compiled_unless_on_host, custom_jvp, matmul, stop_gradient, xp
 from .._results import raise_on_failure, Result
 from .._typing import Array, BoolScalar, Square
 from ..math._linear_solve import (
@@ -28,13 +28,24 @@ from ._arguments import (
 )
 from ._doubling import continuous_start, discrete_start
 from ._residual import (
+    if_needed,
     is_small,
     matrices_of,
     newton_refine,
     riccati_residual,
     stationary,
 )
-from ._search import Attempt, in_units, search, SECOND, units, Verdict, weights
+from ._search import (
+    Attempt,
+    DONE,
+    in_units,
+    no_verdict,
+    search,
+    SECOND,
+    units,
+    Verdict,
+    weights,
+)
 from ._spectrum import abscissa_and_size, spectral_radius
 
 
@@ -131,16 +142,13 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
 @compiled_unless_on_host
 @full_precision
 def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
-    """The solution, computed with states in units that fit."""
-    by = d, f = units(data)
-    solved = _certified(discrete, in_units(by, data), d)
+    solved = _certified(discrete, data)
     verdict = Verdict(*stop_gradient(solved.numbers))
-    # Back to the user's units, by powers of two: without rounding.
     return RiccatiSolution(
-        X=solved.X * (f[:, None] * f),
-        K=solved.K * d,
+        X=solved.X,
+        K=solved.K,
         residual=verdict.unscaled,
-        closed_loop=solved.closed_loop / (d[:, None] / d),
+        closed_loop=solved.closed_loop,
         iterations=verdict.iterations.astype(int),
         result=verdict.result(solved.well_posed),
         **{"spectral_radius" if discrete else "spectral_abscissa": verdict.bound},
@@ -148,13 +156,15 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
 
 
 class _Solved(NamedTuple):
-    """The best `X`, its gain and loop, and the verdict on it in numbers."""
+    """The best `X`, its gain and loop, the verdict on it in numbers, and the units of
+    states and rows that it was found in."""
 
     X: Square
     K: Array
     closed_loop: Square
     numbers: Array
     well_posed: BoolScalar
+    by: Array
 
     @property
     def differentiable(self) -> BoolScalar:
@@ -163,25 +173,42 @@ class _Solved(NamedTuple):
 
 
 @functools.partial(custom_jvp, nondiff_argnums=(0,))
-def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
-    """The certified search for the stabilising `X`, for data in balanced units, `by`
-    times the user's."""
-    A, B, Q, R, S, E = data
+def _certified(discrete: bool, data: RiccatiData) -> _Solved:
+    """The certified search for the stabilising `X`."""
+    A, B, Q, _, S, _ = data
+    (n, m), dtype = B.shape, A.dtype
+    # NaN and infinity, times zero, are NaN, which any sum keeps.
+    finite = xp.sum(0 * xp.concatenate([A, Q, B.T, S.T])) == 0
+    unknown = xp.full((2 * n + m, n), xp.nan, dtype)
+    # Of data that are not finite these remain: not well posed.
+    nothing = _Solved(
+        *matrices_of(unknown), no_verdict(DONE, dtype), finite, xp.ones((2, n), dtype)
+    )
+    # In a loop of one round, which XLA on CPU compiles as a whole if the arrays are
+    # small: in less time than operation by operation, and it runs sooner.
+    solved = lambda _, data: _search(discrete, data)
+    return if_needed(finite, solved, nothing, (data,))
+
+
+def _search(discrete: bool, data: RiccatiData) -> _Solved:
+    """The search, with states in units that fit."""
+    by = d, f = units(data)
+    A, B, Q, R, S, E = data = in_units(by, data)
     n, eps = A.shape[0], float(xp.finfo(A.dtype).eps)
-    # The starting points are computed for E^-1 A and E^-1 B.
-    plain = (A, B) if E is None else tuple(map(factorised(E), (A, B)))
     # In discrete time R + B'XB is inverted, in continuous time R alone.
     well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
-    # NaN and infinity, times zero, are NaN, which any sum keeps. R passed a comparison.
-    given = xp.concatenate([plain[0], Q, plain[1].T, S.T])
-    well_posed = well_posed & (xp.sum(0 * given) == 0)
+    # The starting points are computed for E^-1 A and E^-1 B.
+    plain = A, B
+    if E is not None:
+        plain = tuple(map(factorised(E), plain))
+        well_posed = well_posed & (xp.sum(0 * xp.concatenate(plain, axis=1)) == 0)
     small = is_small(B)
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array) -> Attempt:
-        here, size_Q = weights(kind, data, by)
+        here, size_Q = weights(kind, data, d)
         start = here._replace(A=plain[0], B=plain[1])
         if discrete:
             height = xp.where(kind == SECOND, _SECOND_START * size_Q, size_Q)
@@ -191,7 +218,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
             X, size_G, iterations = continuous_start(start, kind)
         # Residuals in the balanced and in the user's units.
         left = newton_refine(
-            lambda X, flag: riccati_residual(discrete, here, X, small or flag, by),
+            lambda X, flag: riccati_residual(discrete, here, X, small or flag, d),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
             controls=here.B.shape[1],
@@ -202,7 +229,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
         if discrete:
             bound = spectral_radius(loop)
             # A stable loop may belong to a saddle point of an indefinite cost.
-            weight = here.R + here.B.T @ X @ here.B
+            weight = here.R + matmul(here.B.T, matmul(X, here.B))
             gap = xp.where(is_semidefinite(weight), 1 - bound, -xp.inf)
             rounding, scale = xp.asarray(n * eps, A.dtype), 1.0
             # Eigenvalues come in pairs z, 1/z. Where two meet on the circle, data that
@@ -235,21 +262,28 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> _Solved:
 
     unknown = xp.full((2 * n + B.shape[1], n), xp.nan, A.dtype)
     point, numbers = search(attempt, unknown, well_posed)
-    return _Solved(*matrices_of(point), numbers, well_posed)
+    return _Solved(*_in_users_units(by, *matrices_of(point)), numbers, well_posed, by)
+
+
+def _in_users_units(by, X, K, loop):
+    """Back from other units, by powers of two: without rounding."""
+    d, f = by
+    return X * (f[:, None] * f), K * d, loop / (d[:, None] / d)
 
 
 @_certified.defjvp
 @full_precision
 def _certified_jvp(discrete, primals, tangents):
     """By the implicit function theorem; zero in unsolved members."""
-    data, _ = primals
     solved = _certified(discrete, *primals)
-    ok = solved.differentiable
+    ok, by = solved.differentiable, stop_gradient(solved.by)
+    d, f = by
     # Masked at input and output, so that a failed member's NaN does not spread.
     if_ok = lambda tree: jax.tree.map(lambda M: xp.where(ok, M, 0), tree)
-    tangent = if_ok(tangents[0])
-    A, B, Q, R, S, E = data
-    (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, solved.X), (R, E))
+    tangent = if_ok(in_units(by, *tangents))
+    A, B, Q, R, S, E = in_units(by, *primals)
+    X = solved.X / (f[:, None] * f)
+    (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, X), (R, E))
     safe = RiccatiData(A, B, Q, R, S, E)
     # The derivative of the equation in X is the Lyapunov operator of the closed loop:
     # dX solves a Lyapunov equation whose constant is the derivative in the data.
@@ -261,9 +295,8 @@ def _certified_jvp(discrete, primals, tangents):
     # The gain is a formula in X and the data, whose derivatives are then its own.
     feedback = lambda *at: _terms(discrete, *at)[2:]
     _, (dK, d_loop) = jax.jvp(feedback, (safe, X), (tangent, dX))
-    return solved, no_tangent(solved)._replace(
-        X=dX, K=if_ok(dK), closed_loop=if_ok(d_loop)
-    )
+    dX, dK, d_loop = _in_users_units(by, dX, if_ok(dK), if_ok(d_loop))
+    return solved, no_tangent(solved)._replace(X=dX, K=dK, closed_loop=d_loop)
 
 
 def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array]:

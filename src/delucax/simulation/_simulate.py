@@ -153,7 +153,7 @@ def simulate(
             )
             return jnp.sum(trajectory.final_state**2)
 
-        jax.grad(cost)(jnp.zeros((20, 1)))
+        jax.jit(jax.grad(cost))(jnp.zeros((20, 1)))
 
         feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
         sampled = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, dt=0.05)

@@ -143,9 +143,10 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... 
         ```python
         import delucax as dlx
         import jax
+        import jax.numpy as jnp
 
-        noise = dlx.disturbances.Gaussian(0.1, size=2)
-        env = dlx.make("lds", key=jax.random.key(0), disturbance=noise)
+        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         learner = dlx.controllers.gpc(env.dynamics, env.cost)
         run = dlx.rollout(env, learner, key=jax.random.key(0))
         best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)

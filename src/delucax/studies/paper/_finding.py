@@ -1,5 +1,7 @@
 """The findings of a study of the paper."""
 
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -48,6 +50,13 @@ def paired_ratio(
     """The ratio of the means over the same seeds, and its 95% interval."""
     pairs = np.stack([one, other], axis=1)
     return Bootstrap(statistic=np.mean).paired([pairs], ratio=True)
+
+
+def side_by_side(function: Callable[..., Any], arguments: Iterable[Any]) -> list[Any]:
+    """The results for each argument, from threads: nearly all of the time of a study is
+    compilation, and a program compiles on one core."""
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        return list(pool.map(function, arguments))
 
 
 def draw_panels(count: int, size: tuple[float, float], **options: Any) -> Any:

@@ -2,22 +2,26 @@
 first figure, right), and the variance of the estimators (Section 2)."""
 
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from ... import training
+from ..._module import replace
 from ...controllers import Gaussian, Linear, MLP, mlp_policy
 from ...environments import pendulum
 from ...simulation import rollout
 from .._swing_up import spread_starts
-from ._finding import Claim, draw_panels, Finding
+from ._finding import Claim, draw_panels, Finding, side_by_side
 
 
 EPISODE, RATE, GOAL = 50, 0.01, 2.0
@@ -36,26 +40,27 @@ def policy_gradient(small: bool = False) -> Finding:
     steps, seeds = (400, 3) if small else (1500, 5)
     scales, pairs = ((0.1,), (1, 16)) if small else ((0.05, 0.1, 0.3), (1, 4, 16, 64))
 
-    def train(estimator, seed, rate=RATE):
-        options: Any = dict(gradient=estimator, progress=False)
-        return np.asarray(train_linear(steps, seed, rate, **options).history.loss)
+    def losses(seed, rate=RATE, **options):
+        fitted = train_linear(steps, seed, rate, progress=False, **options)
+        return np.asarray(fitted.history.loss).T
 
-    exact = train(training.analytic, 0)
-    first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
+    exact = losses(0)
+    first, faster = _first(exact), _first(losses(0, TWICE))
     rows: Any = [("through the rollout", 1, int(first is not None), first, exact[-1])]
-    curves, fewest = {}, []
-    for scale in scales:
-        for count in pairs:
-            estimator = training.EvolutionStrategies(scale, 2 * count)
-            runs = [train(estimator, seed) for seed in range(seeds)]
-            when = [_first(run) for run in runs]
-            # The loss itself, which is one more rollout a step, is not charged.
-            cost = [2 * count * w for w in when if w is not None]
-            curves[scale, count], fewest = runs, fewest + cost
-            name = f"evolution strategies, sigma {scale}, {count} pairs"
-            median = float(np.median(cost)) if cost else None
-            at_end = float(np.median([run[-1] for run in runs]))
-            rows.append((name, seeds, len(cost), median, at_end))
+    settings = list(itertools.product(scales, pairs))
+    estimators = [training.EvolutionStrategies(s, 2 * count) for s, count in settings]
+    evolve = lambda estimator: losses(np.arange(seeds), gradient=estimator)
+    curves = dict(zip(settings, side_by_side(evolve, estimators), strict=True))
+    fewest = []
+    for (scale, count), runs in curves.items():
+        when = [_first(run) for run in runs]
+        # The loss itself, which is one more rollout a step, is not charged.
+        cost = [2 * count * w for w in when if w is not None]
+        fewest += cost
+        name = f"evolution strategies, sigma {scale}, {count} pairs"
+        median = float(np.median(cost)) if cost else None
+        at_end = float(np.median([run[-1] for run in runs]))
+        rows.append((name, seeds, len(cost), median, at_end))
     least = min(fewest) if fewest else None
     claims = [
         descent_claim(first, faster),
@@ -98,13 +103,23 @@ def _mean_cost() -> Callable[..., Any]:
     return lambda controller, key: total(controller, key) / EPISODE
 
 
+@functools.cache
+def _descent(rate: float) -> optax.GradientTransformation:
+    """Gradient descent; cached, because `fit` compiles anew for a new one."""
+    return optax.sgd(rate)
+
+
 def train_linear(
-    steps: int, seed: int = 0, rate: float = RATE, **options: Any
+    steps: int, seed: Any = 0, rate: float = RATE, **options: Any
 ) -> training.Fitted:
-    """Descend with a linear policy from zero; with the options of `fit`."""
-    options["key"] = jax.random.key(seed)
-    start = Linear(jnp.zeros((1, 2)))
-    return training.fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
+    """Descend with a linear policy from zero, or with several for an array of seeds;
+    with the options of `fit`."""
+    start, key_of = Linear(jnp.zeros((1, 2))), jr.key
+    if np.ndim(seed):
+        start = jax.tree.map(lambda K: jnp.stack([K] * len(seed)), start)
+        key_of = jax.vmap(jr.key)
+    options["key"] = key_of(seed)
+    return training.fit(_mean_cost(), start, _descent(rate), steps, **options)
 
 
 def descent_claim(first: int | None, faster: int | None) -> Claim:
@@ -125,7 +140,6 @@ def _first(losses: np.ndarray) -> int | None:
 
 def estimator_variance(small: bool = False) -> Finding:
     """Networks of growing width, of one pendulum's control."""
-    # Nearly all of the time is compilation, of each estimator at each width.
     widths = (4, 64) if small else (4, 8, 16, 32, 64, 128, 256)
     draws = 64 if small else 256
     env = pendulum(initial_state=np.array([1.0, 0.0]), horizon=HORIZON)
@@ -147,7 +161,8 @@ def estimator_variance(small: bool = False) -> Finding:
             "REINFORCE, no baseline": (likelihood(BUDGET, False), score, noisy),
         }
         names = list(estimators)[: 3 if small else 5]
-        samples = {name: _estimates(estimators[name], draws) for name in names}
+        each = _estimates([estimators[name] for name in names], draws)
+        samples = dict(zip(names, each, strict=True))
         exact = samples["analytic"][0]
         scale = exact @ exact
         variance = lambda drawn, by: float(jnp.sum(jnp.var(drawn, axis=0)) / by)
@@ -160,7 +175,7 @@ def estimator_variance(small: bool = False) -> Finding:
         for name in ("ES, antithetic", "REINFORCE")
     )
     last = ratios["REINFORCE"][-1]
-    over = [_at_horizon(T, draws) for T in (LONGER[::4] if small else LONGER)]
+    over = _over_horizons(LONGER[::4] if small else LONGER, draws)
     exploding = over[-1]["analytic"] / over[0]["analytic"]
     lost = [row["horizon"] for row in over if row["analytic"] > row["REINFORCE"]]
     claims = [
@@ -217,30 +232,50 @@ def estimator_variance(small: bool = False) -> Finding:
     return Finding(title, claims, tables, {"estimator_variance": ax.figure}, notes)
 
 
-def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
-    """Variances over a horizon, the start drawn, and how large the gradient is."""
-    env = spread_starts(pendulum())
+class _After(eqx.Module):
+    """The end of an episode at a time, which is data: all horizons share a program."""
+
+    end: Array
+
+    def __call__(self, t, x):
+        del x
+        return t > self.end
+
+
+def _over_horizons(horizons: Sequence[int], draws: int) -> list[dict[str, Any]]:
+    """Variances over each horizon, the start drawn, and how large the gradient is."""
+    env = spread_starts(pendulum(terminated=_After(jnp.zeros(()))))
     policy = mlp_policy(env, width=32, depth=1, key=jr.key(0))
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
-    one = training.expected_cost(env, batch=1, horizon=horizon)
-    score = training.scored_cost(env, horizon=horizon)
-    # Of single rollouts, so that norms are those of one, and the variance an eighth.
-    each = np.asarray(_estimates((training.analytic, one, policy), draws))
-    drawn = training.LikelihoodRatio(DRAWN)
-    guesses = np.asarray(_estimates((drawn, score, noisy), draws))
-    norms = np.linalg.norm(each, axis=1)
-    return {
-        "horizon": horizon,
-        "analytic": float(np.sum(np.var(each, axis=0))) / DRAWN,
-        "REINFORCE": float(np.sum(np.var(guesses, axis=0))),
-        "norm, median": float(np.median(norms)),
-        "norm, largest": float(np.max(norms)),
-    }
+    drawn, rows = training.LikelihoodRatio(DRAWN), []
+    for horizon in horizons:
+        # Half a step before the last, because times are rounded.
+        until = replace(env, {"terminated.end": (horizon - 0.5) * env.dt})
+        one = training.expected_cost(until, batch=1, horizon=max(horizons))
+        score = training.scored_cost(until, horizon=max(horizons))
+        # Of single rollouts, so that norms are those of one, and the variance an
+        # eighth.
+        both = [(training.analytic, one, policy), (drawn, score, noisy)]
+        each, guesses = _estimates(both, draws)
+        norms = np.linalg.norm(each, axis=1)
+        row: dict[str, Any] = {"horizon": horizon}
+        row["analytic"] = float(np.sum(np.var(each, axis=0))) / DRAWN
+        row["REINFORCE"] = float(np.sum(np.var(guesses, axis=0)))
+        row["norm, median"] = float(np.median(norms))
+        rows.append(row | {"norm, largest": float(np.max(norms))})
+    return rows
 
 
-def _estimates(given: tuple[Any, Any, Any], draws: int) -> jax.Array:
-    """Estimates of the gradient by the policy's own weights, a row each; of an
-    estimator, a loss and a model."""
+def _estimates(
+    given: list[tuple[Any, Any, Any]], draws: int
+) -> list[Float[np.ndarray, "draws weights"]]:
+    """Estimates of the gradient by the policy's own weights, a row each, by each
+    estimator of a loss of a model."""
+    return side_by_side(lambda one: np.asarray(_compiled_estimates(one, draws)), given)
+
+
+@eqx.filter_jit
+def _compiled_estimates(given, draws):
     estimator, loss, model = given
 
     def estimate(key):
@@ -248,4 +283,4 @@ def _estimates(given: tuple[Any, Any, Any], draws: int) -> jax.Array:
         own = gradient.base if isinstance(gradient, Gaussian) else gradient
         return ravel_pytree(own)[0]
 
-    return jax.lax.map(jax.jit(estimate), jr.split(jr.key(1), draws))
+    return jax.lax.map(estimate, jr.split(jr.key(1), draws))

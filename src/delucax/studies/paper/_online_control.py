@@ -19,7 +19,14 @@ from ...environments import Environment
 from ...planning import ilqr
 from ...simulation import rollout
 from ...systems import Pendulum
-from ._finding import Claim, draw_panels, Finding, mean_and_half_width, paired_ratio
+from ._finding import (
+    Claim,
+    draw_panels,
+    Finding,
+    mean_and_half_width,
+    paired_ratio,
+    side_by_side,
+)
 
 
 DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20
@@ -29,10 +36,10 @@ def pendulum_shock(small: bool = False) -> Finding:
     """Regulate the inverted pendulum from off upright."""
     seeds, steps = (4, 300) if small else (20, STEPS)
     dynamics = Discretized(Pendulum(), dt=DT, solver=diffrax.Euler())
-    cost = Quadratic(jnp.eye(2), jnp.eye(1))
+    cost = Quadratic(np.eye(2), np.eye(1))
     env = Environment(dynamics, cost, control_bounds=(-BOUND, BOUND))
     model = linearize(dynamics)
-    lqr = LQR(model, jnp.eye(2), jnp.eye(1))
+    lqr = LQR(model, np.eye(2), np.eye(1))
     rng = np.random.default_rng(0)
     starts = jnp.asarray(rng.uniform(0.3, 0.6, (seeds, 2)) * [1, 0])
     middle = (np.arange(steps) >= steps // 3) & (np.arange(steps) < 2 * steps // 3)
@@ -50,7 +57,7 @@ def pendulum_shock(small: bool = False) -> Finding:
     horizon = learner.loop.horizon
     around = lambda x: controllers.gpc(dynamics, cost, base=x, horizon=horizon)
     # What LQR would cost from there on stands for all that lies beyond the horizon.
-    ahead = Quadratic(jnp.eye(2), jnp.eye(1), final=lqr.P)
+    ahead = Quadratic(np.eye(2), np.eye(1), final=lqr.P)
     mpc = controllers.MPC(dynamics, ahead, AHEAD, bounds=(-BOUND, BOUND))
     contenders: dict[str, Any] = {
         "zero": lambda plan: controllers.Zero(1),
@@ -147,16 +154,22 @@ def _costs(
 
     A contender makes a controller of the plan of a seed.
     """
-    costs: dict[tuple[str, str], Any] = {}
     options: Any = dict(key=jr.key(0), keep=("costs",), throw=False)
-    for name, make in contenders.items():
-        of_seed = lambda plan, x0, w, make=make: rollout(
-            env, make(plan), x0=x0, w=w, horizon=len(w), **options
-        )
-        run = jax.jit(jax.vmap(of_seed))
-        for world, w in worlds.items():
-            found = run(plans, starts, jnp.asarray(w, starts.dtype))
-            costs[name, world] = np.asarray(found.costs)
+
+    def run_all(name):
+        @jax.jit
+        @jax.vmap
+        def run(plan, x0, w):
+            controller = contenders[name](plan)
+            return rollout(env, controller, x0=x0, w=w, horizon=len(w), **options).costs
+
+        given = {world: np.asarray(w, starts.dtype) for world, w in worlds.items()}
+        found = {world: run(plans, starts, w) for world, w in given.items()}
+        return {(name, world): np.asarray(costs) for world, costs in found.items()}
+
+    costs: dict[tuple[str, str], Any] = {}
+    for found in side_by_side(run_all, contenders):
+        costs |= found
     return costs
 
 
@@ -179,9 +192,9 @@ def lq_perturbations(small: bool = False) -> Finding:
     # Over fewer steps the time that GPC takes to learn would count for more.
     seeds, steps = 5 if small else 20, 1000
     A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
-    dynamics, cost = LinearDynamics(A, B), Quadratic(jnp.eye(2), jnp.eye(1))
+    dynamics, cost = LinearDynamics(A, B), Quadratic(np.eye(2), np.eye(1))
     env = Environment(dynamics, cost)
-    weights = jnp.eye(2), jnp.eye(1)
+    weights = np.eye(2), np.eye(1)
     contenders = {
         "LQR": LQR(dynamics, *weights),
         "H-infinity": controllers.HInfinity(dynamics, *weights),

@@ -88,11 +88,14 @@ def reproduce(
             say(f"    {claim.measured}")
             row = {"study": name, "claim": claim.statement}
             rows.append(row | {"measured": claim.measured, "holds": claim.holds})
+        images = []
         for title, figure in finding.figures.items():
             if not isinstance(figure, Path):
+                # Drawn once, for the page too: figures take as long as some studies.
                 figure.savefig(out / f"{title}.png", dpi=150)
-        # Drawn once: figures take as long as some studies.
-        sections += _section(finding)
+                figure = out / f"{title}.png"
+            images.append(figure)
+        sections += _section(finding, images)
         pd.DataFrame(rows).to_csv(out / "claims.csv", index=False)
         page = Page("The Deluca paper, reproduced")
         page.paragraph(f"{_held(rows)}.")
@@ -121,7 +124,7 @@ def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Findin
         return Finding(name, [failed], notes=f"The traceback is in {name}.txt.")
 
 
-def _section(finding: Finding) -> list[str]:
+def _section(finding: Finding, images: list[Path]) -> list[str]:
     """The parts of a page that show the findings of a study."""
     section = Page(finding.title)
     section.heading(finding.title)
@@ -129,8 +132,8 @@ def _section(finding: Finding) -> list[str]:
         word = "<b>holds" if claim.holds else "<b class='bad'>does not hold"
         text = f"{claim.statement}. Measured: {claim.measured}."
         section.parts.append(f"<p>{word}</b>: {html.escape(text)}</p>")
-    for figure in finding.figures.values():
-        section.figure(figure)
+    for image in images:
+        section.figure(image)
     for title, table in finding.tables.items():
         columns = list(table[0])
         section.heading(title, 3)
