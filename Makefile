@@ -64,7 +64,7 @@ test-float64: $(VENV)/.tests ## the tests in double precision; the docs' example
 		$(PYTEST_ARGS)
 
 .PHONY: thorough
-thorough: $(VENV)/.tests ## the tests that `test` leaves out: they compile for long
+thorough: $(VENV)/.tests ## the tests that `test` leaves out: each takes minutes
 	JAX_ENABLE_X64=0 $(pytest) -m minutes $(PYTEST_ARGS)
 	JAX_ENABLE_X64=1 $(pytest) -m minutes $(examples) $(PYTEST_ARGS)
 
