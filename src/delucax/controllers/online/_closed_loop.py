@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -14,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..._check import check_count, check_instance, check_step, is_concrete
 from ..._controller import AbstractController, wrong_observation
-from ..._jax import value_and_jacobians
+from ..._jax import host_unless_traced, scan, value_and_jacobians, xp
 from ..._module import parameter
 from ...dynamics import AbstractDynamics, LinearDynamics
 from ...math import matvec
@@ -145,8 +144,8 @@ class ClosedLoop(eqx.Module):
         self.memory = check_count(memory, "memory", where)
         self.response = self.first_response = None
         if tangents is not None:
-            given = tangents, self.horizon, dynamics.observation_size
-            response, self.first_response = _responses(*given)
+            p = dynamics.observation_size
+            response, self.first_response = _responses(tangents, self.horizon, p)
             self.response = response if is_constant else None
 
     def __check_init__(self):
@@ -304,8 +303,13 @@ def in_first_responses(
         raise ValueError(
             f"{where}: {name} must be given, for dynamics that define no equilibrium."
         )
+    return _quotient(units, loop.first_response)
+
+
+@host_unless_traced
+def _quotient(units, size):
     # Where a control never shows there is no unit; 1 keeps the quotient finite.
-    return units / jnp.where(loop.first_response > 0, loop.first_response, 1)
+    return units / xp.where(size > 0, size, xp.ones_like(size))
 
 
 def _check_control(
@@ -313,12 +317,13 @@ def _check_control(
 ) -> None:
     """Raise unless a base controller gives a control that dynamics take."""
     check_instance(base, AbstractController, "base", where)
-    y = jnp.zeros(dynamics.observation_size)
+    size = dynamics.observation_size
+    act = lambda base: base(jnp.zeros(()), jnp.zeros(size), base.init(key=None))
     try:
-        u, _ = eqx.filter_eval_shape(base, jnp.zeros(()), y, base.init(key=None))
+        u, _ = eqx.filter_eval_shape(act, base)
     except ValueError as error:
         raise ValueError(
-            f"{where}: base must take an observation of size {y.shape[0]}, as dynamics "
+            f"{where}: base must take an observation of size {size}, as dynamics "
             f"give; {error}"
         ) from error
     if u.shape != (dynamics.control_size,):
@@ -354,43 +359,47 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
     return Tangents(by_state[: z.size], by_control[: z.size], by_state[z.size :])
 
 
-@eqx.filter_jit
-def _responses(tangents: Tangents, horizon: int, outputs: int) -> tuple[Array, Array]:
-    """The response to an impulse of added control, and the size of its first change of
-    the observation."""
-    first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
-    # Markov parameters: row j is the response to an impulse j + 1 steps ago.
-    step = lambda z, _: (first.transition @ z, first.output @ z)
-    response = lax.scan(step, first.input, length=horizon)[1]
-    sizes = jnp.sqrt(jnp.sum(response[:, :outputs] ** 2, axis=(1, 2)))
-    # A control may take several steps to show; smaller responses are rounding.
-    slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
-    return response, sizes[jnp.argmax(sizes > slack)]
-
-
 def _equilibrium_tangents(
     dynamics: AbstractDynamics, base: AbstractController
 ) -> Tangents | None:
     """The derivatives at the operating point, at each time if they depend on it; `None`
     if the dynamics define no such point."""
-
     if isinstance(dynamics, LinearDynamics) and dynamics.is_time_varying:
-        times = (jnp.arange(len(dynamics.A)) * dynamics.dt).astype(dynamics.A.dtype)
-        at = lambda *point: _tangents_at(dynamics, base, *point)
-        return jax.vmap(at)(times, dynamics.x_ref, dynamics.u_ref)
+        return _tangents_along(dynamics, base, dynamics.x_ref, dynamics.u_ref)
     try:
         x, u = dynamics.equilibrium()
     except ValueError:
         return None
-    return _tangents_at(dynamics, base, jnp.zeros((), x.dtype), x, u)
+    return _tangents_along(dynamics, base, x, u)
 
 
 @eqx.filter_jit
-def _tangents_at(dynamics, base, t, x, u) -> Tangents:
-    """The derivatives where the control is `u` and the base is at its start."""
-    state = base.init(key=None)
-    u_base, _ = base(t, dynamics.observe(t, x), state)
-    return _tangents(dynamics, base, t, x, state, u - u_base)
+def _tangents_along(dynamics, base, x, u) -> Tangents:
+    """The derivatives at one point, or at one for each time."""
+
+    def at(t, x, u):
+        state = base.init(key=None)
+        u_base, _ = base(t, dynamics.observe(t, x), state)
+        return _tangents(dynamics, base, t, x, state, u - u_base)
+
+    if x.ndim == 1:
+        return at(jnp.zeros((), x.dtype), x, u)
+    times = (jnp.arange(len(x)) * dynamics.dt).astype(x.dtype)
+    return jax.vmap(at)(times, x, u)
+
+
+@host_unless_traced
+def _responses(tangents, horizon, p):
+    """The response to an impulse, at first if it depends on time; and the size of its
+    first row that is not zero in the first `p` entries."""
+    transition, now, output = (M if M.ndim == 2 else M[0] for M in tangents)
+    # Markov parameters: row j is the response to an impulse j + 1 steps ago.
+    step = lambda z, _: (transition @ z, output @ z)
+    response = scan(step, now, xp.arange(horizon))[1]
+    sizes = xp.sqrt(xp.sum(response[:, :p] ** 2, axis=(1, 2)))
+    # A control may take several steps to show; smaller responses are rounding.
+    slack = xp.finfo(sizes.dtype).eps ** 0.5 * xp.max(sizes)
+    return response, sizes[xp.argmax(sizes > slack)]
 
 
 def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> int:

@@ -278,10 +278,9 @@ def base_for(
             f"{where}: base must be given, for dynamics that define no equilibrium to "
             "design one at."
         ) from error
-    t = jnp.zeros((), x.dtype)
-    Q, R, S = _curvature(dynamics, cost, t, x, u, where)
+    Q, R, S = _weights(dynamics, cost, x, u, where)
     if not isinstance(dynamics, LinearDynamics):
-        model = linearize(dynamics, t, x, u)
+        model = linearize(dynamics, jnp.zeros((), x.dtype), x, u)
         return LQR(model, Q, R, S, difference=dynamics.difference)
     if not dynamics.is_time_varying:
         if dynamics.observes_state:
@@ -310,27 +309,11 @@ def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None
         raise ValueError(f"{where}: cost must give a scalar, got {got}.")
 
 
-def _curvature(dynamics, cost, t, x, u, where):
-    """The second derivatives of the cost, as weights of a regulator."""
-    H, *weights = _half_hessian(dynamics, cost, t, x, u)
-    if is_concrete(H):
-        H = np.asarray(H, float)
-        # Above the rounding of a Hessian in float32.
-        slack = 1e-6 * np.max(np.abs(H), initial=0)
-        curved = np.all(np.linalg.eigvalsh(H) >= -slack)
-        R = np.asarray(weights[1])
-        if not (curved and np.all(np.linalg.eigvalsh(R) > slack)):
-            raise ValueError(
-                f"{where}: base must be given, for a cost that is not convex, and "
-                "strictly so in u, at the operating point."
-            )
-    return weights
-
-
 @eqx.filter_jit
-def _half_hessian(dynamics, cost, t, x, u):
-    """Half of the second derivatives of the cost, as a whole and in blocks."""
-    y, n = dynamics.observe(t, x), x.shape[0]
+def _curvature(dynamics, cost, x, u):
+    """Half of the second derivatives of the cost, and its blocks `Q`, `R` and `S`."""
+    t, n = jnp.zeros((), x.dtype), x.shape[0]
+    y = dynamics.observe(t, x)
 
     def charged(z):
         # Gauss and Newton in the observation: the curvature of the sensor, which could
@@ -338,6 +321,22 @@ def _half_hessian(dynamics, cost, t, x, u):
         y_here = y + jax.jvp(lambda x: dynamics.observe(t, x), (x,), (z[:n],))[1]
         return cost(t, y_here, u + z[n:])
 
-    H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
     # c = dx'Q dx + ...
-    return H, H[:n, :n], H[n:, n:], H[:n, n:]
+    H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
+    return H, (H[:n, :n], H[n:, n:], H[:n, n:])
+
+
+def _weights(dynamics, cost, x, u, where):
+    """The curvature of the cost as weights of a regulator, if it has one."""
+    H, (Q, R, S) = _curvature(dynamics, cost, x, u)
+    if is_concrete(H):
+        H = np.asarray(H, float)
+        # Above the rounding of a Hessian in float32.
+        slack = 1e-6 * np.max(np.abs(H), initial=0)
+        curved = np.all(np.linalg.eigvalsh(H) >= -slack)
+        if not (curved and np.all(np.linalg.eigvalsh(np.asarray(R)) > slack)):
+            raise ValueError(
+                f"{where}: base must be given, for a cost that is not convex, and "
+                "strictly so in u, at the operating point."
+            )
+    return Q, R, S
