@@ -88,7 +88,9 @@ def largest(matrix: Array) -> Array:
     """The size of the largest entry."""
     if _is_large(matrix):
         return abs(matrix).max()
-    return _reduced(lambda a, b: lax.max(xp.abs(a), xp.abs(b)), matrix, matrix.ndim)
+    # Sizes are taken beforehand too, as XLA leaves out the reduction of a single entry.
+    join = lambda a, b: lax.max(xp.abs(a), xp.abs(b))
+    return _reduced(join, xp.abs(matrix), matrix.ndim)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:

@@ -83,7 +83,7 @@ def model(
 
     @by_components
     def advance(parts, t, w):
-        z = join_state(parts, like[0].size)
+        z = join_state(parts)
         return problem.step(t, z[:size], z[size:], w)
 
     step = with_stores(lambda z, t, w: advance(split_state(z), t, w), *like)
