@@ -67,7 +67,7 @@ test-float32: $(VENV)/.tests ## the tests in single precision
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
+	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
 		$(PYTEST_ARGS)
 
 .PHONY: thorough
