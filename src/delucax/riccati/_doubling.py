@@ -104,7 +104,7 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
         before, _, k = carry
         after = composed(before, before)
         # NaN and infinity, times zero, are NaN, which is kept.
-        finite = largest(0 * sum(after)) == 0
+        finite = largest(0 * sum(after[1:], after[0])) == 0
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
