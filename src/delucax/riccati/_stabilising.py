@@ -157,7 +157,7 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
 
 class _Solved(NamedTuple):
     """The best `X`, its gain and loop, the verdict on it in numbers, and the units of
-    states and rows that it was found in."""
+    states and rows of the search."""
 
     X: Square
     K: Array

@@ -88,7 +88,7 @@ def _of_controller(name: str) -> Any:
 
 
 class InTime(diffrax.AbstractAdaptiveStepSizeController):
-    """A step-size controller that is told times, in a solve that counts intervals."""
+    """A step-size controller in time, inside a solve that counts intervals."""
 
     controller: diffrax.AbstractAdaptiveStepSizeController
     interval: Array

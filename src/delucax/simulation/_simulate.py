@@ -81,7 +81,7 @@ def simulate(
 
     The solve counts its time in intervals from `t0`, so that a late start costs no
     precision: its switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in
-    single precision, however large `t0` is. A step-size controller is told the time
+    single precision, however large `t0` is. A step-size controller receives the time
     since `t0`. The field, with a control that is not held, is corrected for the
     rounding of `t0 + s` as in [`delucax.Discretized`][]; held controllers receive the
     rounded time.

@@ -164,12 +164,12 @@ def _costs(
             return rollout(env, controller, x0=x0, w=w, horizon=len(w), **options).costs
 
         given = {world: np.asarray(w, starts.dtype) for world, w in worlds.items()}
-        found = {world: run(plans, starts, w) for world, w in given.items()}
-        return {(name, world): np.asarray(costs) for world, costs in found.items()}
+        by_world = {world: run(plans, starts, w) for world, w in given.items()}
+        return {(name, world): np.asarray(costs) for world, costs in by_world.items()}
 
     costs: dict[tuple[str, str], Any] = {}
-    for found in side_by_side(run_all, contenders):
-        costs |= found
+    for of_contender in side_by_side(run_all, contenders):
+        costs |= of_contender
     return costs
 
 
