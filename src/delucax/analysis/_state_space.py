@@ -6,7 +6,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Inexact
 
-from .._check import check_choice, check_time_invariant
+from .._check import check_choice
+from .._check_models import check_time_invariant
 from .._typing import BoolScalar, Scalar, Square
 from ..dynamics import LinearDynamics
 from ..math import safe_norm

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from .._check import as_vector, output_of
+from .._check import as_vector
+from .._check_models import output_of
 from .._module import function_field, parameter
 from .._typing import Difference, RealScalar
 from ..dynamics import LinearDynamics

@@ -14,12 +14,12 @@ from .._check import (
     bounds_field,
     check_bool,
     check_control_bounds,
-    check_cost_sizes,
     check_count,
     check_finite,
     check_instance,
     check_key,
 )
+from .._check_models import check_cost_sizes
 from .._controller import AbstractController, Tally
 from .._jax import host_unless_traced, xp
 from .._module import function_field

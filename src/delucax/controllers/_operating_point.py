@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._check import check_instance, check_time_invariant, is_concrete
+from .._check import check_instance, is_concrete
+from .._check_models import check_time_invariant
 from .._controller import AbstractController, wrong_observation
 from .._jax import compiled_unless_on_host, host_unless_traced, xp
 from .._typing import Array, Difference

@@ -11,13 +11,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._check import (
-    check_choice,
-    check_instance,
-    check_step,
-    check_time_invariant,
-    is_concrete,
-)
+from .._check import check_choice, check_instance, check_step, is_concrete
+from .._check_models import check_time_invariant
 from .._typing import Matrix, Scalar, Vector
 from ..math._linear_solve import full_precision, solve
 from ..systems import LinearSystem

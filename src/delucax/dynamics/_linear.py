@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, check_matrices, check_real, checked_names, is_concrete
+from .._check import as_matrix, check_real, is_concrete
+from .._check_models import check_matrices, checked_names
 from .._module import as_float_array, parameter
 from .._results import Result, RESULTS
 from .._typing import Control, Observation, Real, RealScalar, State, Time

@@ -13,15 +13,14 @@ from .._check import (
     as_bounds,
     as_vector,
     bounds_field,
-    check_cost_sizes,
     check_count,
     check_finite,
     check_instance,
     check_key,
     check_real,
     is_concrete,
-    output_of,
 )
+from .._check_models import check_cost_sizes, output_of
 from .._message import shortened
 from .._module import (
     as_float_array,

@@ -15,9 +15,9 @@ from .._check import (
     check_instance,
     check_number,
     check_positive,
-    check_time_invariant,
     is_concrete,
 )
+from .._check_models import check_time_invariant
 from .._jax import host_unless_traced, jacobian, xp
 from .._module import function_field, parameter, positive, weight
 from .._results import raise_on_failure, RESULTS

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .._check import as_path, check_time_invariant, is_concrete
+from .._check import as_path, is_concrete
+from .._check_models import check_time_invariant
 from .._extras import extra
 from .._module import indexed_names
 from ..dynamics import LinearDynamics

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import output_of
+from .._check_models import output_of
 from .._module import check_parameters
 from .._typing import Control, Disturbance, Observation, State, Time
 from ..math import wrap

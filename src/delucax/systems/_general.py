@@ -8,13 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import (
-    as_vector,
-    check_function,
-    check_matrices,
-    checked_names,
-    state_network,
-)
+from .._check import as_vector, check_function
+from .._check_models import check_matrices, checked_names, state_network
 from .._module import (
     function_field,
     indexed_names,

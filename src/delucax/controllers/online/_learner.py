@@ -11,7 +11,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..._check import check_function, check_instance, check_step, is_concrete, output_of
+from ..._check import check_function, check_instance, check_step, is_concrete
+from ..._check_models import output_of
 from ..._controller import AbstractController, AbstractLearner, Tally
 from ..._jax import is_constant
 from ..._module import function_field, parameter

@@ -17,8 +17,8 @@ from ..._check import (
     check_instance,
     check_positive,
     check_step,
-    state_network,
 )
+from ..._check_models import state_network
 from ..._module import parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar

@@ -1,0 +1,114 @@
+"""Checks of models: their sizes, names and matrices."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ._check import as_matrix, check_count, check_key
+from ._module import indexed_names, mlp, names_of
+from ._typing import Array
+
+
+def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
+    """The shapes of what `function` returns for arrays of `shapes`, traced once for all
+    functions that differ in the values of their arrays alone."""
+    dtype = jnp.result_type(float)
+    inputs = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
+    leaves, structure = jax.tree.flatten(function)
+    try:
+        hash(structure)
+        arrays = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+    except (TypeError, AttributeError):
+        # An unhashable field, or a leaf that is not an array.
+        return eqx.filter_eval_shape(function, *inputs)
+    return _traced(structure, arrays, tuple(inputs))
+
+
+@functools.lru_cache(maxsize=256)
+def _traced(structure: Any, arrays: Any, inputs: Any) -> Any:
+    call = lambda arrays, inputs: jax.tree.unflatten(structure, arrays)(*inputs)
+    return jax.eval_shape(call, arrays, inputs)
+
+
+def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
+    """Raise unless `cost` takes states and controls of these `sizes`."""
+    n, m = sizes
+    try:
+        output_of(cost, (), (n,), (m,))
+        output_of(cost.final, (), (n,))
+    except jax.errors.JAXTypeError:  # not traceable: it still works outside of jit
+        return
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where}: {name} does not fit a state of size {n} and a control of size "
+            f"{m}: {error}"
+        ) from error
+
+
+def checked_names(
+    names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
+) -> tuple[str, ...]:
+    """`names` as a tuple of `size`; indexed names if there are none."""
+    if names is None:
+        return indexed_names(letter, size)
+    if isinstance(names, str) or len(names) != size:
+        raise ValueError(f"{where}: {argument} must have {size} names, got {names!r}.")
+    return tuple(names)
+
+
+def check_matrices(
+    A: Any, B: Any, C: Any, E: Any, where: str
+) -> tuple[Array, Array, Any, Any]:
+    """`A`, `B`, `C`, `E` as matrices whose shapes fit."""
+    A = as_matrix(A, "A", where)
+    n = A.shape[0]
+    if A.shape != (n, n) or n == 0:
+        raise ValueError(f"{where}: A must be square, got shape {A.shape}.")
+    B = _as_part(B, "B", n, "rows", where)
+    C = None if C is None else _as_part(C, "C", n, "columns", where)
+    E = None if E is None else _as_part(E, "E", n, "rows", where)
+    return A, B, C, E
+
+
+def _as_part(value: Any, name: str, n: int, side: str, where: str) -> Array:
+    """`value` as a matrix with as many rows or columns as there are states."""
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[side == "columns"] != n:
+        raise ValueError(
+            f"{where}: {name} must have as many {side} as A ({n}), got shape "
+            f"{matrix.shape}."
+        )
+    return matrix
+
+
+def check_time_invariant(model: Any, name: str, where: str) -> None:
+    """Raise if the matrices of a linear model depend on time."""
+    if model.is_time_varying:
+        raise ValueError(
+            f"{where}: {name} must be time-invariant, got matrices at {len(model.A)} "
+            "times; `dynamics.at(t)` are those at one time."
+        )
+
+
+def state_network(
+    states: int | Sequence[str],
+    controls: int | Sequence[str],
+    width: int,
+    depth: int,
+    activation: Callable[[Array], Array],
+    key: Any,
+    where: str,
+) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
+    """The names of states and controls, and a network of both with as many outputs as
+    there are states."""
+    check_key(key, where)
+    names = names_of(states, "x", "states", where)
+    inputs = names_of(controls, "u", "controls", where)
+    width = check_count(width, "width", where)
+    depth = check_count(depth, "depth", where, least=0)
+    size = len(names) + len(inputs)
+    return names, inputs, mlp(size, len(names), width, depth, activation, key=key)
