@@ -196,3 +196,17 @@ def test_dead_beat_loop_has_a_gradient():
 def test_wrong_arguments(change, match):
     with user_error(match=match):
         dlx.riccati.dare(**({"A": A, "B": B, "Q": Q, "R": R} | change))
+
+
+@once
+def test_a_small_program():
+    """Of few operations, all but a few of them in loops that XLA on CPU compiles as a
+    whole. A call of a library in one of the loops would end that."""
+    A, B, Q, R, *_ = random_problem(0, 4, 1)
+    solve = jax.jit(lambda *data: dlx.riccati.dare(*data, throw=False))
+    text = solve.lower(A, B, Q, R).compile().as_text()
+    entry = text[text.index("ENTRY") :]
+    assert text.count(" fusion(") <= 200
+    assert entry.count(" fusion(") <= 16
+    assert entry.count(" while(") == 0
+    assert text.count(" custom-call(") == text.count(" dot(") == 0

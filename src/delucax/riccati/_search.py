@@ -220,8 +220,9 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
 
     def logarithm(M):
-        exponent = xp.log2(M)
-        return xp.where(xp.isfinite(exponent), exponent, lowest)
+        # Of a vector: one loop over it compiles sooner than two over rows and columns.
+        exponent = xp.log2(M.ravel())
+        return xp.where(xp.isfinite(exponent), exponent, lowest).reshape(M.shape)
 
     # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
     # each, and that of the cost, which is free: one more row and column, of which the

@@ -180,30 +180,51 @@ def _certified(discrete: bool, data: RiccatiData) -> _Solved:
     # NaN and infinity, times zero, are NaN, which any sum keeps.
     finite = xp.sum(0 * xp.concatenate([A, Q, B.T, S.T])) == 0
     unknown = xp.full((2 * n + m, n), xp.nan, dtype)
-    # Of data that are not finite these remain: not well posed.
-    nothing = _Solved(
-        *matrices_of(unknown), no_verdict(DONE, dtype), finite, xp.ones((2, n), dtype)
-    )
-    # In a loop of one round, which XLA on CPU compiles as a whole if the arrays are
-    # small: in less time than operation by operation, and it runs sooner.
-    solved = lambda _, data: _search(discrete, data)
-    return if_needed(finite, solved, nothing, (data,))
+    # In two loops of one round each, which XLA on CPU compiles as a whole if the arrays
+    # are small, and at the same time: in less time than operation by operation, and
+    # they run sooner.
+    problem = _Problem(xp.ones((2, n), dtype), data, (A, B), finite)
+    prepare = lambda _, data: _in_fitting_units(discrete, data)
+    problem = if_needed(finite, prepare, problem, (data,))
+    # Of data that are not well posed these remain.
+    kept = no_verdict(DONE, dtype), problem.well_posed, problem.by
+    nothing = _Solved(*matrices_of(unknown), *kept)
+    solved = lambda _, problem: _search(discrete, problem)
+    return if_needed(problem.well_posed, solved, nothing, (problem,))
 
 
-def _search(discrete: bool, data: RiccatiData) -> _Solved:
-    """The search, with states in units that fit."""
-    by = d, f = units(data)
-    A, B, Q, R, S, E = data = in_units(by, data)
-    n, eps = A.shape[0], float(xp.finfo(A.dtype).eps)
+class _Problem(NamedTuple):
+    """The data with states and rows scaled `by` the units that fit, and `A` and `B`
+    without the descriptor."""
+
+    by: Array
+    data: RiccatiData
+    plain: tuple[Array, Array]
+    well_posed: BoolScalar
+
+
+def _in_fitting_units(discrete: bool, data: RiccatiData) -> _Problem:
+    by = units(data)
+    A, B, _, R, _, E = data = in_units(by, data)
+    eps = float(xp.finfo(A.dtype).eps)
     # In discrete time R + B'XB is inverted, in continuous time R alone.
     well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
     # The starting points are computed for E^-1 A and E^-1 B.
-    plain = A, B
     if E is not None:
-        plain = tuple(map(factorised(E), plain))
-        well_posed = well_posed & (xp.sum(0 * xp.concatenate(plain, axis=1)) == 0)
+        A, B = map(factorised(E), (A, B))
+        finite = xp.sum(0 * xp.concatenate([A, B], axis=1)) == 0
+        well_posed = well_posed & finite
+    return _Problem(by, data, (A, B), well_posed)
+
+
+def _search(discrete: bool, problem: _Problem) -> _Solved:
+    """The search, in these units."""
+    by, data, plain, well_posed = problem
+    d, _ = by
+    A, B, *_, E = data
+    n, eps = A.shape[0], float(xp.finfo(A.dtype).eps)
     small = is_small(B)
     magnified = 1 if E is None else size(E) ** 2
 
