@@ -85,13 +85,12 @@ class Hidden(dlx.AbstractSystem):
 
 
 def test_substeps_are_shorter_steps():
-    for solver in (diffrax.Tsit5(), diffrax.ImplicitEuler()):
-        x = X
-        step = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1, solver, 3))
-        part = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1 / 3, solver))
-        for k in range(3):
-            x = part(0.1 * k / 3, x, U)
-        assert_close(step(0.0, X, U), x, atol=1e-14)
+    x, solver = X, diffrax.Tsit5()
+    step = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1, solver, 3))
+    part = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1 / 3, solver))
+    for k in range(3):
+        x = part(0.1 * k / 3, x, U)
+    assert_close(step(0.0, X, U), x, atol=1e-14)
 
 
 def test_a_step_by_hand():
