@@ -44,13 +44,14 @@ def solve(matrix: Square, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
 
 
 def factorised(
-    matrix: Inexact[Array, "m n"],
+    matrix: Inexact[Array, "*stack m n"],
     solver: lx.AbstractLinearSolver | None = None,
     tags: Any = (),
 ) -> Callable[[Inexact[Array, "m k"]], Inexact[Array, "n k"]]:
     """`right -> matrix^-1 right`, for more than one right side in turn.
 
-    A `solver` that is given may need `tags` of the matrix.
+    A `solver` that is given may need `tags` of the matrix. NumPy solves a stack of
+    equations, too.
     """
     if on_host():
         return functools.partial(_by_lapack, matrix, isinstance(solver, lx.QR))
