@@ -404,6 +404,12 @@ def _crossings(
     low, high = xp.take_along_axis(between, last, axis=1), between[:, 1:]
     low_sign = xp.sign(xp.take_along_axis(signs, last, axis=1))
     crosses = is_reliable[:, 1:] & (last >= 0) & (low_sign != xp.sign(signs[:, 1:]))
+    # A loop of n states crosses at most n times. The other intervals come last.
+    order = xp.argsort(indices[1:] + xp.where(crosses, 0, len(nodes)), axis=1)
+    low, high, low_sign, crosses = (
+        xp.take_along_axis(row, order[:, : len(A)], axis=1)
+        for row in (low, high, low_sign, crosses)
+    )
 
     def halve(_, bracket):
         low, high = bracket
