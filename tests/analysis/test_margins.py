@@ -192,6 +192,9 @@ def test_gradients_are_central_differences_beside_an_unstable_loop():
     assert np.all(np.isfinite(values[:7]))
     numeric = (values[:3] - values[3:6]).T / 2e-6
     assert_close(slopes[6], numeric, rtol=1e-6, atol=1e-7)
+    # And what NumPy computes of concrete numbers.
+    for lane in (6, 7):
+        assert_close(measures(thetas[lane])[0], values[lane], rtol=1e-9)
     # An unstable loop has no margins, and harms no other.
     assert_close(values[7, :3], [1, 0, 0])
     assert np.all(np.isfinite(slopes[7]))

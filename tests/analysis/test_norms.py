@@ -124,6 +124,8 @@ def test_gradients_are_central_differences_beside_an_unstable_model():
     slopes, values = jax.jit(jax.vmap(jax.jacfwd(measures, has_aux=True)))(thetas)
     numeric = np.transpose(values[:3] - values[3:6]) / 2e-6
     assert_close(slopes[6], numeric, rtol=1e-6, atol=1e-7)
+    # And what NumPy computes of concrete numbers.
+    assert_close(measures(THETA)[0], values[6], rtol=1e-11)
     # The unstable one harms no other.
     assert np.all(np.isinf(values[7, :2])) and np.all(np.isfinite(values[:7]))
     assert np.all(np.isfinite(slopes))
@@ -198,6 +200,7 @@ def test_frequency_response_is_differentiable_in_the_frequency():
     both = jax.jit(jax.value_and_grad(decibels))
     numeric = central_difference(lambda w: both(w)[0], 1.3)
     assert_close(both(1.3)[1], numeric, atol=1e-7)
+    assert_close(decibels(1.3), both(1.3)[0], rtol=1e-11)
 
 
 def test_integrators_have_no_dcgain():

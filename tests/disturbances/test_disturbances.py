@@ -45,6 +45,27 @@ def test_contract(name, key):
 
 
 @once
+def test_a_sequence_is_few_programs(key):
+    """Each operation outside of a compiled function would be a program of its own."""
+    compiled = []
+
+    def heard(event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    keys = jax.random.split(key)
+    times = jax.device_put(np.arange(13, dtype=np.float32))
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    try:
+        for name, disturbance in ALL.items():
+            before = len(compiled)
+            disturbance.sequence(keys[0], times)
+            assert len(compiled) - before <= 6, name
+    finally:
+        jax.monitoring.unregister_event_duration_listener(heard)
+
+
+@once
 def test_every_public_disturbance_is_listed():
     kinds = {type(x) for x in ALL.values()}
     public = {
