@@ -95,7 +95,7 @@ def test_gradients_are_central_differences(name):
     value = lambda x: np.squeeze(slopes(x)[0])
     expected = central_difference(value, at, step=1e-5)
     for gradient in found:
-        assert_close(gradient.ravel(), expected, atol=1e-6 * np.max(np.abs(expected)))
+        assert_close(gradient.ravel(), expected, atol=1e-8 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("checkpoint", ["sqrt", None])
@@ -113,4 +113,4 @@ def test_second_order():
 
     both = jax.jit(jax.jacfwd(slope, has_aux=True))
     expected = central_difference(lambda x: both(x)[1][1], at, step=1e-5)
-    assert_close(both(at)[0][1], expected, rtol=1e-5, atol=1e-6)
+    assert_close(both(at)[0][1], expected, rtol=1e-8, atol=1e-9)

@@ -109,7 +109,7 @@ def test_bounds_batches_and_derivatives(planner, options):
     slope = both(X0, KEY)[1]
     for i, way in enumerate(np.eye(2)):
         up, down = (both(X0 + h * way, KEY)[0] for h in (1e-6, -1e-6))
-        assert_close(slope[i], (up - down) / 2e-6, rtol=1e-5)
+        assert_close(slope[i], (up - down) / 2e-6, rtol=1e-8)
 
 
 @once
