@@ -535,7 +535,7 @@ def test_derivatives_behind_a_wrapper(kind, wrappers):
             e = np.zeros(here.shape)
             e[i] = 1e-5
             difference = (at(here + e) - at(here - e)) / 2e-5
-            assert_close(slope[i], difference, rtol=1e-6, atol=1e-6)
+            assert_close(slope[i], difference, rtol=1e-8, atol=1e-8)
 
 
 @once
