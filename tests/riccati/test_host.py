@@ -138,13 +138,15 @@ def test_nothing_is_compiled(name):
 
 
 SPINE = "dare", "care"
+OTHERS = "lyap, not stable", "dlyap, not stable"
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(k, marks=() if k in SPINE else needs_x64) for k in EQUATIONS],
+    "name", [*SPINE, *(pytest.param(name, marks=needs_x64) for name in OTHERS)]
 )
 def test_both_ways_agree(name):
+    """The tests of derivatives compare the compiled solutions of the other equations
+    with those by NumPy, and `test_darex.py` has complex ones."""
     at_once, compiled = EQUATIONS[name](A), jax.jit(EQUATIONS[name])(A)
     assert at_once.result == compiled.result
     rtol = tolerance(3e-4, 1e-11)

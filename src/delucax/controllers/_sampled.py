@@ -1,5 +1,6 @@
 """The sampled-data regulator, and the discretisation of quadratic costs."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -65,13 +66,21 @@ def sampled_weights(
                 f"{where}: {name} must have shape {shape} to fit the system, got "
                 f"{M.shape}."
             )
+    return _weights_over(A, B, Q, R, S, jnp.asarray(dt, A.dtype))
+
+
+@jax.jit
+def _weights_over(
+    A: Array, B: Array, Q: Array, R: Array, S: Array, dt: Array
+) -> tuple[Array, Array, Array]:
+    n, m = B.shape
     size = n + m
     # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
     # of one exponential (Van Loan).
     field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
     # integral of expm(F' s) charge expm(F s) over [0, dt], by blocks: Qd, Sd and Rd.
-    total = gramian_over(field.T, charge, jnp.asarray(dt, A.dtype))
+    total = gramian_over(field.T, charge, dt)
     return total[:n, :n], total[n:, n:], total[:n, n:]
 
 
