@@ -52,7 +52,7 @@ DESIGNS = {
     "LQI": lambda A: controllers.LQI(linear(A, B), np.eye(3), R, output=C),
     "LQG": lambda A: controllers.LQG(linear(A, B, C), Q, R, Q, R),
     "HInfinity": lambda A: controllers.HInfinity(linear(A, B), Q, R),
-    "lqrd": lambda A: controllers.lqrd(MODELS["continuous"](A), Q, R, dt=0.1),
+    "lqrd": lambda A: controllers.lqrd(dlx.systems.LinearSystem(A, B), Q, R, dt=0.1),
 }
 MODELS = {
     "discrete": lambda A: linear(A / 2, B, C, dt=0.5),
