@@ -1,5 +1,7 @@
 """The sampled-data regulator, and the discretisation of quadratic costs."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -72,7 +74,7 @@ def sampled_weights(
 @host_unless_traced
 @compiled_unless_on_host
 def _weights_over(
-    A: Array, B: Array, Q: Array, R: Array, S: Array, dt: ArrayLike
+    A: Array, B: Array, Q: Array, R: Array, S: Any, dt: ArrayLike
 ) -> tuple[Array, Array, Array]:
     n, m = B.shape
     # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
