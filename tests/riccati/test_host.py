@@ -17,6 +17,7 @@ from delucax.riccati import _stabilising
 
 riccati, controllers, analysis = dlx.riccati, dlx.controllers, dlx.analysis
 linear: Any = dlx.LinearDynamics
+system: Any = dlx.systems.LinearSystem
 A = np.array([[1.1, 0.3], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
 Q, R, C = np.eye(2), np.eye(1), np.eye(2)[:1]
@@ -52,10 +53,11 @@ DESIGNS = {
     "LQI": lambda A: controllers.LQI(linear(A, B), np.eye(3), R, output=C),
     "LQG": lambda A: controllers.LQG(linear(A, B, C), Q, R, Q, R),
     "HInfinity": lambda A: controllers.HInfinity(linear(A, B), Q, R),
+    "lqrd": lambda A: controllers.lqrd(system(A, B), Q, R, dt=0.1),
 }
 MODELS = {
     "discrete": lambda A: linear(A / 2, B, C, dt=0.5),
-    "continuous": lambda A: dlx.systems.LinearSystem(A - 2 * Q, B, C),
+    "continuous": lambda A: system(A - 2 * Q, B, C),
 }
 
 
@@ -177,7 +179,7 @@ def test_single_precision_of_data_is_kept():
         assert riccati.dare(*single).X.dtype == jnp.float32
         assert riccati.hinf_care(*single[:2], None, *single[2:]).X.dtype == jnp.float32
         assert riccati.dare(*single[:3], R).X.dtype == jnp.float64
-        model = dlx.systems.LinearSystem(*(M.astype(np.float32) for M in (-Q, B, C)))
+        model = system(*(M.astype(np.float32) for M in (-Q, B, C)))
         for name in OF_MODELS.keys() - OF_ONE_KIND.keys():
             for leaf in jax.tree.leaves(OF_MODELS[name](model)):
                 inexact = jnp.issubdtype(leaf.dtype, jnp.inexact)

@@ -70,7 +70,7 @@ def factorised(
     return jax.vmap(column, in_axes=1, out_axes=1)
 
 
-def _by_lapack(matrix, least_squares, right):
+def _by_lapack(matrix: Any, least_squares: bool, right: Any) -> Any:
     """The solution on the host, NaN where there is none."""
     if least_squares:
         basis, matrix = np.linalg.qr(matrix)
@@ -194,6 +194,7 @@ def eigenvalues(matrix: Square) -> Complex[Array, " n"]:
     """Of a matrix that is not finite NaN."""
     if not on_host():
         return xp.linalg.eigvals(matrix)
+    values: Any
     try:
         values = np.linalg.eigvals(matrix)
     except np.linalg.LinAlgError:
