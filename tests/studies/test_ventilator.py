@@ -157,6 +157,25 @@ def test_tuned_pids_are_the_best_that_were_tried(tmp_path, monkeypatch):
     assert jnp.all(own <= alike + 1e-3) and jnp.all(own < 10)
 
 
+@pytest.mark.parametrize("name, most", [("PID", 0.2), ("LeakyPID", 4.0)])
+def test_pids_are_drawn_over_orders_of_magnitude(name, most):
+    kind, waveform = getattr(dlx.controllers, name), lung.BreathWaveform()
+    drawn = _contenders._drawn(kind, 400, jnp.asarray(0.03), waveform, KEY)
+    pids, forwards = drawn.first, drawn.second
+    assert type(pids) is kind and pids.kp.shape == (400,)
+    ranges = (pids.kp, 0.03, 8.0), (pids.ki, 0.05, 40.0), (pids.kd, most / 70, most)
+    for gains, low, high in ranges:
+        # Half of the PIDs have no derivative.
+        used = gains[gains > 0]
+        assert len(used) == 400 or 150 < len(used) < 250
+        assert low <= jnp.min(used) < 2 * low and high / 2 < jnp.max(used) <= high
+    for values in (forwards.gain, forwards.offset):
+        assert 150 < jnp.sum(values == 0) < 250
+    # Each of them runs.
+    runs = eqx.filter_vmap(lambda one: one(0.0, jnp.array([5.0]), one.init())[0])(drawn)
+    assert jnp.all(jnp.isfinite(runs)) and len(jnp.unique(runs)) == 400
+
+
 def test_what_has_no_finite_error_is_not_chosen():
     candidates = dict(number=jnp.arange(6).reshape(3, 2))
     errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])

@@ -26,7 +26,8 @@ from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
 from ._breath_controllers import Breathing
-from ._breaths import Breaths, GAINS
+from ._breaths import Breaths
+from ._explorer import GAINS
 from ._learned_lung import LearnedLung
 from ._ventilation import waveform_of
 from ._waveform import as_pips, BreathWaveform, LENGTH, PIPS
