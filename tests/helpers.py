@@ -155,6 +155,23 @@ def original_ilqr(dynamics, cost, x0, controls, *, iterations):
     return learn(dynamics, dynamics, cost, start, iterations=iterations, throw=False)
 
 
+@contextlib.contextmanager
+def counted_programs():
+    """The events of compilation within."""
+    events = []
+
+    def listen(event, duration_secs, **others):
+        del duration_secs
+        if event == "/jax/core/compile/backend_compile_duration":
+            events.append(others)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield events
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
 class CountCalls:
     """Counts how often it is traced, when it is called inside a compiled function."""
 

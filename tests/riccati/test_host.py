@@ -1,6 +1,5 @@
 """Concrete matrices are solved by NumPy, traced ones by compiled programs."""
 
-import contextlib
 import threading
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import needs_x64, once, tolerance
+from helpers import counted_programs, needs_x64, once, tolerance
 
 import delucax as dlx
 from delucax._host import on_host
@@ -99,23 +98,6 @@ COMPARED = [
     for name in ANALYSES
     if name.split(",")[0] not in ("hinf_norm", "margins", "disk_margin")
 ]
-
-
-@contextlib.contextmanager
-def counted_programs():
-    """The events of compilation within."""
-    events = []
-
-    def listen(event, duration_secs, **others):
-        del duration_secs
-        if event == "/jax/core/compile/backend_compile_duration":
-            events.append(others)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield events
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def test_programs_are_counted():

@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, counted_programs, needs_x64, user_error
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
@@ -321,3 +321,22 @@ def test_bad_input():
         sysid.physical(GUESS, states[:, :1], controls, "system.mass")
     with user_error(match="trainable"):
         sysid.physical(GUESS, states, controls, "system.colour")
+
+
+def test_few_programs_are_compiled():
+    """Each fit is a few programs, and another limit of steps compiles none of them."""
+    states, controls, _ = recorded()
+    jax.clear_caches()
+    with counted_programs() as events:
+        sysid.linear(states[:82], controls[:81], throw=False)
+    assert 0 < len(events) <= 16
+    options = dict(window=9, noise=0.01, throw=False)
+    fit = lambda **more: sysid.physical(
+        GUESS, states[:28], controls[:27], "system.mass", **options, **more
+    )
+    with counted_programs() as events:
+        fit(max_steps=20)
+    assert 0 < len(events) <= 24
+    with counted_programs() as events:
+        fit(max_steps=19)
+    assert not events

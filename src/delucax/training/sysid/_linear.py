@@ -188,15 +188,16 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
 
 @jax.jit
 def _least_squares(
-    regressors: list[Float[Array, "runs steps _"]],
+    parts: list[Float[Array, "runs steps _"]],
     targets: Float[Array, "runs steps outputs"],
     reach: Array,
 ) -> tuple[dict[str, Array], Certainty]:
     """The estimate of each output with its interval, and what the data tell of the
     output with the largest relative noise."""
-    regressors = jnp.concatenate(regressors, axis=2)
-    rows, p = regressors.shape[0] * regressors.shape[1], regressors.shape[2]
-    regressors, targets = regressors.reshape(rows, p), targets.reshape(rows, -1)
+    regressors = jnp.concatenate(parts, axis=2)
+    regressors = regressors.reshape(-1, regressors.shape[2])
+    rows, p = regressors.shape
+    targets = targets.reshape(rows, -1)
     # In units of the regressors' size, so that the rank does not depend on units.
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)

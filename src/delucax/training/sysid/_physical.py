@@ -129,7 +129,7 @@ def physical(
     runs, steps = controls.shape[:2]
     window = min(check_count(window, "window", where), steps)
     # An array, so that another limit does not compile again.
-    most = np.asarray(check_count(max_steps, "max_steps", where))
+    most: Any = np.asarray(check_count(max_steps, "max_steps", where))
     reach = quantile(level, where)
     check_bool(throw, "throw", where)
     if noise is not None:
