@@ -1,10 +1,11 @@
 """The sampled-data regulator, and the discretisation of quadratic costs."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
-from .._typing import Difference, Numbers
+from .._typing import Difference, Matrix, Numbers, Scalar
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
@@ -65,13 +66,22 @@ def sampled_weights(
                 f"{where}: {name} must have shape {shape} to fit the system, got "
                 f"{M.shape}."
             )
+    return _held_weights(A, B, Q, R, S, jnp.asarray(dt, A.dtype))
+
+
+@eqx.filter_jit
+def _held_weights(
+    A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix, dt: Scalar
+) -> tuple[Matrix, Matrix, Matrix]:
+    """The weights of a step in which the control is held."""
+    n, m = B.shape
     size = n + m
     # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
     # of one exponential (Van Loan).
     field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
     # integral of expm(F' s) charge expm(F s) over [0, dt], by blocks: Qd, Sd and Rd.
-    total = gramian_over(field.T, charge, jnp.asarray(dt, A.dtype))
+    total = gramian_over(field.T, charge, dt)
     return total[:n, :n], total[n:, n:], total[:n, n:]
 
 
