@@ -1,11 +1,11 @@
 """The sampled-data regulator, and the discretisation of quadratic costs."""
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
-from .._typing import Difference, Matrix, Numbers, Scalar
+from .._typing import Difference, Numbers
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
@@ -66,14 +66,13 @@ def sampled_weights(
                 f"{where}: {name} must have shape {shape} to fit the system, got "
                 f"{M.shape}."
             )
-    return _held_weights(A, B, Q, R, S, jnp.asarray(dt, A.dtype))
+    return _weights_over(A, B, Q, R, S, jnp.asarray(dt, A.dtype))
 
 
-@eqx.filter_jit
-def _held_weights(
-    A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix, dt: Scalar
-) -> tuple[Matrix, Matrix, Matrix]:
-    """The weights of a step in which the control is held."""
+@jax.jit
+def _weights_over(
+    A: Array, B: Array, Q: Array, R: Array, S: Array, dt: Array
+) -> tuple[Array, Array, Array]:
     n, m = B.shape
     size = n + m
     # The held control as a state with du/dt = 0: the cost of a step is then a Gramian

@@ -170,7 +170,7 @@ def fit(
             optax.adam(0.05),
             steps=200,
             key=jax.random.key(1),
-            data=(states, jax.vmap(field)(states)),
+            data=(states, jax.jit(jax.vmap(field))(states)),
             batch_size=32,
             trainable={"length": dlx.positive},
         )
