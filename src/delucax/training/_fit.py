@@ -211,8 +211,8 @@ def fit(
             "keys."
         )
     assembly, values = partition_trainable(model, trainable, _WHERE)
-    made: Any = (loss, gradient, Optimiser(optimiser), assembly)
-    run = Steps(*made, key, data, batch_size, seeds)
+    own = Optimiser(optimiser)
+    run = Steps(loss, gradient, own, assembly, key, data, batch_size, seeds)
     state = run.start(model, values)
 
     saved, blocks, seconds = None, [], 0.0
