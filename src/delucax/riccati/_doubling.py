@@ -102,9 +102,11 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
 
     def body(carry):
         (A, C, J), _, k = carry
-        # As of `composed`, with the inverse, as products take less time than solves.
-        inverse = solve(eye + matmul(C, J), eye)
-        solved = matmul(inverse, A)
+        # As of `composed`. Small matrices are eliminated once, for both right sides; of
+        # large ones products with the inverse take less time than solves.
+        right = xp.concatenate([A, C], axis=1) if n <= SMALL else eye
+        inverse = solve(eye + matmul(C, J), right)
+        solved = inverse[:, :n] if n <= SMALL else matmul(inverse, A)
         change = symmetric(matmul(A.T, matmul(J, solved)))
         after, J_after = matmul(A, solved), J + change
         # In units of X = X0 + J, of which J may be a small part.
@@ -118,8 +120,8 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
         relative = xp.where(finite, relative, 0)
 
         def joined(C):
-            moved = matmul(A, matmul(inverse, C))
-            return C + symmetric(matmul(moved, A.T))
+            spread = inverse[:, n:] if n <= SMALL else matmul(inverse, C)
+            return C + symmetric(matmul(matmul(A, spread), A.T))
 
         # The last doubling is one of J alone. A small one is compiled without branches.
         C = joined(C) if n <= SMALL else if_true(relative > eps, joined, C)
