@@ -110,6 +110,11 @@ class _Operations:
         return np.minimum.accumulate(x[::step])[::step]
 
     @staticmethod
+    def cummax(x: Any, axis: int) -> Any:
+        """The largest entry so far."""
+        return np.maximum.accumulate(x, axis)
+
+    @staticmethod
     def custom_linear_solve(matvec: Any, b: Any, solve: Any, **_: Any) -> Any:
         """The solution."""
         return solve(matvec, b)
