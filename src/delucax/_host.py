@@ -145,6 +145,13 @@ def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C
     return start
 
 
+def if_true(needed: Any, function: Callable[[_C], _C], value: _C) -> _C:
+    """`function(value)` if `needed`, else `value`; of a batch always computed."""
+    if _ON_HOST.get():
+        return function(value) if needed else value
+    return jax.lax.cond(needed, function, lambda value: value, value)
+
+
 def fori_loop(low: Any, high: Any, body: Callable[[Any, _C], _C], start: _C) -> _C:
     """`lax.fori_loop`."""
     if not _ON_HOST.get():
