@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from helpers import dtype, tolerance
 
-from delucax.math._accurate import (
-    block_product,
-    product,
-    product_in_parts,
-    units_of_sum,
-)
+from delucax.math._accurate import product, product_in_parts, units_of_sum
 from delucax.math._norms import power_of_two
 
 
@@ -45,28 +40,6 @@ def test_its_error_is_bounded_and_small(n, k, m, spread):
     assert np.all(error <= lost)
     eps = np.finfo(dtype()).eps
     assert np.all(lost <= eps * (np.abs(total) + tolerance(0.1, 1e-3) * sizes))
-
-
-def test_blocks_of_one_problem_and_of_a_batch():
-    draws = [draw(n, k, 3, 1, seed=k) for n, k in ((4, 2), (2, 5), (3, 7))]
-    (B, _, _), (X, _, _), (S, whole, _) = draws
-    rows = [dict(N=B), dict(L=X), dict(N=S[:, :2], L=S[:, 2:])]
-    right = dict(N=whole[:2], L=whole[2:])
-    full = np.block(
-        [[B, np.zeros((4, 5))], [np.zeros((2, 2)), X], [S[:, :2], S[:, 2:]]]
-    ).astype(dtype())
-    # What cancels most of the product.
-    added = -(full @ whole)
-    parts = [added[:4], added[4:6], added[6:]]
-    true, _ = exact(full, whole, added)
-    one = jax.jit(block_product)(rows, right, parts)
-    batch = jax.tree.map(lambda M: M[None], (rows, right, parts))
-    for total, lost in (
-        one,
-        jax.tree.map(lambda M: M[0], jax.vmap(block_product)(*batch)),
-    ):
-        error = np.vectorize(Fraction, otypes=[object])(np.asarray(total, float)) - true
-        assert np.all(np.abs(error).astype(float) <= np.asarray(lost, float))
 
 
 @pytest.mark.parametrize("k", [5, 70])

@@ -16,12 +16,7 @@ from .._host import (
     while_loop as while_loop,
     xp as xp,
 )
-from ._batches import (
-    by_lanes as by_lanes,
-    fence as fence,
-    matmul as matmul,
-    unless_batched as unless_batched,
-)
+from ._batches import by_lanes as by_lanes, fence as fence, matmul as matmul
 from ._components import (
     by_components as by_components,
     COMPONENTS_UP_TO as COMPONENTS_UP_TO,

@@ -11,20 +11,17 @@ barrier does nothing without a batch or on accelerators, where it would be slowe
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jax.extend.core import jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
 
 from .._host import on_host
 
-
-_F = TypeVar("_F", bound=Callable[..., Any])
 
 _fence = Primitive("fence")
 _fence.multiple_results = True
@@ -135,20 +132,6 @@ mlir.register_lowering(_matmul, mlir.lower_fun(_product, multiple_results=False)
 mlir.register_lowering(
     _matmul, mlir.lower_fun(_sum_of_products, multiple_results=False), platform="cpu"
 )
-
-
-def unless_batched(single: _F, batch: _F) -> _F:
-    """`single`, which compiles sooner; under `vmap`, on CPU or not, `batch` of the same
-    results, which runs sooner. Neither is differentiated."""
-    function = custom_vmap(single)
-
-    @function.def_vmap
-    def _(size, batched, *args):
-        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
-        out = jax.vmap(batch, axes, axis_size=size)(*args)
-        return out, jax.tree.map(lambda _: True, out)
-
-    return function  # pyright: ignore[reportReturnType]
 
 
 def by_lanes(function: Callable[..., Any], *args: Any) -> Any:

@@ -2,12 +2,11 @@
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from .._jax import lax, matmul, on_host, scan, unless_batched, xp
+from .._jax import lax, matmul, on_host, scan, xp
 from .._typing import Array
 from ._norms import power_of_two
 
@@ -15,8 +14,6 @@ from ._norms import power_of_two
 _SMALL = 2**15
 """Up to so many scalar products one loop over the sums, which XLA compiles in half the
 time, is as fast as several matrix products."""
-_FEW = 2**13
-"""Up to so many scalar products, with those with zeros, a product of blocks is one."""
 _PARTS = 8
 _LONG = 64
 
@@ -33,45 +30,6 @@ def product(
     if on_host() or left.size * right.shape[1] > _SMALL:
         return _by_slices(left, right, *added)
     return _term_by_term(left, right, *added)
-
-
-def block_product(
-    rows: Sequence[dict[str, Array]], right: dict[str, Array], *added: Sequence[Array]
-) -> tuple[Array, Array]:
-    """The product of a matrix of blocks and a column of them plus the `added` columns,
-    and entrywise error bounds. A block that a row does not name is zero.
-    """
-    stacked = lambda column: xp.concatenate([*column])
-    sizes = [len(next(iter(row.values()))) for row in rows]
-
-    def row_by_row(rows, right, *added):
-        """Without the products with zeros."""
-        products = [
-            product(
-                xp.concatenate([*row.values()], axis=1),
-                stacked(right[name] for name in row),
-                *parts,
-            )
-            for row, *parts in zip(rows, *added, strict=True)
-        ]
-        value, bound = map(stacked, zip(*products, strict=True))
-        return value, bound
-
-    def at_once(rows, right, *added):
-        filled = [
-            [
-                row.get(name, xp.zeros((size, len(M)), M.dtype))
-                for name, M in right.items()
-            ]
-            for row, size in zip(rows, sizes, strict=True)
-        ]
-        return product(xp.block(filled), stacked(right.values()), *map(stacked, added))
-
-    columns = added[0][0].shape[1]
-    if on_host() or sum(sizes) * sum(map(len, right.values())) * columns > _FEW:
-        return row_by_row(rows, right, *added)
-    # One product compiles in half the time of several, but in a batch takes longer.
-    return unless_batched(at_once, row_by_row)(rows, right, *added)
 
 
 def _term_by_term(left, right, *added):

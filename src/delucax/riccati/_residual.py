@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from .._jax import matmul, numbers, vmap, while_loop, xp
 from .._typing import Array, BoolScalar, Scalar, Square
-from ..math._accurate import block_product, product_in_parts, units_of_sum
+from ..math._accurate import product, product_in_parts, units_of_sum
 from ..math._linear_solve import solve, symmetric
 from ..math._norms import largest, relative_and_total_size
 from ._arguments import RiccatiData
@@ -257,9 +257,18 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     else:
         whole |= dict(L=Y.T)
     rows.append((whole, Q, X if discrete and E is None else nothing, nothing))
-    blocks, added, subtracted, factor = zip(*rows, strict=True)
+    factors, added, subtracted, factor = zip(*rows, strict=True)
     factor = xp.concatenate(factor)
-    value, rounding = block_product(blocks, right, added, [-M for M in subtracted])
+    pairs = [
+        product(
+            xp.concatenate([*blocks.values()], axis=1),
+            xp.concatenate([right[name] for name in blocks]),
+            plus,
+            -minus,
+        )
+        for blocks, plus, minus in zip(factors, added, subtracted, strict=True)
+    ]
+    value, rounding = (xp.concatenate(M) for M in zip(*pairs, strict=True))
     rest, rest_lost, factor = value[:-n], rounding[:-n], factor[:-n].T
     sizes = xp.abs(rest)
     most = sizes + rest_lost
