@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import once
 
 import delucax as dlx
 
@@ -30,19 +31,18 @@ def controls(Q):
     return dlx.planning.ilqr(DYNAMICS, cost, X0, np.zeros((5, 1))).controls
 
 
-@pytest.mark.once
+@once
 def test_adjoint_stays_small():
-    # A plan's derivative is one linear-quadratic problem about the solution. If its
-    # products were written out entry by entry, or the derivative of the gains traced
-    # though nothing depends on it, it would be several times the plan, and the first
-    # gradient would be waited for as many times as long.
+    # A derivative of a plan is one linear-quadratic problem about the solution, with
+    # products in one piece: 1.4 times the operations of the plan. Written out entry by
+    # entry it would be several times as many, and the first gradient as much later.
     plan = operations(jax.make_jaxpr(controls)(jnp.eye(2)).jaxpr)
     total = lambda Q: jnp.sum(controls(Q))
     adjoint = operations(jax.make_jaxpr(jax.grad(total))(jnp.eye(2)).jaxpr)
-    assert adjoint < 2.2 * plan
+    assert adjoint < 1.7 * plan
 
 
-@pytest.mark.once
+@once
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
 def test_closing_over_what_is_differentiated_is_refused(derivative):
     def best(p):
