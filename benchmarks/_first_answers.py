@@ -160,6 +160,42 @@ def hinfinity():
     return of_shapes(lambda A, B, Q, R: HInfinity(linear(A, B), Q, R))
 
 
+def stable(A: np.ndarray, B: np.ndarray) -> Any:
+    """A stable model in continuous time, with as many outputs as controls."""
+    import delucax as dlx
+
+    eye, abscissa = np.eye(len(A)), np.max(np.linalg.eigvals(A).real)
+    return dlx.systems.LinearSystem(A - (abscissa + 0.5) * eye, B, eye[: B.shape[1]])
+
+
+@case("margins", 0.5)
+def margins():
+    from delucax.analysis import margins
+
+    return of_shapes(lambda A, B, Q, R: margins(stable(A, B[:, :1])))
+
+
+@case("disk_margin", 0.5)
+def disk_margin():
+    from delucax.analysis import disk_margin
+
+    return of_shapes(lambda A, B, Q, R: disk_margin(stable(A, B)))
+
+
+@case("hinf_norm", 0.5)
+def hinf_norm():
+    from delucax.analysis import hinf_norm
+
+    return of_shapes(lambda A, B, Q, R: hinf_norm(stable(A, B)))
+
+
+@case("c2d and d2c", 0.5)
+def conversions():
+    from delucax import c2d, d2c
+
+    return of_shapes(lambda A, B, Q, R: d2c(c2d(stable(A, B), 0.1)))
+
+
 @case("python-control: dlqr")
 def control_lqr():
     import control

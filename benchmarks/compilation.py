@@ -147,21 +147,25 @@ def import_times(rounds: int) -> list[dict[str, Any]]:
     ]
 
 
-def show(rows: list[dict[str, Any]]) -> None:
-    """Print a table."""
-    columns = "first trace lower compile further again programs operations".split()
-    columns += ["limit", "peer", "ratio"]
-    print(f"{'case':44s}" + "".join(f"{c:>11s}" for c in columns))
-    for row in rows:
-        if "error" in row:
-            print(f"{row['case']:44s} {row['error']}")
-            continue
-        cells = (row.get(c) for c in columns)
-        cells = (
-            "" if c is None else f"{c:.3f}" if isinstance(c, float) else c
-            for c in cells
-        )
-        print(f"{row['case']:44s}" + "".join(f"{c!s:>11s}" for c in cells))
+COLUMNS = (
+    "first trace lower compile further again programs operations limit peer ratio"
+).split()
+
+
+def print_line(*cells: str) -> None:
+    """Print a line at once, also where the output is no terminal."""
+    name, *rest = cells
+    print(f"{name:44s}" + "".join(f"{cell:>11s}" for cell in rest), flush=True)
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a row."""
+    if "error" in row:
+        print_line(row["case"], f" {row['error']}")
+        return
+    cells = map(row.get, COLUMNS)
+    number = lambda c: f"{c:.3f}" if isinstance(c, float) else str(c)
+    print_line(row["case"], *("" if c is None else number(c) for c in cells))
 
 
 def with_cache(name: str, variables: dict[str, str], rounds: int) -> dict[str, Any]:
@@ -187,17 +191,14 @@ def with_cache(name: str, variables: dict[str, str], rounds: int) -> dict[str, A
     }
 
 
-def show_cache(rows: list[dict[str, Any]]) -> None:
-    """Print a table of the waits without and with programs on disk."""
-    columns = "wait then ratio compile then ratio not-found".split()
-    print(f"{'case':44s}" + "".join(f"{c:>11s}" for c in columns))
-    for row in rows:
-        if cache := row.get("cache"):
-            cells = []
-            for before, after in (cache["wait"], cache["compile"]):
-                cells += [before, after, after / before]
-            shown = "".join(f"{cell:>11.3f}" for cell in cells)
-            print(f"{row['case']:44s}{shown}{cache['not found']:>11d}")
+def show_cache(row: dict[str, Any]) -> None:
+    """Print a row of the waits without and with programs on disk."""
+    if cache := row.get("cache"):
+        cells = []
+        for before, after in (cache["wait"], cache["compile"]):
+            cells += [before, after, after / before]
+        shown = (f"{cell:.3f}" for cell in cells)
+        print_line(row["case"], *shown, str(cache["not found"]))
 
 
 def main() -> None:
@@ -213,36 +214,41 @@ def main() -> None:
     if options.answer:
         print(json.dumps(answer(options.answer)))
         return
-    names = [
+    chosen = [
         name
         for name in CASES
         if not options.cases or any(word in name for word in options.cases)
     ]
+    # A peer comes before the first case that is compared with it.
+    pairs = ((CASES[name].peer, name) for name in chosen)
+    names = [name for name in dict.fromkeys(sum(pairs, ())) if name in chosen]
     variables = {
         "JAX_ENABLE_X64": "1" if options.x64 else "0",
         "JAX_ENABLE_COMPILATION_CACHE": "false",
     }
-    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    for _ in range(options.rounds):
-        for name in names:
-            runs[name].append(in_a_process(name, **variables))
+    print_line("case", *COLUMNS)
     rows = [] if options.cases else import_times(2 * options.rounds + 1)
-    found = {name: median(r) for name, r in runs.items()}
-    for name, row in found.items():
-        case = CASES[name]
+    for row in rows:
+        show(row)
+    measured: dict[str, dict[str, Any]] = {}
+    for name in names:
+        runs = [in_a_process(name, **variables) for _ in range(options.rounds)]
+        row, case = median(runs), CASES[name]
         row["limit"] = case.limit
-        if case.peer in found and "first" in row and "first" in found[case.peer]:
-            row["peer"] = found[case.peer]["first"]
-            row["ratio"] = row["first"] / row["peer"]
-        rows.append(row)
-    show(rows)
+        peer = measured.get(case.peer or "", {})
+        if "first" in row and "first" in peer:
+            row["peer"], row["ratio"] = peer["first"], row["first"] / peer["first"]
+        measured[name] = row
+        show(row)
+    rows += measured.values()
     if options.cache:
         print("\nA second process, with the programs of the first on disk: limits are")
         print(f"{WAIT} of the wait, and {COMPILED} of what XLA took")
-        for name in names:
-            if found[name].get("programs"):
-                found[name] |= with_cache(name, variables, options.rounds)
-        show_cache([found[name] for name in names])
+        print_line("case", *"wait then ratio compile then ratio not-found".split())
+        for name, row in measured.items():
+            if row.get("programs"):
+                row |= with_cache(name, variables, options.rounds)
+                show_cache(row)
     if options.out or not options.cases:
         from benchmarks._machine import describe
 

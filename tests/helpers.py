@@ -49,6 +49,16 @@ def central_difference(f, x, step=1e-6):
     return gradient
 
 
+def assert_gradient(f, x, step=1e-6, **close):
+    """The gradient of a scalar `f` at an array is its central difference. One program
+    has both."""
+    both, x = jax.jit(jax.value_and_grad(f)), np.asarray(x, np.float64)
+    expected = central_difference(lambda x: both(x)[0], x, step)
+    gradient = both(x)[1]
+    assert_close(gradient, expected, **close)
+    return gradient
+
+
 def in_both_modes(f):
     """A function of a vector, and its Jacobian forwards and backwards."""
 
@@ -63,25 +73,25 @@ def in_both_modes(f):
 
 
 def check_second_order(line, backwards=False, step=1e-5):
-    """The derivatives of `line`, a number of a number, in both modes, and those of
-    these forwards, and backwards if asked for, are central differences."""
-
-    def to_first_order(e):
-        parts = in_both_modes(lambda e: line(e[0])[None])(e)
-        return jnp.concatenate([part.ravel() for part in parts])
+    """The derivatives of `line`, a number of a number, in both modes, and the second
+    one, forwards and if asked for backwards, are central differences. Returns the
+    compiled value at 0.1."""
 
     @jax.jit
-    def to_second_order(e):
-        if backwards:
-            return in_both_modes(to_first_order)(e)
-        return jax.jvp(to_first_order, (e,), (jnp.ones(1),))
+    def derivatives(e):
+        both = jax.value_and_grad(line)
+        (value, reverse), (forward, second) = jax.jvp(both, (e,), (1.0,))
+        seconds = [second, jax.grad(jax.grad(line))(e)] if backwards else [second]
+        return value, reverse, forward, jnp.stack(seconds)
 
-    low, high = (to_second_order(np.array([0.1 + h]))[0] for h in (-step, step))
-    numeric = np.asarray(high - low) / (2 * step)
-    values, *derivatives = to_second_order(np.array([0.1]))
-    assert_close(values[1:], np.full(2, numeric[0]), rtol=1e-6)
-    for slopes in derivatives:
-        assert_close(slopes.ravel(), numeric, rtol=1e-6)
+    (low, slope_low, *_), (high, slope_high, *_) = (
+        derivatives(0.1 + h) for h in (-step, step)
+    )
+    value, reverse, forward, seconds = derivatives(0.1)
+    slope, second = (high - low) / (2 * step), (slope_high - slope_low) / (2 * step)
+    assert_close(jnp.stack([reverse, forward]), np.full(2, slope), rtol=1e-6)
+    assert_close(seconds, np.full(len(seconds), second), rtol=1e-6)
+    return value
 
 
 @contextlib.contextmanager
@@ -143,6 +153,23 @@ def original_ilqr(dynamics, cost, x0, controls, *, iterations):
     start = eqx.tree_at(lambda p: (p.states, p.controls), blank, given)
     learn = dlx.planning.ilc
     return learn(dynamics, dynamics, cost, start, iterations=iterations, throw=False)
+
+
+@contextlib.contextmanager
+def counted_programs():
+    """The events of compilation within."""
+    events = []
+
+    def listen(event, duration_secs, **others):
+        del duration_secs
+        if event == "/jax/core/compile/backend_compile_duration":
+            events.append(others)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield events
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 class CountCalls:

@@ -4,9 +4,9 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import pytest
-from helpers import once
+from helpers import assert_close, once
 
-from delucax._jax import first_possible
+from delucax._jax import first_possible, value_and_jacobians
 
 
 def unbounded(x):
@@ -46,3 +46,29 @@ def test_where_no_mode_is_possible_the_first_error_is_raised():
     both = lambda x: unbounded(square(x))
     with pytest.raises(ValueError, match="Reverse-mode"):
         first_possible(jax.jacrev(both), jax.jacfwd(both))(1.0)
+
+
+@once
+def test_directions_in_a_loop_are_those_at_once():
+    f = lambda x, u: jnp.stack([jnp.sin(x[0]) * u[0], x[1] ** 2, x[0] * x[1]])
+    xs, us = jnp.array([[1.0, 2.0], [-3.0, 0.5]]), jnp.array([[2.0], [0.7]])
+
+    def lanes(in_loop):
+        def derivatives(x, u):
+            return value_and_jacobians(f, x, u, in_loop=in_loop)
+
+        total = lambda x, u: jnp.sum(derivatives(x, u)[1][0] ** 3)
+        both = jax.vmap(lambda x, u: (derivatives(x, u), jax.grad(total)(x, u)))
+        return jax.jit(both)(xs, us)
+
+    same = lambda a, b: assert_close(a, b, rtol=1e-6)
+    jax.tree.map(same, lanes(in_loop=True), lanes(in_loop=False))
+
+
+@once
+def test_many_directions_and_reverse_mode_alone_have_no_loop():
+    for f, n in ((jnp.sin, 65), (jax.vmap(square), 2)):
+        x = jnp.arange(1.0, n + 1)
+        value, (J,) = value_and_jacobians(f, x, in_loop=True)
+        assert_close(J, jax.jacrev(f)(x))
+        assert_close(value, f(x))

@@ -110,6 +110,11 @@ class _Operations:
         return np.minimum.accumulate(x[::step])[::step]
 
     @staticmethod
+    def cummax(x: Any, axis: int) -> Any:
+        """The largest entry so far."""
+        return np.maximum.accumulate(x, axis)
+
+    @staticmethod
     def custom_linear_solve(matvec: Any, b: Any, solve: Any, **_: Any) -> Any:
         """The solution."""
         return solve(matvec, b)
@@ -138,6 +143,13 @@ def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C
     while proceed(start):
         start = body(start)
     return start
+
+
+def if_true(needed: Any, function: Callable[[_C], _C], value: _C) -> _C:
+    """`function(value)` if `needed`, else `value`; of a batch always computed."""
+    if _ON_HOST.get():
+        return function(value) if needed else value
+    return jax.lax.cond(needed, function, lambda value: value, value)
 
 
 def fori_loop(low: Any, high: Any, body: Callable[[Any, _C], _C], start: _C) -> _C:

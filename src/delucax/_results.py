@@ -6,7 +6,6 @@ from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool
@@ -132,8 +131,8 @@ def first_of(results: Result | None) -> Result:
     if results is None:
         return RESULTS.successful
     # argmax of booleans is the first that holds, and the first entry if none does.
-    failed = results != RESULTS.successful
-    return jax.tree.map(lambda r: r[jnp.argmax(failed)], results)
+    failed = results._value != RESULTS.successful._value
+    return jax.tree.map(lambda r: r[failed.argmax()], results)
 
 
 def or_none(result: Result) -> Result | None:
@@ -146,7 +145,11 @@ _T = TypeVar("_T")
 
 def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
     """`value`, or raise if `failed`, now if that is concrete, else at run time."""
-    return eqx.error_if(value, failed, message)
+    if isinstance(failed, Tracer):
+        return eqx.error_if(value, failed, message)
+    if failed:
+        raise RuntimeError(message)
+    return value
 
 
 def raise_on_failure(

@@ -134,22 +134,32 @@ def states_of(env, size, seed, edges):
 
 @functools.cache
 def compiled_step(name):
-    """A step with its cost and features, and their gradients with respect to all."""
+    """A step with its cost and features, and their gradients with respect to all.
+
+    Of a system that is integrated the gradient of the step is that of its field, which
+    `test_systems` has.
+    """
 
     @jax.jit
     def step(env, x, u):
         arrays, rest = eqx.partition(env, eqx.is_inexact_array)
+        integrated = isinstance(env.dynamics, dlx.Discretized)
 
         def one(x, u):
             def outputs(arrays, x, u):
                 env = eqx.combine(arrays, rest)
-                step = env.step(0.3, x, u)
-                final = env.cost.final(0.3, step.state)
-                y = env.dynamics.observe(0.3, step.state)
-                return step.state, step.cost, final, env.encode(y)
+                costs = env.cost(0.3, x, u), env.cost.final(0.3, x)
+                return *costs, env.encode(env.dynamics.observe(0.3, x))
 
-            out, back = jax.vjp(outputs, arrays, x, u)
-            return out, back(jax.tree.map(jnp.ones_like, out))
+            def stepped(arrays, x, u):
+                step = eqx.combine(arrays, rest).step(0.3, x, u)
+                return step.state, step.cost, outputs(arrays, step.state, u)[1:]
+
+            of, at = stepped, x
+            if integrated:
+                of, at = outputs, env.step(0.3, x, u).state
+            out, back = jax.vjp(of, arrays, at, u)
+            return at, out, back(jax.tree.map(jnp.ones_like, out))
 
         return jax.vmap(one)(x, u)
 

@@ -45,6 +45,27 @@ def test_contract(name, key):
 
 
 @once
+def test_a_sequence_is_few_programs(key):
+    """Each operation outside of a compiled function would be a program of its own."""
+    compiled = []
+
+    def heard(event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    keys = jax.random.split(key)
+    times = jax.device_put(np.arange(13, dtype=np.float32))
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    try:
+        for name, disturbance in ALL.items():
+            before = len(compiled)
+            disturbance.sequence(keys[0], times)
+            assert len(compiled) - before <= 6, name
+    finally:
+        jax.monitoring.unregister_event_duration_listener(heard)
+
+
+@once
 def test_every_public_disturbance_is_listed():
     kinds = {type(x) for x in ALL.values()}
     public = {
@@ -96,13 +117,15 @@ RANDOM = {
 
 @needs_x64
 @pytest.mark.parametrize("name", RANDOM)
-@pytest.mark.parametrize("size", [1, 3])
-def test_a_short_horizon_is_the_beginning_of_a_long_one(name, size, key):
+def test_a_short_horizon_is_the_beginning_of_a_long_one(name, key):
     """In both precisions."""
-    disturbance = RANDOM[name](size)
-    for times in (TIMES, TIMES.astype(jnp.float32)):
+    for size, times, shorter in (
+        (1, TIMES, (99, 2)),
+        (3, TIMES.astype(jnp.float32), (17,)),
+    ):
+        disturbance = RANDOM[name](size)
         long = draw(disturbance, key, times[:100])
-        for steps in (99, 50, 17, 2) if size == 1 else (99, 17):
+        for steps in shorter:
             short = draw(disturbance, key, times[:steps])
             # Programs of two sizes may round differently.
             close = 4 * np.finfo(times.dtype).eps * np.max(np.abs(long))

@@ -42,11 +42,9 @@ def states(solver, substeps):
 @pytest.mark.parametrize(
     "solver, order, substeps",
     [
-        (diffrax.Euler(), 1, (1024, 2048)),
-        (diffrax.Heun(), 2, (128, 256)),
+        # `test_integration.py` has Euler's and Heun's steps by hand.
         (dlx.dynamics.RK4(), 4, (32, 64)),
         (diffrax.Tsit5(), 5, (16, 32)),
-        (diffrax.ImplicitEuler(), 1, (512, 1024)),
         (diffrax.Kvaerno3(), 3, (64, 128)),
     ],
     ids=lambda value: type(value).__name__ if not isinstance(value, int) else None,

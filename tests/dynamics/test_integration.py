@@ -9,7 +9,7 @@ import optimistix as optx
 import pytest
 from helpers import (
     assert_close,
-    central_difference,
+    assert_gradient,
     dtype,
     needs_x64,
     user_error,
@@ -85,13 +85,12 @@ class Hidden(dlx.AbstractSystem):
 
 
 def test_substeps_are_shorter_steps():
-    for solver in (diffrax.Tsit5(), diffrax.ImplicitEuler()):
-        x = X
-        step = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1, solver, 3))
-        part = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1 / 3, solver))
-        for k in range(3):
-            x = part(0.1 * k / 3, x, U)
-        assert_close(step(0.0, X, U), x, atol=1e-14)
+    x, solver = X, diffrax.Tsit5()
+    step = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1, solver, 3))
+    part = eqx.filter_jit(dlx.Discretized(PENDULUM, 0.1 / 3, solver))
+    for k in range(3):
+        x = part(0.1 * k / 3, x, U)
+    assert_close(step(0.0, X, U), x, atol=1e-14)
 
 
 def test_a_step_by_hand():
@@ -287,8 +286,9 @@ class Named(Driven):
     disturbance_names = ("wind", "sea")
 
 
-@pytest.mark.parametrize("motions", [1, 3])
-@pytest.mark.parametrize("solver", [diffrax.Euler(), diffrax.EulerHeun()])
+@pytest.mark.parametrize(
+    "motions, solver", [(1, diffrax.EulerHeun()), (3, diffrax.Euler())]
+)
 def test_as_many_brownian_motions_as_the_diffusion_has_columns(motions, solver, key):
     system = Driven(motions)
     step = dlx.Discretized(system, 0.1, solver, substeps=2)
@@ -402,15 +402,6 @@ def final_angle(leaves, dynamics):
 
 
 @needs_x64
-def test_backsolve_at_a_tight_tolerance():
-    at = jnp.array([1.1, 1.0, -0.5, 0.7, -1.3])
-    f = eqx.filter_jit(eqx.filter_value_and_grad(final_angle))
-    found = f(at, backsolve())[1]
-    expected = central_difference(lambda x: f(x, backsolve())[0], at, step=1e-4)
-    assert_close(found, expected, atol=1e-6 * np.max(np.abs(expected)))
-
-
-@needs_x64
 def test_a_backward_solve_that_fails_is_loud():
     at = jnp.array([1.1, 1.0, -0.5, 0.7])
     with user_error(RuntimeError, match="maximum number of solver steps"):
@@ -419,26 +410,17 @@ def test_a_backward_solve_that_fails_is_loud():
 
 
 def test_backsolve_inside_a_rollout():
-    def slopes(dynamics):
-        env = dlx.Environment(dynamics, dlx.costs.PendulumCost(), horizon=3)
+    env = dlx.Environment(backsolve(), dlx.costs.PendulumCost(), horizon=3)
 
-        def cost(length, K):
-            plant = dlx.replace(env, {"dynamics.system.length": length})
-            linear = dlx.controllers.Linear(K)
-            key = jax.random.key(0)
-            return dlx.rollout(plant, linear, key=key, x0=X, throw=False).total_cost
+    def cost(leaves):
+        """Of a length, a gain and a start."""
+        plant = dlx.replace(env, {"dynamics.system.length": leaves[0]})
+        linear, key = dlx.controllers.Linear(leaves[None, 1:3]), jax.random.key(0)
+        run = dlx.rollout(plant, linear, key=key, x0=leaves[3:], throw=False)
+        return run.total_cost
 
-        return jax.jit(jax.grad(cost, (0, 1)))(1.1, jnp.array([[5.0, 1.0]]))
-
-    adaptive = backsolve()
-    stored = dlx.Discretized(
-        adaptive.system,
-        0.2,
-        adaptive.solver,
-        stepsize_controller=adaptive.stepsize_controller,
-    )
-    for found, expected in zip(slopes(adaptive), slopes(stored), strict=True):
-        assert_close(found, expected, rtol=1e-6)
+    at = jnp.array([1.1, 5.0, 1.0, 1.0, -0.5])
+    assert_gradient(cost, at, step=1e-4, rtol=1e-5)
 
 
 # What does not fit.

@@ -155,7 +155,9 @@ def in_units(name, scale):
     return scaled, scale * jnp.array(x), jnp.array(u), fix
 
 
-@pytest.mark.parametrize("name", SCALED)
+@pytest.mark.parametrize(
+    "name", ["reactor", *(pytest.param(n, marks=once) for n in ("tanks", "Lorenz"))]
+)
 def test_units_do_not_matter(name):
     tight = tolerance(1e-3, 1e-9)
     plain, x, u, fix = in_units(name, 1.0)
@@ -274,7 +276,7 @@ def test_gradient_of_a_held_value_is_that_of_the_formula():
 
 
 @needs_x64
-@pytest.mark.parametrize("fix", [(), "Tc", ("T", "Tc")])
+@pytest.mark.parametrize("fix", [(), ("T", "Tc")])
 def test_derivatives_are_those_of_finite_differences(fix):
     def point(parameters):
         k0, UA, c, T, Tc = parameters
@@ -286,10 +288,10 @@ def test_derivatives_are_those_of_finite_differences(fix):
     at = jnp.array([1.0, 2.092, 0.45, 352.0, 299.0])
     both = jax.jit(in_both_modes(point))
     _, forward, reverse = both(at)
-    assert_close(forward, reverse, rtol=1e-8, atol=1e-9)
+    assert_close(forward, reverse, rtol=1e-12, atol=1e-13)
     steps = jnp.diag(1e-5 * at)
     rows = [(both(at + h)[0] - both(at - h)[0]) / 2e-5 for h in steps]
-    assert_close(forward * at, jnp.stack(rows, 1), rtol=1e-5, atol=1e-5)
+    assert_close(forward * at, jnp.stack(rows, 1), rtol=1e-7, atol=1e-7)
 
 
 @once

@@ -176,12 +176,7 @@ def compare(case, n, **gym_settings):
 
 @pytest.mark.parametrize("task", CASES)
 def test_one_step_agrees_on_many_states(task):
-    compare(CASES[task], 5_000)
-
-
-@pytest.mark.parametrize("task", CASES)
-def test_one_step_agrees_on_all_states(task):
-    compare(CASES[task], 100_000)
+    compare(CASES[task], 20_000)
 
 
 def test_other_forms_agree():
@@ -286,18 +281,9 @@ def compare_episodes(case, seeds):
     assert any(ends) and chaotic <= len(runs) // 20
 
 
-@pytest.mark.parametrize(
-    "task",
-    # The discrete one has the same arithmetic.
-    list(CASES),
-)
-def test_whole_episodes_agree(task):
-    compare_episodes(CASES[task], range(6))
-
-
 @pytest.mark.parametrize("task", CASES)
-def test_a_hundred_episodes_agree(task):
-    compare_episodes(CASES[task], range(100))
+def test_whole_episodes_agree(task):
+    compare_episodes(CASES[task], range(40))
 
 
 @pytest.mark.parametrize("task", CASES)

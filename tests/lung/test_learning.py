@@ -27,7 +27,7 @@ def breaths():
 
 @pytest.mark.parametrize("published", [False, True])
 def test_prediction_is_what_the_dynamics_do(breaths, published):
-    model = lung.LearnedLung(breaths, width=8, published=published, key=KEY)
+    model = lung.LearnedLung(breaths, width=8, boundary=2, published=published, key=KEY)
     u = breaths.u_in[0]
     controls = jnp.stack([u, 0 * u], 1)
     states = dlx.open_loop(model, model.resting(), controls)
@@ -38,7 +38,7 @@ def test_prediction_is_what_the_dynamics_do(breaths, published):
     again = eqx.filter_jit(model.one_step)(u, found)
     assert_close(again, found, rtol=1e-4)
     # The expiratory valve makes it forget.
-    after = model(0.0, states[7], jnp.array([30.0, 1.0]))
+    after = eqx.filter_jit(model)(0.0, states[7], jnp.array([30.0, 1.0]))
     assert_close(after, model.resting())
     assert len(model.state_names) == model.state_size
 

@@ -112,13 +112,7 @@ def test_scores_of_the_original(name):
     assert_close(jnp.mean(found, axis=1), expected, atol=5.01e-4)
 
 
-THOROUGH = (
-    "single",
-    "balloon",
-)
-
-
-@pytest.mark.parametrize("name", ["double", "delay", *THOROUGH])
+@pytest.mark.parametrize("name", LUNGS)
 def test_order_of_the_solver(name):
     """It goes to a fine solution at the fourth order, under controls that switch."""
     plant = LUNGS[name]

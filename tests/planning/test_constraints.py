@@ -1,5 +1,6 @@
 """State and general constraints, by the method of multipliers."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,15 +76,25 @@ def test_a_state_limit_costs_and_holds():
     cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])
     start = jnp.array([1.3, 0.0]), jnp.zeros((12, 1))
     free = ilqr(dynamics, cost, *start)
-    slow = lambda t, x, u: jnp.stack([x[1] - 1.8, -x[1] - 1.8])
-    plan = ilqr(dynamics, cost, *start, constraints=Constraints(slow))
+    plan = ilqr(dynamics, cost, *start, constraints=slower_than(1.8))
     assert jnp.max(jnp.abs(free.states[:, 1])) > 1.9
     assert jnp.max(jnp.abs(plan.states[:-1, 1])) < 1.8 + 1e-6
     assert plan.cost > free.cost
     # A limit that is not met changes nothing.
-    wide = Constraints(lambda t, x, u: jnp.abs(u) - 1e3, final_inequality=_low)
-    same = ilqr(dynamics, cost, *start, constraints=wide)
-    assert_close(same.cost, free.cost, rtol=1e-8)
+    same = ilqr(dynamics, cost, *start, constraints=slower_than(1e3))
+    assert_close(same.cost, free.cost, rtol=1e-12)
+
+
+class Slower(eqx.Module):
+    speed: jax.Array
+
+    def __call__(self, t, x, u):
+        return jnp.concatenate([x[1:] - self.speed, -x[1:] - self.speed])
+
+
+def slower_than(speed):
+    """And at the end below 100 rad."""
+    return Constraints(Slower(jnp.asarray(speed)), final_inequality=_low)
 
 
 def _low(t, x):

@@ -94,7 +94,6 @@ def test_the_trace_with_short_steps():
         dict(line_search="parallel"),
         dict(second_order=True),
         dict(regularise="state"),
-        dict(parallel=True),
         dict(bounds=(-10.0, [10.0, 10.0])),
     ],
 )
@@ -145,13 +144,13 @@ def test_a_plan_is_a_controller():
 def test_gains_are_those_of_the_regulator_of_a_linear_problem(parallel):
     A, B = jnp.array([[1.0, 0.1], [0.3, 0.9]]), jnp.array([[0.0], [0.1]])
     Q, R, Qf = jnp.diag(jnp.array([1.0, 0.2])), 0.1 * jnp.eye(1), 3 * jnp.eye(2)
-    known = dlx.riccati.dre(A, B, Q, R, final=Qf, horizon=15)
+    known = dlx.riccati.dre(A, B, Q, R, final=Qf, horizon=6)
     cost = dlx.costs.Quadratic(Q, R, final=Qf)
     x0 = jnp.array([1.0, -1.0])
     linear = dlx.LinearDynamics(A, B, dt=0.1)
     options = dict(parallel=parallel, line_search="backtracking")
-    plan = ilqr(linear, cost, x0, jnp.zeros((15, 1)), **options)
-    assert_close(plan.gains, known.K, rtol=tolerance(1e-3, 1e-9))
+    plan = ilqr(linear, cost, x0, jnp.zeros((6, 1)), **options)
+    assert_close(plan.gains, known.K, rtol=tolerance(1e-3, 1e-12))
     assert_close(plan.cost, x0 @ known.X[0] @ x0, rtol=tolerance(1e-5, 1e-12))
     assert plan.rollouts <= tolerance(4, 2)
 
@@ -258,6 +257,7 @@ def test_a_quadratic_program_between_bounds():
     """Of a few controls: the Karush-Kuhn-Tucker conditions."""
     from delucax.planning._lq import solve_box_qp
 
+    @jax.jit
     @jax.vmap
     def check(key):
         keys = jax.random.split(key, 3)
@@ -342,16 +342,18 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
     cost = dlx.costs.Quadratic([1.0], [0.1], final=[1.0])
     u = jnp.zeros((8, 1))
 
-    def cost_of(x0):
+    @jax.jit
+    @jax.vmap
+    def costs(x0):
         options = dict(throw=False, line_search=line_search)
         plan = ilqr(stiff(), cost, x0, u, **options)
         return plan.cost, plan.result == dlx.RESULTS.successful
 
-    x0 = jnp.array([[0.3], [4.0], [jnp.nan], [0.2]])
-    found, ok = jax.vmap(cost_of)(x0)
+    found, ok = costs(np.array([[0.3], [4.0], [np.nan], [0.2]]))
     assert ok.tolist() == [True, False, False, True]
-    alone = jnp.stack([cost_of(x)[0] for x in (x0[0], x0[3])])
-    assert_close(found[jnp.array([0, 3])], alone, rtol=1e-10)
+    beside, ok = costs(np.array([[0.3], [0.1], [-0.2], [0.2]]))
+    assert np.all(ok)
+    assert_close(found[::3], beside[::3], rtol=1e-13)
 
 
 @once
@@ -431,5 +433,5 @@ def test_a_batch_over_what_a_cost_closes_over():
         return dlx.planning.ilqr(dynamics, Weighted(), x0, start, throw=False).cost
 
     weights = jnp.array([1.0, 2.0])
-    alone = [total(weight) for weight in weights]
+    alone = [jax.jit(total)(weight) for weight in weights]
     assert_close(jax.vmap(total)(weights), alone, rtol=1e-12)

@@ -4,6 +4,7 @@ import importlib.util
 import re
 from pathlib import Path
 
+import jax
 import pytest
 from helpers import once
 from PIL import Image
@@ -35,14 +36,33 @@ def test_pictures_move_and_are_small():
             assert image.width == 300
 
 
+# `test_drawings` draws every system.
+DRAWN = {"pendulum", "cartpole", "lds", "balloon_lung"}
+
+
 def test_code_of_the_page_draws_its_pictures(tmp_path, monkeypatch):
+    """Its closed loops are traced, and some are run and drawn."""
+
+    def sparing(film):
+        def traced(name, env, controller, x0=None, steps=None, frames=60):
+            assert 20 <= frames
+            if name in DRAWN:
+                film(name, env, controller, x0, steps, frames=2)
+            options = dict(key=jax.random.key(0), x0=x0, horizon=steps)
+            run = lambda: dlx.rollout(env, controller, **options).states
+            assert jax.eval_shape(run).shape[1] == env.state_size
+            named.add(name)
+
+        return traced
+
+    named = set()
     monkeypatch.chdir(tmp_path)
     path = DOCS / "figures" / "gallery.py"
     spec = importlib.util.spec_from_file_location("gallery_figures", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    pictures = module.draw([], tmp_path, frames=2)
-    assert {picture.stem for picture in pictures} == TASKS
+    pictures = module.draw([], tmp_path, sparing)
+    assert named == TASKS and {picture.stem for picture in pictures} == DRAWN
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))

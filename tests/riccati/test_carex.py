@@ -52,7 +52,7 @@ def test_published_systems(number):
 compiled = jax.jit(lambda *problem: dlx.riccati.care(*problem, throw=False))
 
 
-@pytest.mark.parametrize("number", [1, 2, 4, 9, 14])
+@pytest.mark.parametrize("number", [4, 14])
 def test_compiled(number):
     check_compiled(number)
 

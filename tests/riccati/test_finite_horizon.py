@@ -194,7 +194,7 @@ def test_no_minimum(parallel):
 def test_one_bad_member_harms_no_other(parallel):
     def total(R):
         solution = dlx.riccati.dre(
-            A, B, Q, R, final=Q, horizon=4, parallel=parallel, throw=False
+            A, B, Q, R, final=Q, horizon=2, parallel=parallel, throw=False
         )
         good = solution.result == dlx.RESULTS.successful
         return jnp.where(good, jnp.sum(solution.X[0]) + jnp.sum(solution.K), 0.0), good
@@ -214,19 +214,19 @@ def test_one_bad_member_harms_no_other(parallel):
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_derivatives_of_the_recursion(parallel):
-    stages = random_stages(3, 3, 2, 1)
+    stages = random_stages(3, 2, 2, 1)
     rng = np.random.default_rng(0)
     direction = {k: rng.normal(size=v.shape) for k, v in stages.items()}
 
     def line(e):
         moved = {name: stages[name] + e * direction[name] for name in stages}
         for name in ("Q", "R", "final"):
-            moved[name] = (moved[name] + jnp.swapaxes(moved[name], -1, -2)) / 2
+            moved[name] = (moved[name] + moved[name].swapaxes(-1, -2)) / 2
         solution = dlx.riccati.dre(**moved, parallel=parallel, throw=False)
         parts = solution.X, solution.K, solution.k, solution.p, solution.s
         return sum(jnp.sum(jnp.sin(part)) for part in parts)
 
-    check_second_order(line)
+    assert_close(check_second_order(line), line(0.1), rtol=1e-11)
 
 
 def test_differential_equation():
@@ -302,7 +302,7 @@ def test_derivatives_of_the_differential_equation():
         solution = dlx.riccati.cre(A, B, Q, R, S, **options)
         return jnp.sum(jnp.sin(solution.X)) + jnp.sum(jnp.sin(solution.K))
 
-    check_second_order(line)
+    assert_close(check_second_order(line), line(0.1), rtol=1e-11)
 
 
 @pytest.mark.parametrize(

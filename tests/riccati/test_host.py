@@ -1,6 +1,5 @@
 """Concrete matrices are solved by NumPy, traced ones by compiled programs."""
 
-import contextlib
 import threading
 from typing import Any
 
@@ -8,15 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import needs_x64, once, tolerance
+from helpers import counted_programs, needs_x64, once, tolerance
 
 import delucax as dlx
 from delucax._host import on_host
 from delucax.riccati import _stabilising
 
 
-riccati, controllers = dlx.riccati, dlx.controllers
+riccati, controllers, analysis = dlx.riccati, dlx.controllers, dlx.analysis
 linear: Any = dlx.LinearDynamics
+system: Any = dlx.systems.LinearSystem
 A = np.array([[1.1, 0.3], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
 Q, R, C = np.eye(2), np.eye(1), np.eye(2)[:1]
@@ -52,24 +52,52 @@ DESIGNS = {
     "LQI": lambda A: controllers.LQI(linear(A, B), np.eye(3), R, output=C),
     "LQG": lambda A: controllers.LQG(linear(A, B, C), Q, R, Q, R),
     "HInfinity": lambda A: controllers.HInfinity(linear(A, B), Q, R),
+    "lqrd": lambda A: controllers.lqrd(system(A, B), Q, R, dt=0.1),
+}
+MODELS = {
+    "discrete": lambda A: linear(A / 2, B, C, dt=0.5),
+    "continuous": lambda A: system(A - 2 * Q, B, C),
 }
 
 
-@contextlib.contextmanager
-def counted_programs():
-    """The events of compilation within."""
-    events = []
+def modal_test(model):
+    test = analysis.modal_controllability(model)
+    return test.rank_deficient, test.worst, test.worst_unstable
 
-    def listen(event, duration_secs, **others):
-        del duration_secs
-        if event == "/jax/core/compile/backend_compile_duration":
-            events.append(others)
 
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield events
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
+OF_MODELS = {
+    "frequency_response": lambda M: analysis.frequency_response(
+        M, np.array([0.1, 2.0])
+    ),
+    "dcgain": analysis.dcgain,
+    "h2_norm": analysis.h2_norm,
+    "hinf_norm": analysis.hinf_norm,
+    "margins": analysis.margins,
+    "disk_margin": lambda M: analysis.disk_margin(M, 0.5, channel=0),
+    "controllability_matrix": analysis.controllability_matrix,
+    "observability_matrix": analysis.observability_matrix,
+    "controllability_gramian": analysis.controllability_gramian,
+    "observability_gramian": lambda M: analysis.observability_gramian(M, 3),
+    "modal_controllability": modal_test,
+    "is_observable": analysis.is_observable,
+    "is_stabilizable": analysis.is_stabilizable,
+    "poles": analysis.poles,
+    "c2d": lambda M: (dlx.c2d(M, 0.5), dlx.c2d(M, 0.5, "tustin")),
+    "d2c": lambda M: (dlx.d2c(M), dlx.d2c(M, "tustin")),
+}
+OF_ONE_KIND = dict(c2d="continuous", d2c="discrete")
+ANALYSES = {
+    f"{name}, {kind}": lambda A, of=of, model=model: of(model(A))
+    for name, of in OF_MODELS.items()
+    for kind, model in MODELS.items()
+    if OF_ONE_KIND.get(name, kind) == kind
+}
+# The rest is compared beside the test of its derivatives, which compiles it.
+COMPARED = [
+    name
+    for name in ANALYSES
+    if name.split(",")[0] not in ("hinf_norm", "margins", "disk_margin")
+]
 
 
 def test_programs_are_counted():
@@ -78,11 +106,11 @@ def test_programs_are_counted():
     assert events
 
 
-@pytest.mark.parametrize("name", EQUATIONS | DESIGNS)
+@pytest.mark.parametrize("name", EQUATIONS | DESIGNS | ANALYSES)
 def test_nothing_is_compiled(name):
     jax.clear_caches()
     with counted_programs() as events:
-        solution = (EQUATIONS | DESIGNS)[name](A)
+        solution = (EQUATIONS | DESIGNS | ANALYSES)[name](A)
     assert not events
     leaves = [leaf for leaf in jax.tree.leaves(solution) if hasattr(leaf, "dtype")]
     assert leaves
@@ -94,13 +122,15 @@ def test_nothing_is_compiled(name):
 
 
 SPINE = "dare", "care"
+OTHERS = "lyap, not stable", "dlyap, not stable"
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(k, marks=() if k in SPINE else needs_x64) for k in EQUATIONS],
+    "name", [*SPINE, *(pytest.param(name, marks=needs_x64) for name in OTHERS)]
 )
 def test_both_ways_agree(name):
+    """The tests of derivatives compare the compiled solutions of the other equations
+    with those by NumPy, and `test_darex.py` has complex ones."""
     at_once, compiled = EQUATIONS[name](A), jax.jit(EQUATIONS[name])(A)
     assert at_once.result == compiled.result
     rtol = tolerance(3e-4, 1e-11)
@@ -111,6 +141,19 @@ def test_both_ways_agree(name):
     )
 
 
+@needs_x64
+@pytest.mark.parametrize("name", COMPARED)
+def test_both_ways_of_an_analysis_agree(name):
+    at_once, compiled = ANALYSES[name](A), jax.jit(ANALYSES[name])(A)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11),
+        at_once,
+        compiled,
+    )
+    types = [[x.dtype for x in jax.tree.leaves(tree)] for tree in (at_once, compiled)]
+    assert types[0] == types[1]
+
+
 @once
 def test_single_precision_of_data_is_kept():
     with jax.enable_x64(True):
@@ -118,6 +161,11 @@ def test_single_precision_of_data_is_kept():
         assert riccati.dare(*single).X.dtype == jnp.float32
         assert riccati.hinf_care(*single[:2], None, *single[2:]).X.dtype == jnp.float32
         assert riccati.dare(*single[:3], R).X.dtype == jnp.float64
+        model = system(*(M.astype(np.float32) for M in (-Q, B, C)))
+        for name in OF_MODELS.keys() - OF_ONE_KIND.keys():
+            for leaf in jax.tree.leaves(OF_MODELS[name](model)):
+                inexact = jnp.issubdtype(leaf.dtype, jnp.inexact)
+                assert not inexact or jnp.finfo(leaf.dtype).bits == 32
 
 
 @once

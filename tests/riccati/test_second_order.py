@@ -1,4 +1,4 @@
-"""Derivatives of the Riccati solvers to second order.
+"""Derivatives of the Riccati solvers to second order, and their compiled solutions.
 
 `test_finite_horizon.py` and `test_hinfinity.py` have those of the others.
 """
@@ -27,9 +27,9 @@ E = np.array([[1.1, 0.1], [0.0, 0.9]]), np.array([[0.2, -0.4], [0.5, 0.1]])
 C = B[0].T, B[1].T
 
 rng = np.random.default_rng(0)
-LEFT, RIGHT = rng.normal(size=(2, 3, 3)) / 6, rng.normal(size=(2, 2, 2)) / 4
-SQUARE, TALL = rng.normal(size=(2, 3, 3)), rng.normal(size=(2, 3, 2))
-STABLE = LEFT[0] - np.eye(3), LEFT[1]
+LEFT, RIGHT = rng.normal(size=(2, 2, 2)) / 4, rng.normal(size=(2, 1, 1)) / 4
+SQUARE, TALL = rng.normal(size=(2, 2, 2)), rng.normal(size=(2, 2, 1))
+STABLE = LEFT[0] - np.eye(2), LEFT[1]
 PROBLEMS = {
     "dare": (A, B, Q, R, S, E),
     "care": (A, B, Q, R, S, E),
@@ -62,14 +62,16 @@ def line(name, e):
 )
 def test_to_second_order(name):
     # Quadratic equations go by one rule, and linear ones by another.
-    in_each_order = name in ("dare", "dsylvester")
-    check_second_order(functools.partial(line, name), backwards=in_each_order)
+    of, backwards = functools.partial(line, name), name in ("dare", "dsylvester")
+    compiled = check_second_order(of, backwards)
+    assert_close(compiled, of(0.1), rtol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["filter_dare", "filter_care"])
 def test_filter(name):
     """Which is a regulator's equation, transposed."""
-    both = jax.jit(jax.value_and_grad(functools.partial(line, name)))
-    h = 1e-5
+    of, h = functools.partial(line, name), 1e-5
+    both = jax.jit(jax.value_and_grad(of))
+    assert_close(both(0.1)[0], of(0.1), rtol=1e-11)
     numeric = (both(0.1 + h)[0] - both(0.1 - h)[0]) / (2 * h)
     assert_close(both(0.1)[1], numeric, rtol=1e-6)

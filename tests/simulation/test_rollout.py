@@ -111,7 +111,7 @@ def test_a_batch_is_vmap(key):
 
 
 @needs_x64
-@pytest.mark.parametrize("horizon", [1, 16, 23])
+@pytest.mark.parametrize("horizon", [1, 23])
 def test_checkpoints_change_no_number(key, horizon):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
 

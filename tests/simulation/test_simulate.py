@@ -131,10 +131,7 @@ def test_interval_of_a_step(count):
     [
         diffrax.Tsit5(),
         diffrax.Kvaerno3(),
-        pytest.param(diffrax.Euler(), marks=needs_x64),
-        pytest.param(diffrax.Heun(), marks=needs_x64),
         pytest.param(dlx.dynamics.RK4(), marks=needs_x64),
-        pytest.param(diffrax.Dopri5(), marks=needs_x64),
     ],
     ids=lambda solver: type(solver).__name__,
 )

@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 import delucax as dlx
 from delucax.training import fit
+from delucax.training._optimiser import Optimiser
 
 
 class Line(eqx.Module):
@@ -92,9 +93,9 @@ def test_a_second_fit_does_not_compile_again():
         calls()
         return jnp.mean((model(batch) - 1.0) ** 2)
 
-    optimiser = optax.adam(0.1)
+    make = lambda: optax.chain(optax.clip(1.0), optax.adam(0.1, b1=0.8))
     first = train(
-        loss, optimiser=optimiser, steps=10, data=np.ones(8), batch_size=4, block=4
+        loss, optimiser=make(), steps=10, data=np.ones(8), batch_size=4, block=4
     )
     traced = calls.count
     assert traced == 1  # and the last block is shorter than the others
@@ -103,7 +104,7 @@ def test_a_second_fit_does_not_compile_again():
         train(
             loss,
             model,
-            optimiser,
+            make(),
             steps,
             key=key,
             data=np.zeros(8),
@@ -111,6 +112,32 @@ def test_a_second_fit_does_not_compile_again():
             block=4,
         )
     assert calls.count == traced
+
+
+@once
+def test_optimisers_are_equal_if_made_in_the_same_way():
+    schedule = {10: 0.5}
+    makers = [
+        lambda: optax.adam(1e-3),
+        lambda: optax.adam(2e-3),
+        lambda: optax.adamw(1e-3),
+        lambda: optax.scale(1),
+        lambda: optax.scale(1.0),
+        lambda: optax.adam(optax.piecewise_constant_schedule(0.1, schedule)),
+        lambda: optax.masked(optax.sgd(0.1), {"a": True}),
+        lambda: optax.masked(optax.sgd(0.1), {"b": True}),
+        lambda: optax.lbfgs(),
+        # An array is compared by identity, because its numbers may change.
+        lambda: optax.sgd(np.ones(3)),
+    ]
+    made = [(Optimiser(make()), Optimiser(make())) for make in makers]
+    assert all(hash(one) == hash(again) for one, again in made[:-1])
+    for i, (one, _) in enumerate(made):
+        assert [one == again for _, again in made] == [
+            i == j < len(makers) - 1 for j in range(len(makers))
+        ]
+    schedule[20] = 0.1
+    assert Optimiser(makers[5]()) != made[5][0]
 
 
 def test_weakly_typed_leaves_stay_so():

@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, counted_programs, needs_x64, user_error
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
@@ -23,9 +23,9 @@ B = np.array([[0.0], [1.0]])
 TRUE = dict(mass=1.3, length=0.8)
 
 
-def recorded(seed=0, noise=0.01):
+def recorded(seed=0, noise=0.01, damping=0.0):
     """20 s of a pendulum under a new torque every 0.25 s, at 40 dB."""
-    plant = dlx.Discretized(dlx.systems.Pendulum(**TRUE), dt=0.05)
+    plant = dlx.Discretized(dlx.systems.Pendulum(**TRUE, damping=damping), dt=0.05)
     controls = 3 * jnp.repeat(jr.normal(jr.key(3), (80, 1)), 5, 0)
     states = dlx.open_loop(plant, jnp.array([3.0, 0.0]), controls)
     std = noise * jnp.std(states, axis=0)
@@ -51,36 +51,21 @@ def test_length_and_mass_within_one_percent():
     assert inside >= 16
 
 
-class Friction(dlx.AbstractSystem):
-    """A mass with linear and cubic friction; the latter can be left out."""
-
-    state_names, control_names = ("v",), ("u",)
-    b: jax.Array = dlx.parameter(1.0)
-    a: jax.Array = dlx.parameter(0.0)
-
-    def vector_field(self, t, x, u, w):
-        return -self.a * x**3 - self.b * x + u
-
-
 def test_residuals_of_a_wrong_model_are_said_to_be_correlated():
-    plant = dlx.Discretized(Friction(0.5, 1.0), dt=0.05)
-    guess = dlx.Discretized(Friction(1.0, 0.5), dt=0.05)
-    wrong = dlx.Discretized(Friction(), dt=0.05)
-    controls = 3 * jnp.repeat(jr.normal(jr.key(3), (40, 1)), 5, 0)
-    states = dlx.open_loop(plant, jnp.array([0.5]), controls)
+    """Of a pendulum whose friction the model leaves out."""
+    paths, friction = ("system.length", "system.mass"), 0.3
     for seed in range(3):
-        noise = 0.01 * jnp.std(states) * jr.normal(jr.key(seed), states.shape)
-        missing = sysid.physical(wrong, states + noise, controls, "system.b")
+        states, controls, _ = recorded(seed, damping=friction)
+        missing = sysid.physical(GUESS, states, controls, paths)
         assert missing.correlation > 8
         assert "correlated from step to step" in repr(missing)
-        found = sysid.physical(
-            guess, states + noise, controls, ("system.a", "system.b")
-        )
+        guess = dlx.replace(GUESS, {"system.damping": friction})
+        found = sysid.physical(guess, states, controls, paths)
         assert found.correlation < 4
         assert "correlated" not in repr(found)
-        # Where the noise is said to be larger than all that remains nothing is known.
-        loud = sysid.physical(wrong, states + noise, controls, "system.b", noise=1.0)
-        assert loud.correlation == 0
+    # Where the noise is said to be larger than all that remains nothing is known.
+    loud = sysid.physical(GUESS, states, controls, paths, noise=10.0)
+    assert loud.correlation == 0
 
 
 def test_direction_that_is_not_identifiable_is_reported():
@@ -336,3 +321,22 @@ def test_bad_input():
         sysid.physical(GUESS, states[:, :1], controls, "system.mass")
     with user_error(match="trainable"):
         sysid.physical(GUESS, states, controls, "system.colour")
+
+
+def test_few_programs_are_compiled():
+    """Each fit is a few programs, and another limit of steps compiles none of them."""
+    states, controls, _ = recorded()
+    jax.clear_caches()
+    with counted_programs() as events:
+        sysid.linear(states[:82], controls[:81], throw=False)
+    assert 0 < len(events) <= 16
+    options = dict(window=9, noise=0.01, throw=False)
+    fit = lambda **more: sysid.physical(
+        GUESS, states[:28], controls[:27], "system.mass", **options, **more
+    )
+    with counted_programs() as events:
+        fit(max_steps=20)
+    assert 0 < len(events) <= 24
+    with counted_programs() as events:
+        fit(max_steps=19)
+    assert not events

@@ -6,6 +6,7 @@ from .._host import (
     entry as entry,
     fori_loop as fori_loop,
     host_unless_traced as host_unless_traced,
+    if_true as if_true,
     lax as lax,
     numbers as numbers,
     on_host as on_host,

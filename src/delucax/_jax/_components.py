@@ -56,23 +56,25 @@ def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def replayed(*args):
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-        outs = _replay(closed.jaxpr, closed.consts, jax.tree.leaves(args))
+        outs = _replay(closed, jax.tree.leaves(args), _apply)
         return jax.tree.unflatten(jax.tree.structure(shapes), map(_whole, outs))
 
     return replayed
 
 
-def _replay(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
-    env: dict[Any, Any] = {}
-
-    def read(atom):
-        return atom.val if isinstance(atom, Literal) else env[atom]
-
-    env.update(zip(jaxpr.constvars, consts, strict=True))
+def _replay(
+    closed: Any,
+    args: Sequence[Any],
+    apply: Callable[[Any, list[Any]], Sequence[Any]],
+) -> list[Any]:
+    """The outputs of a jaxpr; `apply` gives those of one equation."""
+    jaxpr = closed.jaxpr
+    env = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     env.update(zip(jaxpr.invars, args, strict=True))
+    read = lambda atom: atom.val if isinstance(atom, Literal) else env[atom]
     for equation in jaxpr.eqns:
-        values = [read(atom) for atom in equation.invars]
-        env.update(zip(equation.outvars, _apply(equation, values), strict=True))
+        out = apply(equation, [read(atom) for atom in equation.invars])
+        env.update(zip(equation.outvars, out, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -81,8 +83,7 @@ def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     primitive, params = equation.primitive, equation.params
     # An inner `jit` would take and return whole vectors, so it is replayed as well.
     if primitive.name in ("jit", "pjit"):
-        inner = params["jaxpr"]
-        return _replay(inner.jaxpr, inner.consts, values)
+        return _replay(params["jaxpr"], values, _apply)
     first_out = equation.outvars[0].aval if equation.outvars else None
     shape = getattr(first_out, "shape", None)
     out = _on_components(primitive, params, shape, values)
@@ -120,23 +121,22 @@ def with_stores(function: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     **Returns:** a function with the same values, which compiles in less time.
     """
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*like)
-    jaxpr = closed.jaxpr
 
     def replayed(*args):
         repeated: dict[Any, int] = {}
-        env = dict(zip(jaxpr.constvars, closed.consts, strict=True))
-        env.update(zip(jaxpr.invars, jax.tree.leaves(args), strict=True))
-        read = lambda atom: atom.val if isinstance(atom, Literal) else env[atom]
-        for equation in jaxpr.eqns:
-            out = _bind(equation, map(read, equation.invars))
+
+        def stored(equation, values):
+            out = _bind(equation, values)
             if equation.primitive.name in _ELEMENTWISE:
                 given = [v for v in equation.invars if not isinstance(v, Literal)]
                 count = 1 + sum(repeated.get(v, 0) for v in given)
                 out = out if count <= _REPEATED_UP_TO else fence(*out)
                 count = count if count <= _REPEATED_UP_TO else 0
                 repeated[equation.outvars[0]] = count
-            env.update(zip(equation.outvars, out, strict=True))
-        return jax.tree.unflatten(jax.tree.structure(shapes), map(read, jaxpr.outvars))
+            return out
+
+        outs = _replay(closed, jax.tree.leaves(args), stored)
+        return jax.tree.unflatten(jax.tree.structure(shapes), outs)
 
     return replayed
 

@@ -6,12 +6,17 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.flatten_util import ravel_pytree
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
+
+
+_LOOPED_UP_TO = 64
+"""More directions are taken at once, by products of matrices."""
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,16 +44,33 @@ def jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     return first_possible(jax.jacfwd(f), jax.jacrev(f))
 
 
-def value_and_jacobians(f: Callable[..., Array], *args: Array) -> tuple[Array, Any]:
-    """`f` of vectors, and its Jacobian with respect to each, from one copy of `f`."""
+def value_and_jacobians(
+    f: Callable[..., Array], *args: Array, in_loop: bool = False
+) -> tuple[Array, Any]:
+    """`f` of vectors, and its Jacobian with respect to each, from one copy of `f`.
+
+    With `in_loop`, for what runs seldom, few directions are taken one after the other:
+    XLA on CPU compiles a loop over small arrays as a whole, which takes half the time.
+    """
     joined, split = ravel_pytree(args)
 
     def twice(joined):
         value = f(*split(joined))
         return value, value
 
-    ways = jax.jacfwd(twice, has_aux=True), jax.jacrev(twice, has_aux=True)
-    J, value = first_possible(*ways)(joined)
+    def looped(joined):
+        def along(direction):
+            # Behind a barrier both change in each round. Otherwise XLA would move what
+            # depends on the point alone out of the loop, one operation after the other.
+            point, direction = lax.optimization_barrier((joined, direction))
+            return jax.jvp(lambda z: f(*split(z)), (point,), (direction,))
+
+        values, rows = lax.map(along, jnp.eye(joined.size, dtype=joined.dtype))
+        return rows.T, values[0]
+
+    in_loop = in_loop and joined.size <= _LOOPED_UP_TO
+    forward = looped if in_loop else jax.jacfwd(twice, has_aux=True)
+    J, value = first_possible(forward, jax.jacrev(twice, has_aux=True))(joined)
     ends = np.cumsum([arg.size for arg in args])
     return value, jnp.split(J, ends[:-1], axis=1)
 

@@ -292,7 +292,11 @@ def mlp(
 ) -> eqx.nn.MLP:
     """A fully connected network, linear at its end, that compiled functions take."""
     functions = as_module(activation), as_module(jax.nn.identity)
-    return eqx.nn.MLP(inputs, outputs, width, depth, *functions, **options)
+    return _network(inputs, outputs, width, depth, *functions, **options)
+
+
+# One program, and not one for each random number generator of each layer.
+_network = eqx.filter_jit(eqx.nn.MLP)
 
 
 def function_field(default: Any = dataclasses.MISSING) -> Any:

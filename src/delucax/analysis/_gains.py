@@ -1,20 +1,32 @@
 """Gains from inputs to outputs: at a frequency, and the H2 and H-infinity norms."""
 
 import equinox as eqx
-import jax
-import jax.lax as lax
-import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import ArrayLike, Complex, Float
 
 from .._check import is_concrete
+from .._jax import (
+    compiled_unless_on_host,
+    fori_loop,
+    host_unless_traced,
+    stop_gradient,
+    while_loop,
+    xp,
+)
 from .._module import as_float_array
 from .._results import choose, raise_if, raise_on_failure, Result, RESULTS
-from .._typing import BoolScalar, Scalar
-from ..math._linear_solve import lu_solve
+from .._typing import Array, BoolScalar, Scalar
+from ..math._linear_solve import eigenvalues, lu_solve
 from ._gramians import stable_gramian
-from ._state_space import largest_gain, LinearModel, state_space, StateSpace
+from ._state_space import (
+    expanded_gain,
+    largest_gain,
+    LinearModel,
+    state_space,
+    StateSpace,
+)
 
 
+@host_unless_traced
 def frequency_response(
     model: LinearModel, omega: ArrayLike, *, inputs: str = "controls"
 ) -> Complex[Array, "*frequencies p m"]:
@@ -52,21 +64,22 @@ def frequency_response(
     system = state_space(model, inputs, where)
     # Infinite frequencies are refused: the response there is D alone.
     array = as_float_array(omega)
-    real = eqx.is_inexact_array(array) and not jnp.iscomplexobj(array)
-    if not real or is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+    real = eqx.is_inexact_array(array) and not xp.iscomplexobj(array)
+    if not real or is_concrete(array) and not bool(xp.all(xp.isfinite(array))):
         raise ValueError(f"{where}: omega must be real and finite, got {array}.")
     return _responses(system, array)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _responses(
     system: StateSpace, omega: Float[Array, "*frequencies"]
 ) -> Complex[Array, "*frequencies p m"]:
-    gains = jax.vmap(system.response)(omega.astype(system.A.dtype).reshape(-1))
-    gains = jnp.where(jnp.isfinite(gains), gains, jnp.inf)
+    gains = system.response(omega.astype(system.A.dtype).reshape(-1))
+    gains = xp.where(xp.isfinite(gains), gains, xp.inf)
     return gains.reshape(*omega.shape, *gains.shape[1:])
 
 
+@host_unless_traced
 def dcgain(
     model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> Float[Array, "p m"]:
@@ -106,16 +119,16 @@ def dcgain(
     return raise_if(has_integrator, gain, message) if throw else gain
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
     # A pole at frequency zero makes this matrix singular, up to rounding.
     matrix = system.eye - system.A if system.is_discrete else -system.A
-    values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
-    eps = jnp.finfo(values.dtype).eps
+    values = xp.linalg.svd(stop_gradient(matrix), compute_uv=False)
+    eps = xp.finfo(values.dtype).eps
     singular = ~(values[-1] > len(values) * eps * values[0])
-    invertible = jnp.where(singular, system.eye, matrix)
+    invertible = xp.where(singular, system.eye, matrix)
     gain = system.C @ lu_solve(invertible, system.B) + system.D
-    return jnp.where(singular, jnp.inf, gain), singular
+    return xp.where(singular, xp.inf, gain), singular
 
 
 _LEVELS = 30
@@ -154,6 +167,7 @@ class PeakGain(eqx.Module):
     result: Result
 
 
+@host_unless_traced
 def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
     """The H2 norm: the root of the outputs' mean square under unit white noise,
 
@@ -187,17 +201,18 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
     return _h2_norm(state_space(model, inputs, "h2_norm"))
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _h2_norm(system: StateSpace) -> Scalar:
     stable = system.is_stable()
     W = stable_gramian(system.stable_or_placeholder(stable))
     # The square root has no derivative at zero: the branch not taken is that of 1.
-    square = jnp.trace(system.C @ W @ system.C.T)
+    square = xp.trace(system.C @ W @ system.C.T)
     positive = square > 0
-    norm = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
-    return jnp.where(stable, norm, jnp.inf)
+    norm = xp.where(positive, xp.sqrt(xp.where(positive, square, 1)), 0)
+    return xp.where(stable, norm, xp.inf)
 
 
+@host_unless_traced
 def hinf_norm(
     model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> PeakGain:
@@ -250,43 +265,37 @@ def hinf_norm(
     return raise_on_failure(peak, "hinf_norm", throw)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def peak_gain(system: StateSpace) -> PeakGain:
     """The largest gain of a model with a feed-through `D`."""
-    poles = jnp.linalg.eigvals(lax.stop_gradient(system.A))
+    poles = eigenvalues(stop_gradient(system.A))
     growth = system.growth(poles)
-    stable = jnp.all(growth < 0)
+    stable = xp.all(growth < 0)
     safe = system.stable_or_placeholder(stable)
     # The search is not differentiated: the peak is stationary in the frequency, so that
     # the gain's derivatives are those at a fixed frequency (the envelope theorem).
-    frozen = lax.stop_gradient(safe)
+    frozen = stop_gradient(safe)
     start, ended = _search(frozen)
     top, curvature, moves = _climb(frozen, start)
-    finite = jnp.isfinite(top)
-    gain, slope = _with_slope(safe, jnp.where(finite, top, 1))
-    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
+    finite = xp.isfinite(top)
+    gain, slope, _ = expanded_gain(*safe.expansion(xp.where(finite, top, 1), 2))
+    rise = xp.where(moves, slope - stop_gradient(slope), 0)
     # One Newton step, numerically zero: it carries the implicit derivative of the
     # maximiser.
     step = -rise / curvature
     gain = gain + step * slope + step**2 * curvature / 2
-    gain, frequency = jnp.where(finite, gain, largest_gain(safe.D)), top + step
+    gain, frequency = xp.where(finite, gain, largest_gain(safe.D)), top + step
     # An unstable model has no peak: the frequency is that of its least stable pole.
-    least = poles[jnp.argmax(growth)]
+    least = poles[xp.argmax(growth)]
     if system.dt is None:
-        at_pole = jnp.abs(jnp.imag(least))
+        at_pole = xp.abs(xp.imag(least))
     else:
-        at_pole = jnp.abs(jnp.angle(least)) / lax.stop_gradient(system.dt)
+        at_pole = xp.abs(xp.angle(least)) / stop_gradient(system.dt)
     return PeakGain(
-        jnp.where(stable, gain, jnp.inf),
-        jnp.where(stable, frequency, at_pole),
+        xp.where(stable, gain, xp.inf),
+        xp.where(stable, frequency, at_pole),
         choose(ended, RESULTS.successful, RESULTS.not_converged),
     )
-
-
-def _with_slope(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar]:
-    """The gain at a frequency, and its derivative."""
-    gain = lambda w: largest_gain(system.response(w))
-    return jax.jvp(gain, (omega,), (jnp.ones_like(omega),))
 
 
 def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScalar]:
@@ -295,37 +304,33 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
     **Returns:** its frequency, the curvature of the gain there, and whether its
     frequency depends on the plant, which at the ends of the axis it does not.
     """
-    rounding = 100 * jnp.finfo(omega.dtype).eps
+    rounding = 100 * xp.finfo(omega.dtype).eps
 
     def step(_, carry):
         best, flattest, top, top_curvature, moves, trial = carry
         # At an infinite frequency there is no slope: the placeholder 1 is not used.
-        finite = jnp.isfinite(trial)
-        at = jnp.where(finite, trial, 1)
-        (gain, slope), (_, curvature) = jax.jvp(
-            lambda w: _with_slope(system, w), (at,), (jnp.ones_like(at),)
-        )
-        usable = (
-            finite & (curvature < 0) & jnp.isfinite(slope) & jnp.isfinite(curvature)
-        )
+        finite = xp.isfinite(trial)
+        at = xp.where(finite, trial, 1)
+        gain, slope, curvature = expanded_gain(*system.expansion(at, 2))
+        usable = finite & (curvature < 0) & xp.isfinite(slope) & xp.isfinite(curvature)
         # Newton's step on the slope goes up only where the curvature is negative.
-        curvature = jnp.where(usable, curvature, -1)
+        curvature = xp.where(usable, curvature, -1)
         # Near the peak gains differ by rounding alone, and the slope decides.
-        up = usable & (gain >= best) & (jnp.abs(slope) < flattest) & (trial >= 0)
-        top = jnp.where(up, trial, top)
+        up = usable & (gain >= best) & (xp.abs(slope) < flattest) & (trial >= 0)
+        top = xp.where(up, trial, top)
         return (
             # Less its rounding: the next gain may be equal in exact arithmetic.
-            jnp.where(up, gain * (1 - rounding), best),
-            jnp.where(up, jnp.abs(slope), flattest),
+            xp.where(up, gain * (1 - rounding), best),
+            xp.where(up, xp.abs(slope), flattest),
             top,
-            jnp.where(up, curvature, top_curvature),
-            jnp.where(up, top > 0, moves),
-            jnp.where(up, at - slope / curvature, trial),
+            xp.where(up, curvature, top_curvature),
+            xp.where(up, top > 0, moves),
+            xp.where(up, at - slope / curvature, trial),
         )
 
-    low, steep = jnp.zeros_like(omega), jnp.full_like(omega, jnp.inf)
-    start = (low, steep, omega, -jnp.ones_like(omega), jnp.asarray(False), omega)
-    *_, top, curvature, moves, _ = lax.fori_loop(0, _NEWTON_STEPS, step, start)
+    low, steep = xp.zeros_like(omega), xp.full_like(omega, xp.inf)
+    start = (low, steep, omega, -xp.ones_like(omega), xp.asarray(False), omega)
+    *_, top, curvature, moves, _ = fori_loop(0, _NEWTON_STEPS, step, start)
     return top, curvature, moves
 
 
@@ -335,25 +340,24 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     axis = system.bilinear_transform() if system.is_discrete else system
     A, B, C, D, _ = axis
     n = A.shape[0]
-    gain = lambda w: largest_gain(axis.response(w))
-    eps = jnp.finfo(A.dtype).eps
+    eps = xp.finfo(A.dtype).eps
     at_infinity = largest_gain(D)
 
     def best_of(gain_now, omega_now, omegas):
-        gains = jax.vmap(gain)(omegas)
-        gains = jnp.where(jnp.isnan(gains), -1, gains)
-        k = jnp.argmax(gains)
+        gains = largest_gain(axis.response(omegas))
+        gains = xp.where(xp.isnan(gains), -1, gains)
+        k = xp.argmax(gains)
         better = gains[k] > gain_now
-        gain_now = jnp.where(better, gains[k], gain_now)
-        return gain_now, jnp.where(better, omegas[k], omega_now)
+        gain_now = xp.where(better, gains[k], gain_now)
+        return gain_now, xp.where(better, omegas[k], omega_now)
 
     # Resonances are near the poles. The sweep guards against a flat start.
-    poles = jnp.linalg.eigvals(A)
-    at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
-    low, high = jnp.log(jnp.min(at_poles[:n]) / 100), jnp.log(jnp.max(at_poles) * 100)
-    sweep = jnp.exp(jnp.linspace(low, high, _SWEEP))
-    starts = jnp.concatenate([jnp.zeros(1, A.dtype), at_poles, sweep])
-    infinity = jnp.asarray(jnp.inf, A.dtype)
+    poles = eigenvalues(A)
+    at_poles = xp.concatenate([xp.abs(poles), xp.abs(xp.imag(poles))])
+    low, high = xp.log(xp.min(at_poles[:n]) / 100), xp.log(xp.max(at_poles) * 100)
+    sweep = xp.exp(xp.linspace(low, high, _SWEEP, dtype=A.dtype))
+    starts = xp.concatenate([xp.zeros(1, A.dtype), at_poles, sweep])
+    infinity = xp.asarray(xp.inf, A.dtype)
     best = best_of(at_infinity, infinity, starts)
 
     def crossings(level):
@@ -364,15 +368,15 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         """
         # A singular value of G(j omega) is `level` where j omega is an eigenvalue of H.
         m, p = D.shape[1], D.shape[0]
-        R = level**2 * jnp.eye(m, dtype=D.dtype) - D.T @ D
-        S = level**2 * jnp.eye(p, dtype=D.dtype) - D @ D.T
-        solved = lu_solve(R, jnp.concatenate([D.T @ C, B.T], axis=1))
+        R = level**2 * xp.eye(m, dtype=D.dtype) - D.T @ D
+        S = level**2 * xp.eye(p, dtype=D.dtype) - D @ D.T
+        solved = lu_solve(R, xp.concatenate([D.T @ C, B.T], axis=1))
         F = A + B @ solved[:, :n]
         upper, lower = level * B @ solved[:, n:], level * C.T @ lu_solve(S, C)
-        H = jnp.block([[F, upper], [-lower, -F.T]])
+        H = xp.block([[F, upper], [-lower, -F.T]])
         # Eigenvalues come in pairs, s and -s.
-        omegas = jnp.sort(jnp.abs(jnp.imag(jnp.linalg.eigvals(H))))[::2]
-        return jnp.concatenate([jnp.zeros(1, A.dtype), omegas])
+        omegas = xp.sort(xp.abs(xp.imag(eigenvalues(H))))[::2]
+        return xp.concatenate([xp.zeros(1, A.dtype), omegas])
 
     def more(carry):
         _, _, ended, k = carry
@@ -383,13 +387,13 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         # At the level of D the Hamiltonian is not finite, and close to it not accurate.
         is_close = gain_now < (1 + eps**0.375) * at_infinity
         # A smaller step would lose the crossings next to the peak in rounding.
-        step = jnp.where(is_close, eps**0.375, eps**0.625)
-        level = (1 + step) * jnp.where(gain_now > 0, gain_now, 1)
+        step = xp.where(is_close, eps**0.375, eps**0.625)
+        level = (1 + step) * xp.where(gain_now > 0, gain_now, 1)
         nodes = crossings(level)
         between = (nodes[1:] + nodes[:-1]) / 2
         gain_next, omega_next = best_of(gain_now, omega_now, between)
         return gain_next, omega_next, ~(gain_next > level), k + 1
 
-    start = (*best, jnp.asarray(False), jnp.asarray(0))
-    _, omega, ended, _ = lax.while_loop(more, body, start)
-    return omega if system.dt is None else 2 * jnp.arctan(omega) / system.dt, ended
+    start = (*best, xp.asarray(False), xp.asarray(0))
+    _, omega, ended, _ = while_loop(more, body, start)
+    return omega if system.dt is None else 2 * xp.arctan(omega) / system.dt, ended

@@ -1,17 +1,17 @@
 """Controllability and observability: Krylov matrices and Gramians."""
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._check import check_count, check_positive
+from .._jax import compiled_unless_on_host, host_unless_traced, xp
 from .._results import raise_if
-from .._typing import BoolScalar, RealScalar, Scalar
+from .._typing import Array, BoolScalar, RealScalar, Scalar
 from ..math._linear_solve import full_precision, symmetric
 from ..math._lyapunov import gramian_over, lyapunov
 from ._state_space import LinearModel, state_space, StateSpace
 
 
+@host_unless_traced
 def controllability_matrix(
     model: LinearModel, *, inputs: str = "controls"
 ) -> Float[Array, "n nm"]:
@@ -43,6 +43,7 @@ def controllability_matrix(
     return _krylov(state_space(model, inputs, "controllability_matrix"))
 
 
+@host_unless_traced
 def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
     """The Krylov matrix `[C; C A; ...; C A^(n-1)]`.
 
@@ -65,6 +66,7 @@ def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
     return _krylov(state_space(model, "controls", "observability_matrix").dual).T
 
 
+@host_unless_traced
 def controllability_gramian(
     model: LinearModel,
     horizon: RealScalar | None = None,
@@ -109,6 +111,7 @@ def controllability_gramian(
     return _gramian(state_space(model, inputs, where), horizon, throw, where)
 
 
+@host_unless_traced
 def observability_gramian(
     model: LinearModel, horizon: RealScalar | None = None, *, throw: bool = True
 ) -> Float[Array, "n n"]:
@@ -156,7 +159,7 @@ def _gramian(
         if system.is_discrete:
             return _gramian_over(system, check_count(horizon, "horizon", where))
         check_positive(horizon, "horizon", where)
-        return _gramian_over(system, jnp.asarray(horizon, system.A.dtype))
+        return _gramian_over(system, xp.asarray(horizon, system.A.dtype))
     W, stable = _gramian_of_all_time(system)
     message = (
         f"{where}: the model must be stable for a Gramian over all time. Give a "
@@ -165,19 +168,19 @@ def _gramian(
     return raise_if(~stable, W, message) if throw else W
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _krylov(system: StateSpace) -> Float[Array, "n nm"]:
     blocks = [system.B]
     for _ in range(system.A.shape[0] - 1):
         blocks.append(system.A @ blocks[-1])
-    return jnp.concatenate(blocks, axis=1)
+    return xp.concatenate(blocks, axis=1)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _gramian_of_all_time(system: StateSpace) -> tuple[Float[Array, "n n"], BoolScalar]:
     stable = system.is_stable()
     W = stable_gramian(system.stable_or_placeholder(stable))
-    return jnp.where(stable, W, jnp.inf), stable
+    return xp.where(stable, W, xp.inf), stable
 
 
 @full_precision
@@ -187,7 +190,7 @@ def stable_gramian(system: StateSpace) -> Float[Array, "n n"]:
     return symmetric(lyapunov(system.is_discrete, system.A.T, noise))
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 @full_precision
 def _gramian_over(system: StateSpace, horizon: int | Scalar) -> Float[Array, "n n"]:
     A, Q = system.A, system.B @ system.B.T
@@ -195,7 +198,7 @@ def _gramian_over(system: StateSpace, horizon: int | Scalar) -> Float[Array, "n 
         return gramian_over(A, Q, horizon)
     # By doubling, W_2k = W_k + A^k W_k (A^k)', along the bits of the number of steps:
     # logarithmic work, and no assumption of stability.
-    W, power = jnp.zeros_like(Q), system.eye
+    W, power = xp.zeros_like(Q), system.eye
     for bit in bin(horizon)[2:]:
         W, power = W + power @ W @ power.T, power @ power
         if bit == "1":

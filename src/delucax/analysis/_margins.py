@@ -2,16 +2,23 @@
 
 import equinox as eqx
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from .._check import check_at_most, check_count
+from .._jax import (
+    compiled_unless_on_host,
+    fori_loop,
+    host_unless_traced,
+    lax,
+    stop_gradient,
+    vmap,
+    xp,
+)
 from .._results import first_of, raise_on_failure, Result
-from .._typing import BoolScalar, RealScalar, Scalar
-from ..math._linear_solve import lu_solve
+from .._typing import Array, BoolScalar, RealScalar, Scalar
+from ..math._linear_solve import eigenvalues, lu_solve
 from ._gains import peak_gain
-from ._state_space import frobenius_norm, LinearModel, state_space, StateSpace
+from ._state_space import LinearModel, norm, state_space, StateSpace
 
 
 class DiskMargin(eqx.Module):
@@ -47,6 +54,7 @@ class DiskMargin(eqx.Module):
     result: Result
 
 
+@host_unless_traced
 def disk_margin(
     loop: LinearModel,
     skew: RealScalar = 0.0,
@@ -101,55 +109,52 @@ def disk_margin(
     if channel is not None:
         channel = check_count(channel, "channel", where, least=0)
         check_at_most(channel, m - 1, "channel", where)
-    disk = disk_of(system, jnp.asarray(skew, system.A.dtype), channel)
+    disk = _disk(system, xp.asarray(skew, system.A.dtype), channel)
     return raise_on_failure(disk, where, throw)
 
 
-@eqx.filter_jit
-def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
+@compiled_unless_on_host
+def _disk(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     """The disk margin of a loop, or of one of its channels."""
     A, B, C, *_ = loop
     if channel is not None:
         # The other channels are closed by u = -y before the loop is opened at this one.
         others = [i for i in range(B.shape[1]) if i != channel]
-        A = A - B[:, jnp.array(others)] @ C[jnp.array(others)] if others else A
+        A = A - B[:, xp.array(others)] @ C[xp.array(others)] if others else A
         B, C = B[:, channel, None], C[channel, None]
-    eye = jnp.eye(B.shape[1], dtype=A.dtype)
+    eye = xp.eye(B.shape[1], dtype=A.dtype)
     # S = I - C (s I - (A - B C))^-1 B.
     closed = StateSpace(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt)
     peak = peak_gain(closed)
     # Finite values in the branches that are not taken keep their gradients finite.
     # The gain is zero, and the margin infinite, where there is no loop at all.
-    stable = jnp.isfinite(peak.gain)
+    stable = xp.isfinite(peak.gain)
     usual = stable & (peak.gain > 0)
-    alpha = 1 / jnp.where(usual, peak.gain, 1)
+    alpha = 1 / xp.where(usual, peak.gain, 1)
     # The extreme real factors are those at delta = -alpha and alpha.
     up, down = 2 - alpha * (1 + skew), 2 + alpha * (1 + skew)
     low = (2 - alpha * (1 - skew)) / down
     bounded = up > 0
-    high = (2 + alpha * (1 - skew)) / jnp.where(bounded, up, 1)
+    high = (2 + alpha * (1 - skew)) / xp.where(bounded, up, 1)
     # With a factor exp(j phase), delta is 2 tan / sqrt(1 + skew^2 tan^2) in size, tan
     # being that of half the phase.
     square = 1 - (skew * alpha / 2) ** 2
     turns = square > 0
-    tangent = alpha / 2 / jnp.sqrt(jnp.where(turns, square, 1))
-    phase = jnp.where(turns, 2 * jnp.arctan(tangent), jnp.pi)
+    tangent = alpha / 2 / xp.sqrt(xp.where(turns, square, 1))
+    phase = xp.where(turns, 2 * xp.arctan(tangent), xp.pi)
 
     def chosen(value, without_loop, unstable):
-        value = jnp.where(usual, value, without_loop)
-        return jnp.where(stable, value, unstable)
+        value = xp.where(usual, value, without_loop)
+        return xp.where(stable, value, unstable)
 
     return DiskMargin(
-        chosen(alpha, jnp.inf, 0.0),
+        chosen(alpha, xp.inf, 0.0),
         peak.frequency,
-        chosen(low, -jnp.inf, 1.0),
-        chosen(jnp.where(bounded, high, jnp.inf), jnp.inf, 1.0),
-        chosen(phase, jnp.pi, 0.0),
+        chosen(low, -xp.inf, 1.0),
+        chosen(xp.where(bounded, high, xp.inf), xp.inf, 1.0),
+        chosen(phase, xp.pi, 0.0),
         peak.result,
     )
-
-
-_HALVINGS = 60
 
 
 class Margins(eqx.Module):
@@ -206,6 +211,7 @@ class Margins(eqx.Module):
     result: Result
 
 
+@host_unless_traced
 def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     """The gain, phase, delay and disk margins of a loop with one input and one output.
 
@@ -253,49 +259,48 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     return raise_on_failure(_margins(system), where, throw)
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _margins(loop: StateSpace) -> Margins:
+    dtype = loop.A.dtype
     stable = loop._replace(A=loop.A - loop.B @ loop.C).is_stable()
-    skews = jnp.array([0, 1, -1], loop.A.dtype)
-    disks = jax.vmap(lambda skew: disk_of(loop, skew, None))(skews)
-    frozen = lax.stop_gradient(loop)
+    disks = vmap(lambda skew: _disk(loop, skew, None))(xp.array([0, 1, -1], dtype))
+    frozen = stop_gradient(loop)
     omegas, crosses = _crossings(frozen)
-    values = jax.vmap(jax.vmap(lambda w: _scalar(frozen, w)))(omegas)
+    values = _scalars(frozen, omegas)[0]
 
     # Where the loop is real and negative, and where it is 1 in size.
     # A loop gain above `huge` is at a pole on the axis, no crossing.
-    real = jnp.real(values[0])
-    huge = jnp.finfo(real.dtype).eps ** -0.75
+    real = xp.real(values[0])
+    huge = xp.finfo(dtype).eps ** -0.75
     negative = crosses[0] & (real < 0) & (real > -huge)
     # Times these factors the loop gain is -1, and so it is after these turns and lags.
-    factors = -1 / jnp.where(negative, real, -1)
-    turns = jnp.angle(-values[1])
-    lags = jnp.mod(turns, 2 * jnp.pi) / jnp.where(crosses[1], omegas[1], 1)
-    candidates = jnp.stack(
+    factors = -1 / xp.where(negative, real, -1)
+    turns = xp.angle(-values[1])
+    lags = xp.mod(turns, 2 * xp.pi) / xp.where(crosses[1], omegas[1], 1)
+    candidates = xp.stack(
         [
-            jnp.where(negative & (factors >= 1), factors, jnp.inf),
-            jnp.where(negative & (factors < 1), 1 / factors, jnp.inf),
-            jnp.where(crosses[1], jnp.abs(turns), jnp.inf),
-            jnp.where(crosses[1], lags, jnp.inf),
+            xp.where(negative & (factors >= 1), factors, xp.inf),
+            xp.where(negative & (factors < 1), 1 / factors, xp.inf),
+            xp.where(crosses[1], xp.abs(turns), xp.inf),
+            xp.where(crosses[1], lags, xp.inf),
         ]
     )
     # The kind of crossing of each margin: gain margins at phase crossings.
-    kinds = jnp.array([0, 0, 1, 1])
-    nearest = jnp.argmin(candidates, axis=1)
-    exists = jnp.isfinite(jnp.min(candidates, axis=1))
-    followed = jax.vmap(lambda *each: _follow(loop, *each))(
-        kinds, omegas[kinds, nearest], exists
-    )
+    kinds = xp.array([0, 0, 1, 1])
+    nearest = xp.argmin(candidates, axis=1)
+    exists = xp.isfinite(xp.min(candidates, axis=1))
+    followed = _follow(loop, kinds, omegas[kinds, nearest], exists)
     # A placeholder where there is no crossing, at which all is finite.
-    followed = jnp.where(exists, followed, 1)
-    L = jax.vmap(lambda w, ok: jnp.where(ok, _scalar(loop, w), 1))(followed, exists)
-    factor = 1 / jax.vmap(frobenius_norm)(L)
-    angle = jnp.arctan2(-jnp.imag(L), -jnp.real(L))
-    lag = jnp.where(angle < 0, angle + 2 * jnp.pi, angle) / followed
-    margins = jnp.stack([factor[0], factor[1], jnp.abs(angle[2]), lag[3]])
-    none, unstable = jnp.array([jnp.inf, 0, jnp.inf, jnp.inf]), jnp.array([1, 1, 0, 0])
-    margins = jnp.where(stable, jnp.where(exists, margins, none), unstable)
-    frequencies = jnp.where(stable & exists, followed, jnp.nan)
+    followed = xp.where(exists, followed, 1)
+    L = xp.where(exists, _scalars(loop, followed)[0], 1)
+    factor = 1 / norm(L, ())
+    angle = xp.arctan2(-xp.imag(L), -xp.real(L))
+    lag = xp.where(angle < 0, angle + 2 * xp.pi, angle) / followed
+    margins = xp.stack([factor[0], factor[1], xp.abs(angle[2]), lag[3]])
+    none = xp.array([xp.inf, 0, xp.inf, xp.inf], dtype)
+    unstable = xp.array([1, 1, 0, 0], dtype)
+    margins = xp.where(stable, xp.where(exists, margins, none), unstable)
+    frequencies = xp.where(stable & exists, followed, xp.nan)
     names = ("gain_margin", "gain_reduction", "phase_margin", "delay_margin")
     disk, disk_s, disk_t = (jax.tree.map(lambda a, i=i: a[i], disks) for i in range(3))
     return Margins(
@@ -309,41 +314,49 @@ def _margins(loop: StateSpace) -> Margins:
     )
 
 
-def _scalar(loop: StateSpace, omega: Scalar) -> Complex[Array, ""]:
-    return loop.response(omega)[0, 0]
+def _scalars(
+    loop: StateSpace, omega: Float[Array, "*frequencies"], order: int = 0
+) -> list[Complex[Array, "*frequencies"]]:
+    """The gain of the loop, and its derivatives up to an order."""
+    return [gain[..., 0, 0] for gain in loop.expansion(omega, order)]
 
 
-def _crossing(kind: Int[Array, ""] | int, L: Complex[Array, ""]) -> Scalar:
+def _crossing(kind: Int[Array, "..."], L: Complex[Array, "..."]) -> Float[Array, "..."]:
     """Zero where `L` is real, or for the second kind where it is 1 in size."""
-    length = frobenius_norm(L)
-    return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
+    length = norm(L, ())
+    return xp.where(kind == 0, xp.imag(L) / length, xp.log(length))
 
 
 def _follow(
-    loop: StateSpace, kind: Int[Array, ""] | int, omega: Scalar, exists: BoolScalar
-) -> Scalar:
-    """The crossing `omega` with its derivatives in the loop.
+    loop: StateSpace,
+    kind: Int[Array, " margins"],
+    omega: Float[Array, " margins"],
+    exists: Bool[Array, " margins"],
+) -> Float[Array, " margins"]:
+    """The crossings `omega` with their derivatives in the loop.
 
     Two Newton steps from a converged point: their values change nothing but rounding,
     and their derivatives are those of the crossing to third order.
     """
     # At zero and at the Nyquist frequency a loop is real whatever its parameters: these
     # crossings do not move, but that pi / dt moves with the step.
-    dt = loop.dt
-    at_nyquist = jnp.asarray(False)
+    dt, moves = loop.dt, exists & (omega > 0)
     if dt is not None:
-        nearly = jnp.pi * (1 - 10 * jnp.finfo(omega.dtype).eps)
-        at_nyquist = omega * lax.stop_gradient(dt) > nearly
-    moves = exists & (omega > 0) & ~at_nyquist
+        nearly = xp.pi * (1 - 10 * xp.finfo(omega.dtype).eps)
+        at_nyquist = omega * stop_gradient(dt) > nearly
+        moves = moves & ~at_nyquist
+        omega = xp.where(at_nyquist, xp.pi / dt, omega)
 
     def newton(_, crossed):
-        crossing = lambda w: _crossing(kind, _scalar(loop, w))
-        g, slope = jax.jvp(crossing, (crossed,), (jnp.ones_like(crossed),))
-        return crossed - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
+        L, change = _scalars(loop, crossed, 1)
+        relative = change / L
+        turn = xp.real(L) / norm(L, ()) * xp.imag(relative)
+        slope = xp.where(kind == 0, turn, xp.real(relative))
+        g = _crossing(kind, L)
+        return crossed - xp.where(moves, g / xp.where(moves, slope, 1), 0)
 
-    crossed = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
-    fixed = omega if dt is None else jnp.where(at_nyquist, jnp.pi / dt, omega)
-    return jnp.where(moves, crossed, fixed)
+    crossed = fori_loop(0, 2, newton, xp.where(moves, omega, 1))
+    return xp.where(moves, crossed, omega)
 
 
 def _crossings(
@@ -354,60 +367,66 @@ def _crossings(
     **Returns:** two rows of frequencies, and which of them are crossings.
     """
     A, B, C, D, _ = loop
-    eps = jnp.finfo(A.dtype).eps
+    precision = xp.finfo(A.dtype)
+    eps = precision.eps
     if loop.is_discrete:
-        scale = jnp.ones((), A.dtype)
+        scale = xp.ones((), A.dtype)
         # A pole at z = -1 would map to infinity: it is perturbed to stay finite.
         axis = loop._replace(A=loop.A * (1 - 10 * eps)).bilinear_transform()
     else:
         # Frequencies in units of the closed loop's poles: then the angles below, the
         # arc tangents of frequencies, are well spread.
-        sizes = jnp.abs(jnp.linalg.eigvals(A - B @ C))
-        scale = jnp.exp(jnp.mean(jnp.log(jnp.where(sizes > 0, sizes, 1))))
+        sizes = xp.abs(eigenvalues(A - B @ C))
+        scale = xp.exp(xp.mean(xp.log(xp.where(sizes > 0, sizes, 1))))
         axis = StateSpace(A / scale, B / scale, C, D, None)
+    kinds = xp.array([[0], [1]])
 
     def omega(phi):
         """The frequency of an angle in `[0, pi/2]`, which covers the whole axis."""
-        return scale * jnp.tan(phi) if loop.dt is None else 2 * phi / loop.dt
+        return scale * xp.tan(phi) if loop.dt is None else 2 * phi / loop.dt
 
     def values(phi):
         """Both crossing functions, at two rows of angles."""
-        L = jax.vmap(jax.vmap(lambda phi: _scalar(loop, omega(phi))))(phi)
-        return jnp.stack(
-            [jax.vmap(lambda L, k=k: _crossing(k, L))(L[k]) for k in (0, 1)]
-        )
+        return _crossing(kinds, _scalars(loop, omega(phi))[0])
 
-    nodes = jnp.concatenate([_real_frequencies(axis), _unit_frequencies(axis)])
-    nodes = jnp.arctan(jnp.where(jnp.isfinite(nodes), jnp.abs(nodes), 0))
-    ends = jnp.array([0, jnp.pi / 2], A.dtype)
-    nodes = jnp.sort(jnp.concatenate([ends, nodes]))
+    nodes = xp.concatenate([_real_frequencies(axis), _unit_frequencies(axis)])
+    nodes = xp.arctan(xp.where(xp.isfinite(nodes), nodes, 0))
+    ends = xp.array([0, xp.pi / 2], A.dtype)
+    nodes = xp.sort(xp.concatenate([ends, nodes]))
     between = (nodes[1:] + nodes[:-1]) / 2
-    between = jnp.stack([between, between])
+    between = xp.stack([between, between])
     signs = values(between)
     # Sign changes below rounding error are ignored.
-    is_reliable = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
+    is_reliable = xp.isfinite(signs) & (xp.abs(signs) > eps**0.5)
     # Each midpoint is compared with the last reliable one before it.
-    indices = jnp.arange(signs.shape[1])
-    last = lax.cummax(jnp.where(is_reliable, indices, -1), axis=1)[:, :-1]
-    low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
-    low_sign = jnp.sign(jnp.take_along_axis(signs, last, axis=1))
-    crosses = is_reliable[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
+    indices = xp.arange(signs.shape[1])
+    last = lax.cummax(xp.where(is_reliable, indices, -1), axis=1)[:, :-1]
+    low, high = xp.take_along_axis(between, last, axis=1), between[:, 1:]
+    low_sign = xp.sign(xp.take_along_axis(signs, last, axis=1))
+    crosses = is_reliable[:, 1:] & (last >= 0) & (low_sign != xp.sign(signs[:, 1:]))
+    # A loop of n states crosses at most n times. The other intervals come last.
+    order = xp.argsort(indices[1:] + xp.where(crosses, 0, len(nodes)), axis=1)
+    low, high, low_sign, crosses = (
+        xp.take_along_axis(row, order[:, : len(A)], axis=1)
+        for row in (low, high, low_sign, crosses)
+    )
 
     def halve(_, bracket):
         low, high = bracket
         middle = (low + high) / 2
-        before = jnp.sign(values(middle)) == low_sign
-        return jnp.where(before, middle, low), jnp.where(before, high, middle)
+        before = xp.sign(values(middle)) == low_sign
+        return xp.where(before, middle, low), xp.where(before, high, middle)
 
-    # Bisection, as it cannot leave the bracket: Newton's method follows in `_follow`.
-    low, high = lax.fori_loop(0, _HALVINGS, halve, (low, high))
+    # Bisection to rounding, as it cannot leave the bracket: Newton's method follows in
+    # `_follow`.
+    low, high = fori_loop(0, precision.nmant + 8, halve, (low, high))
     phi = (low + high) / 2
     # At a pole or a zero on the axis the sign jumps without a root.
-    crosses = crosses & (jnp.abs(values(phi)) < eps**0.25)
+    crosses = crosses & (xp.abs(values(phi)) < eps**0.25)
     # A loop is real at both ends; a strictly proper one is zero at infinity.
-    at_ends = jnp.array([[True, loop.is_discrete], [False, False]])
-    phi = jnp.concatenate([phi, jnp.stack([ends, ends])], axis=1)
-    return omega(phi), jnp.concatenate([crosses, at_ends], axis=1)
+    at_ends = xp.array([[True, loop.is_discrete], [False, False]])
+    phi = xp.concatenate([phi, xp.stack([ends, ends])], axis=1)
+    return omega(phi), xp.concatenate([crosses, at_ends], axis=1)
 
 
 def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
@@ -415,19 +434,19 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     A, B, C, *_ = loop
     # Where g(s) = L(s) - L(-s) is zero, 1 / g has a pole: an eigenvalue of the inverse
     # system, which exists in a variable 1 / (point - s), as g(point) is not zero.
-    zero = jnp.zeros_like(A)
-    both_A = jnp.block([[A, zero], [zero, -A]])
-    both_B, both_C = jnp.concatenate([B, B]), jnp.concatenate([C, C], axis=1)
-    eye = jnp.eye(both_A.shape[0], dtype=A.dtype)
+    zero = xp.zeros_like(A)
+    both_A = xp.block([[A, zero], [zero, -A]])
+    both_B, both_C = xp.concatenate([B, B]), xp.concatenate([C, C], axis=1)
+    eye = xp.eye(both_A.shape[0], dtype=A.dtype)
+    right = xp.concatenate([eye, both_B], axis=1)
     frequencies = []
     # Two points, neither of which is likely to be a pole or a zero itself.
     for point in (0.7368, 1.3719):
-        right = jnp.concatenate([eye, both_B], axis=1)
         solved = lu_solve(point * eye - both_A, right)
         F, FB = solved[:, : len(eye)], solved[:, len(eye) :]
         inverse = FB @ (both_C @ F) / (both_C @ FB) - F
-        frequencies.append(jnp.imag(1 / jnp.linalg.eigvals(inverse)))
-    return jnp.concatenate(frequencies)
+        frequencies.append(_distinct(1 / eigenvalues(inverse)))
+    return xp.concatenate(frequencies)
 
 
 def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
@@ -435,7 +454,12 @@ def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     A, B, C, D, _ = loop
     # R = I - D'D of the Hamiltonian at level 1, perturbed where it is singular.
     remainder = 1 - D[0, 0] ** 2
-    remainder = jnp.where(remainder == 0, jnp.finfo(A.dtype).eps, remainder)
+    remainder = xp.where(remainder == 0, xp.finfo(A.dtype).eps, remainder)
     F = A + B @ C * D[0, 0] / remainder
-    H = jnp.block([[F, B @ B.T / remainder], [-C.T @ C / remainder, -F.T]])
-    return jnp.imag(jnp.linalg.eigvals(H))
+    H = xp.block([[F, B @ B.T / remainder], [-C.T @ C / remainder, -F.T]])
+    return _distinct(eigenvalues(H))
+
+
+def _distinct(points: Complex[Array, " points"]) -> Float[Array, " nodes"]:
+    """The sizes of the imaginary parts of pairs of conjugates; of real points zero."""
+    return xp.sort(xp.abs(xp.imag(points)))[::2]

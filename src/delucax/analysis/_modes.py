@@ -1,14 +1,13 @@
 """Poles, zeros, and tests of modal controllability and observability."""
 
 import equinox as eqx
-import jax
-import jax.lax as lax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from .._check import check_positive, is_concrete
-from .._typing import BoolScalar, RealScalar, Scalar
+from .._jax import compiled_unless_on_host, host_unless_traced, stop_gradient, vmap, xp
+from .._typing import Array, BoolScalar, RealScalar, Scalar
+from ..math._linear_solve import eigenvalues
 from ._state_space import LinearModel, state_space, StateSpace
 
 
@@ -49,6 +48,7 @@ class ModalTest(eqx.Module):
     tolerance: Scalar
 
     @property
+    @host_unless_traced
     def rank_deficient(self) -> Bool[Array, " n"]:
         """Which modes are uncontrollable (unobservable): the matrix of the test loses
         rank there."""
@@ -56,19 +56,22 @@ class ModalTest(eqx.Module):
         return ~(self.distances > self.tolerance)
 
     @property
+    @host_unless_traced
     def worst(self) -> tuple[Complex[Array, ""], Scalar]:
         """The least controllable (observable) mode, and its distance."""
-        k = jnp.argmin(self.distances)
+        k = xp.argmin(self.distances)
         return self.modes[k], self.distances[k]
 
     @property
+    @host_unless_traced
     def worst_unstable(self) -> tuple[Complex[Array, ""], Scalar]:
         """`worst` among the unstable modes; an infinite distance if there is none."""
-        distances = jnp.where(self.unstable, self.distances, jnp.inf)
-        k = jnp.argmin(distances)
+        distances = xp.where(self.unstable, self.distances, xp.inf)
+        k = xp.argmin(distances)
         return self.modes[k], distances[k]
 
 
+@host_unless_traced
 def modal_controllability(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> ModalTest:
@@ -104,6 +107,7 @@ def modal_controllability(
     return _modal_test(state_space(model, inputs, where), tolerance, where)
 
 
+@host_unless_traced
 def modal_observability(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> ModalTest:
@@ -131,6 +135,7 @@ def modal_observability(
     return _modal_test(state_space(model, "controls", where).dual, tolerance, where)
 
 
+@host_unless_traced
 def is_controllable(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> BoolScalar:
@@ -153,9 +158,10 @@ def is_controllable(
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
-    return ~jnp.any(test.rank_deficient)
+    return ~xp.any(test.rank_deficient)
 
 
+@host_unless_traced
 def is_stabilizable(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> BoolScalar:
@@ -181,9 +187,10 @@ def is_stabilizable(
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
-    return ~jnp.any(test.rank_deficient & test.unstable)
+    return ~xp.any(test.rank_deficient & test.unstable)
 
 
+@host_unless_traced
 def is_observable(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> BoolScalar:
@@ -205,9 +212,10 @@ def is_observable(
         assert dlx.analysis.is_observable(upright)
         ```
     """
-    return ~jnp.any(modal_observability(model, tolerance=tolerance).rank_deficient)
+    return ~xp.any(modal_observability(model, tolerance=tolerance).rank_deficient)
 
 
+@host_unless_traced
 def is_detectable(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> BoolScalar:
@@ -232,9 +240,10 @@ def is_detectable(
         ```
     """
     test = modal_observability(model, tolerance=tolerance)
-    return ~jnp.any(test.rank_deficient & test.unstable)
+    return ~xp.any(test.rank_deficient & test.unstable)
 
 
+@host_unless_traced
 def poles(model: LinearModel) -> Complex[Array, " n"]:
     """The eigenvalues of `A`.
 
@@ -258,39 +267,38 @@ def poles(model: LinearModel) -> Complex[Array, " n"]:
         dlx.analysis.poles(upright)  # +3.87 and -3.87 per second
         ```
     """
-    return jnp.linalg.eigvals(state_space(model, "controls", "poles").A)
+    return eigenvalues(state_space(model, "controls", "poles").A)
 
 
 def _modal_test(
     system: StateSpace, tolerance: RealScalar | None, where: str
 ) -> ModalTest:
-    eps = jnp.finfo(system.A.dtype).eps
+    eps = xp.finfo(system.A.dtype).eps
     if tolerance is None:
         tolerance = float(10 * len(system.A) * eps)
     check_positive(tolerance, "tolerance", where)
-    return _tested(system, jnp.asarray(tolerance, system.A.dtype))
+    return _tested(system, xp.asarray(tolerance, system.A.dtype))
 
 
-@eqx.filter_jit
+@compiled_unless_on_host
 def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
-    system = lax.stop_gradient(system)
-    eps = jnp.finfo(system.A.dtype).eps
+    system = stop_gradient(system)
+    eps = xp.finfo(system.A.dtype).eps
     # Scaled, so that a distance is relative to each of the matrices.
     scale_A, scale_B = (
-        jnp.where(norm > 0, norm, 1)
-        for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
+        xp.where(norm > 0, norm, 1)
+        for norm in (xp.linalg.norm(system.A), xp.linalg.norm(system.B))
     )
     A, B = system.A / scale_A, system.B / scale_B
-    eigenvalues = jnp.linalg.eigvals(A)
     # A defective eigenvalue is only known to a root of the rounding.
     radius = eps ** (1 / 3)
 
     def distance(mode):
         """The smallest singular value, and the best `mode` for its vector."""
-        pencil = jnp.concatenate([A - mode * system.eye, B], axis=1)
-        left, values, _ = jnp.linalg.svd(pencil, full_matrices=False)
+        pencil = xp.concatenate([A - mode * system.eye, B], axis=1)
+        left, values, _ = xp.linalg.svd(pencil, full_matrices=False)
         vector = left[:, -1]
-        return values[-1], jnp.vdot(vector, A.astype(vector.dtype) @ vector)
+        return values[-1], xp.vdot(vector, A.astype(vector.dtype) @ vector)
 
     def nearby(eigenvalue):
         first, better = distance(eigenvalue)
@@ -298,19 +306,20 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
         for _ in range(_SEARCHES):
             # The improved mode stays within the error of the eigenvalue.
             step = better - eigenvalue
-            length = jnp.abs(step)
-            step = step * jnp.minimum(1, radius / jnp.where(length > 0, length, 1))
+            length = xp.abs(step)
+            step = step * xp.minimum(1, radius / xp.where(length > 0, length, 1))
             mode = eigenvalue + step
             least, better = distance(mode)
         reached = least <= tolerance
-        return jnp.where(reached, mode, eigenvalue), jnp.where(reached, least, first)
+        return xp.where(reached, mode, eigenvalue), xp.where(reached, least, first)
 
-    modes, distances = jax.vmap(nearby)(eigenvalues)
+    modes, distances = vmap(nearby)(eigenvalues(A))
     modes = modes * scale_A
     unstable = system.growth(modes) >= 0
     return ModalTest(modes, distances, unstable, tolerance)
 
 
+@host_unless_traced
 def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " zeros"]:
     """The invariant zeros: where `[[A - z I, B], [C, 0]]` loses rank.
 
@@ -349,7 +358,7 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
             "zeros: model must be concrete, got one that is being traced (by jax.jit, "
             "jax.vmap or jax.grad); how many zeros there are depends on its values."
         )
-    A, B, C, D = (np.asarray(M) for M in (system.A, system.B, system.C, system.D))
+    A, B, C, D = (np.asarray(M) for M in system[:4])
     # NumPy: the sizes of the reduced systems depend on ranks.
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
@@ -357,10 +366,10 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
     # Of the transposed system: D is then of full row rank, so in the end it is square.
     A, C, B, D = (M.T for M in _hidden_part(A.T, C.T, B.T, D.T, tolerance))
     if not len(A):
-        return jnp.zeros(0, complex)
+        return xp.zeros(0, complex)
     # Closed by the input that keeps the outputs zero, the remaining modes are zeros.
     left = A - B @ np.linalg.solve(D, C) if D.size else A
-    return jnp.linalg.eigvals(jnp.asarray(left))
+    return eigenvalues(left)
 
 
 def _hidden_part(A, B, C, D, tolerance):

@@ -2,16 +2,16 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
-import jax.lax as lax
-import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float, Inexact
+import jax
+import lineax as lx
+from jaxtyping import Complex, Float, Inexact
 
 from .._check import check_choice
 from .._check_models import check_time_invariant
-from .._typing import BoolScalar, Scalar, Square
+from .._jax import on_host, stop_gradient, xp
+from .._typing import Array, BoolScalar, Scalar, Square
 from ..dynamics import LinearDynamics
-from ..math import safe_norm
-from ..math._linear_solve import lu_solve
+from ..math._linear_solve import eigenvalues, factorised, lu_solve
 from ..systems import LinearSystem
 
 
@@ -33,7 +33,7 @@ class StateSpace(NamedTuple):
 
     @property
     def eye(self) -> Square:
-        return jnp.eye(self.A.shape[0], dtype=self.A.dtype)
+        return xp.eye(self.A.shape[0], dtype=self.A.dtype)
 
     @property
     def dual(self) -> "StateSpace":
@@ -42,31 +42,57 @@ class StateSpace(NamedTuple):
 
     def growth(self, poles: Complex[Array, "*poles"]) -> Float[Array, "*poles"]:
         """The real part of poles, or their modulus less 1: negative where stable."""
-        return jnp.abs(poles) - 1 if self.is_discrete else jnp.real(poles)
+        return xp.abs(poles) - 1 if self.is_discrete else xp.real(poles)
 
     def is_stable(self) -> BoolScalar:
         """Whether all poles are inside the boundary."""
-        poles = jnp.linalg.eigvals(lax.stop_gradient(self.A))
-        return jnp.all(self.growth(poles) < 0)
+        poles = eigenvalues(stop_gradient(self.A))
+        return xp.all(self.growth(poles) < 0)
 
     def stable_or_placeholder(self, stable: BoolScalar) -> "StateSpace":
         """This system, or a stable placeholder for an unstable one, so that results
         that are then discarded have finite derivatives."""
-        return self._replace(A=jnp.where(stable, self.A, -self.eye / 2))
+        return self._replace(A=xp.where(stable, self.A, -self.eye / 2))
 
-    def response(self, omega: Scalar) -> Complex[Array, "p m"]:
-        """The complex gain at one finite frequency: at the point `j omega`, or
-        `exp(j omega dt)`, of the boundary of stability."""
-        s = 1j * omega if self.dt is None else jnp.exp(1j * omega * self.dt)
-        resolvent = s * self.eye - self.A
-        return self.C @ lu_solve(resolvent, self.B.astype(resolvent.dtype)) + self.D
+    def response(
+        self, omega: Float[Array, "*frequencies"]
+    ) -> Complex[Array, "*frequencies p m"]:
+        """The complex gain at finite frequencies."""
+        return self.expansion(omega, 0)[0]
+
+    def expansion(
+        self, omega: Float[Array, "*frequencies"], order: int
+    ) -> list[Complex[Array, "*frequencies p m"]]:
+        """The complex gain and its derivatives in the frequency, to second order at
+        most."""
+        if omega.ndim and not on_host():
+            return jax.vmap(lambda omega: self.expansion(omega, order))(omega)
+        # The point of the boundary of stability, and its derivatives.
+        if self.dt is None:
+            s = (1j * omega)[..., None, None]
+            first, second = 1j, 0
+        else:
+            s = xp.exp(1j * omega * self.dt)[..., None, None]
+            first, second = 1j * self.dt * s, -(self.dt**2) * s
+        matrix = s * self.eye - self.A
+        resolvent = factorised(matrix, lx.LU())
+        # Each derivative in s is one of the resolvent: R' = -R^2, R'' = 2 R^3.
+        X = [resolvent(self.B.astype(matrix.dtype))]
+        for _ in range(order):
+            X.append(resolvent(X[-1]))
+        gains = [self.C @ X[0] + self.D]
+        if order > 0:
+            gains.append(-first * (self.C @ X[1]))
+        if order > 1:
+            gains.append(2 * first**2 * (self.C @ X[2]) - second * (self.C @ X[1]))
+        return gains
 
     def bilinear_transform(self) -> "StateSpace":
         """The bilinear transform `z = (1 + s) / (1 - s)` of a discrete-time system: a
         continuous-time one with the same gains."""
         A, B, C, D, _ = self
         n = A.shape[0]
-        both = lu_solve(self.eye + A, jnp.concatenate([A - self.eye, B], axis=1))
+        both = lu_solve(self.eye + A, xp.concatenate([A - self.eye, B], axis=1))
         D = D - C @ both[:, n:]
         C = 2**0.5 * lu_solve((self.eye + A).T, C.T).T
         return StateSpace(both[:, :n], 2**0.5 * both[:, n:], C, D, None)
@@ -89,41 +115,76 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
             f"{where}: inputs='disturbances' needs a model with E, the input matrix "
             "of disturbances, got a LinearSystem whose E is None."
         )
-    eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
+    eye = xp.eye(model.A.shape[0], dtype=model.A.dtype)
     B = model.B if inputs == "controls" else model.E
     B = eye if B is None else B
     C = eye if model.C is None else model.C
-    dtype = jnp.result_type(model.A, B, C)
+    dtype = xp.result_type(model.A, B, C)
     A, B, C = (M.astype(dtype) for M in (model.A, B, C))
-    D = jnp.zeros((C.shape[0], B.shape[1]), dtype)
-    return StateSpace(A, B, C, D, None if dt is None else jnp.asarray(dt, dtype))
+    D = xp.zeros((C.shape[0], B.shape[1]), dtype)
+    return StateSpace(A, B, C, D, None if dt is None else xp.asarray(dt, dtype))
 
 
-def frobenius_norm(M: Inexact[Array, "..."]) -> Scalar:
-    """The norm of all entries, complex or real, with gradient 0 at 0."""
-    # As one real array: the modulus of a complex zero has no derivative.
-    parts = jnp.stack([jnp.real(M), jnp.imag(M)]) if jnp.iscomplexobj(M) else M
-    return safe_norm(parts, axis=None)
+def norm(
+    M: Inexact[Array, "..."], axes: tuple[int, ...] = (-2, -1)
+) -> Float[Array, "..."]:
+    """The Frobenius norm, of complex entries too, with gradient 0 at 0."""
+    # By real parts: the modulus of a complex zero has no derivative.
+    square = xp.sum(xp.real(M) ** 2 + xp.imag(M) ** 2, axis=axes)
+    is_zero = square == 0
+    return xp.where(is_zero, 0.0, xp.sqrt(xp.where(is_zero, 1.0, square)))
 
 
-def largest_gain(G: Inexact[Array, "p m"]) -> Scalar:
+def largest_gain(G: Inexact[Array, "*stack p m"]) -> Float[Array, "*stack"]:
     """The largest singular value, with derivatives to second order.
 
     Those of `jnp.linalg.svd` divide by the gaps between all singular values, which are
     zero as soon as two channels are alike. Here the singular vector follows `G` to
-    first order, across the gaps that are open, and the gain is `|G v| / |v|`, which is
-    second-order accurate in the error of `v`.
+    first order, and the gain is `|G v|`, which is second-order accurate in its error.
     """
+    return norm(G) if 1 in G.shape[-2:] else norm(G @ _singular_vectors(G)[0])
+
+
+def expanded_gain(
+    G: Inexact[Array, "p m"], G1: Inexact[Array, "p m"], G2: Inexact[Array, "p m"]
+) -> tuple[Scalar, Scalar, Scalar]:
+    """The largest singular value of `G + G1 h + G2 h^2 / 2`, and its first and second
+    derivative in `h` at zero."""
+    inner = lambda a, b: xp.sum(xp.real(a.conj() * b))
     if 1 in G.shape:
-        return frobenius_norm(G)
-    frozen = lax.stop_gradient(G)
-    # First-order perturbation theory of the top singular vector.
-    squares, vectors = jnp.linalg.eigh(frozen.conj().T @ frozen)
-    gaps = squares[-1] - squares
+        G, G1, G2 = (M.reshape(-1, 1) for M in (G, G1, G2))
+        vector, mixed = xp.ones((1, 1), G.dtype), 0
+    else:
+        vector, vectors, weights = _singular_vectors(G)
+        # The perturbation of G'G, on the top vector and each other one.
+        coupling = _adjoint(G1 @ vectors) @ (G @ vector)
+        coupling = coupling + _adjoint(G @ vectors) @ (G1 @ vector)
+        mixed = inner(coupling, weights * coupling)
+    at, along, bent = G @ vector, G1 @ vector, G2 @ vector
+    gain = norm(at)
+    divisor = xp.where(gain > 0, gain, 1)
+    slope = inner(at, along) / divisor
+    curvature = inner(along, along) + inner(at, bent) + mixed - slope**2
+    return gain, slope, curvature / divisor
+
+
+def _singular_vectors(G):
+    """The right singular vector of the largest gain, which follows `G` to first order;
+    all of them; and their weights in a perturbation of it, the inverse gaps."""
+    frozen = stop_gradient(G)
+    product = _adjoint(frozen) @ frozen
+    # NumPy refuses numbers that are not finite.
+    product = xp.where(xp.isfinite(product), product, 0)
+    squares, vectors = xp.linalg.eigh(product)
+    gaps = (squares[..., -1:] - squares)[..., None]
     # Across a closed gap any combination of the two vectors is a singular vector.
-    open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]
-    weights = jnp.where(open_gaps, 1 / jnp.where(open_gaps, gaps, 1), 0)
-    top = vectors[:, -1]
-    change = vectors.conj().T @ (G.conj().T @ (G @ top))
+    is_open = gaps > xp.finfo(gaps.dtype).eps ** 0.5 * squares[..., -1:, None]
+    weights = xp.where(is_open, 1 / xp.where(is_open, gaps, 1), 0)
+    top = vectors[..., -1:]
+    change = _adjoint(vectors) @ (_adjoint(G) @ (G @ top))
     vector = top + vectors @ (weights * change)
-    return frobenius_norm(G @ vector) / frobenius_norm(vector)
+    return vector / norm(vector)[..., None, None], vectors, weights
+
+
+def _adjoint(M):
+    return M.conj().mT

@@ -251,12 +251,11 @@ class GRU(AbstractController):
         bounds: Any = None,
         key: PRNGKey,
     ):
-        cell_key, readout_key = jr.split(check_key(key, "GRU"))
+        check_key(key, "GRU")
         in_size = check_count(in_size, "in_size", "GRU")
         out_size = check_count(out_size, "out_size", "GRU")
         width = check_count(width, "width", "GRU")
-        self.cell = eqx.nn.GRUCell(in_size, width, key=cell_key)
-        self.readout = eqx.nn.Linear(width, out_size, key=readout_key)
+        self.cell, self.readout = _recurrent(in_size, out_size, width, key)
         self.features, self.bounds = features, bounds
 
     def __check_init__(self):
@@ -270,6 +269,16 @@ class GRU(AbstractController):
         z = features_of(self, y, int(self.cell.input_size))
         after = self.cell(z.astype(state.dtype), state)
         return squash(self.readout(after), self.bounds).astype(y.dtype), after
+
+
+@eqx.filter_jit
+def _recurrent(
+    in_size: int, out_size: int, width: int, key: PRNGKey
+) -> tuple[eqx.nn.GRUCell, eqx.nn.Linear]:
+    """A cell and a readout."""
+    cell_key, readout_key = jr.split(key)
+    cell = eqx.nn.GRUCell(in_size, width, key=cell_key)
+    return cell, eqx.nn.Linear(width, out_size, key=readout_key)
 
 
 class Standardise(eqx.Module):

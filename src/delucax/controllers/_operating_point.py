@@ -89,8 +89,7 @@ def operating_state(
     if difference is None:
         moved = _relative_drift(x_next, after, A, B, x, u_ref)
     else:
-        off = difference if x_ref.ndim == 1 else jax.vmap(difference)
-        drift = off(x_next, after)
+        drift = _drift(difference, x_next, after)
         moved = _relative_drift(drift, jnp.zeros_like(drift), A, B, x, u_ref)
     if not is_concrete(moved):
         # Negated, so that a NaN counts as motion.
@@ -102,6 +101,13 @@ def operating_state(
             f"residual is {float(moved):.1e}. {hint}got x_ref {x_ref}, x_next {x_next}."
         )
     return x_ref
+
+
+@eqx.filter_jit
+def _drift(difference: Difference, x_next: Array, after: Array) -> Array:
+    """The difference of one pair of states, or of those over time."""
+    off = difference if x_next.ndim == 1 else jax.vmap(difference)
+    return off(x_next, after)
 
 
 @host_unless_traced

@@ -1,10 +1,13 @@
 """The sampled-data regulator, and the discretisation of quadratic costs."""
 
-import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
-from .._typing import Difference, Numbers
+from .._jax import compiled_unless_on_host, host_unless_traced, xp
+from .._typing import Array, Difference, Numbers
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
@@ -58,20 +61,29 @@ def sampled_weights(
     A, B = system.A, system.B
     n, m = B.shape
     Q, R = symmetric_matrix(Q, "Q", where), symmetric_matrix(R, "R", where)
-    S = jnp.zeros((n, m)) if S is None else as_matrix(S, "S", where)
+    S = np.zeros((n, m), A.dtype) if S is None else as_matrix(S, "S", where)
     for name, M, shape in (("Q", Q, (n, n)), ("R", R, (m, m)), ("S", S, (n, m))):
         if M.shape != shape:
             raise ValueError(
                 f"{where}: {name} must have shape {shape} to fit the system, got "
                 f"{M.shape}."
             )
-    size = n + m
+    return _weights_over(A, B, Q, R, S, dt)
+
+
+@host_unless_traced
+@compiled_unless_on_host
+def _weights_over(
+    A: Array, B: Array, Q: Array, R: Array, S: Any, dt: ArrayLike
+) -> tuple[Array, Array, Array]:
+    n, m = B.shape
     # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
     # of one exponential (Van Loan).
-    field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
-    charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
+    zero = xp.zeros((m, n + m), A.dtype)
+    field = xp.concatenate([xp.concatenate([A, B], axis=1), zero])
+    charge = xp.block([[Q, S], [S.T, R]]).astype(A.dtype)
     # integral of expm(F' s) charge expm(F s) over [0, dt], by blocks: Qd, Sd and Rd.
-    total = gramian_over(field.T, charge, jnp.asarray(dt, A.dtype))
+    total = gramian_over(field.T, charge, xp.asarray(dt, A.dtype))
     return total[:n, :n], total[n:, n:], total[:n, n:]
 
 

@@ -187,7 +187,10 @@ class _Window(AbstractDisturbance):
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         w = self.disturbance.sequence(key, times)
-        dt = step_between(times, "between")
+        return self._cut(w, times, step_between(times, "between"))
+
+    @eqx.filter_jit
+    def _cut(self, w: Rows, times: Vector, dt: Any) -> Rows:
         inside = reached(times, self.start, dt) & ~reached(times, self.stop, dt)
         w = jnp.where(inside[:, None], w, jnp.zeros((), w.dtype))
         # A step of NaN says that the times are too coarse: the result is then NaN too,

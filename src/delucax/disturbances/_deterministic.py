@@ -126,6 +126,7 @@ class Sinusoid(AbstractEntrywise):
     offset: Real = parameter(0.0)
     size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
+    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
         return self._rows(self.amplitude * sin(angle) + self.offset, times)
@@ -168,7 +169,10 @@ class Square(AbstractEntrywise):
         check_range(self.duty, "duty", "Square", 0, 1)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
-        dt = step_between(times, "Square")
+        return self._wave(times, step_between(times, "Square"))
+
+    @eqx.filter_jit
+    def _wave(self, times: Vector, dt: Any) -> Rows:
         # In steps where the grid begins at 0; late times give their step less exactly.
         unit = self.period if dt is None else jnp.where(times[0] == 0, dt, self.period)
         eps = coarsest(times, self.period, self.duty)

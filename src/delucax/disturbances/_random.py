@@ -48,6 +48,7 @@ class Gaussian(AbstractEntrywise):
     def __check_init__(self):
         check_range(self.std, "std", "Gaussian")
 
+    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         w = normal(check_key(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
         return (self.std * w + self.mean).astype(times.dtype)
@@ -83,6 +84,7 @@ class Uniform(AbstractEntrywise):
     def __check_init__(self):
         check_range(self.high, "high", "Uniform", self.low)
 
+    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         w = jr.uniform(
             check_key(key, "Uniform"), (times.shape[0], self.size), times.dtype
@@ -123,6 +125,7 @@ class RandomWalk(AbstractEntrywise):
         check_range(self.std, "std", "RandomWalk")
         check_range(self.bound, "bound", "RandomWalk")
 
+    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         shape = (times.shape[0], self.size)
         e = normal(check_key(key, "RandomWalk"), shape, times.dtype)
@@ -184,6 +187,10 @@ class Brownian(AbstractDisturbance):
                 "define it."
             )
         dt = step_between(times, "Brownian") if self.dt is None else self.dt
-        e = normal(check_key(key, "Brownian"), (times.shape[0], self.size), times.dtype)
+        return self._increments(check_key(key, "Brownian"), times, dt)
+
+    @eqx.filter_jit
+    def _increments(self, key: PRNGKey, times: Vector, dt: Any) -> Rows:
+        e = normal(key, (times.shape[0], self.size), times.dtype)
         # Increments of each substep: their variance is its length.
         return (jnp.sqrt(dt / self.substeps) * e).astype(times.dtype)

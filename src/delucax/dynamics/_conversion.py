@@ -1,19 +1,17 @@
 """Conversion of linear systems to their sampled form and back: c2d and d2c."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
-import jax
-import jax.lax as lax
-import jax.numpy as jnp
-import jax.scipy.linalg as jsl
-import lineax as lx
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from .._check import check_choice, check_instance, check_step, is_concrete
 from .._check_models import check_time_invariant
-from .._typing import Matrix, Scalar, Vector
+from .._jax import compiled_unless_on_host, host_unless_traced, stop_gradient, xp
+from .._results import raise_if
+from .._typing import Array, BoolScalar, Matrix, Scalar, Vector
+from ..math._exponential import exponential
 from ..math._linear_solve import full_precision, solve
 from ..systems import LinearSystem
 from ._linear import LinearDynamics
@@ -41,7 +39,8 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
     disturbance that enters the vector field is held too.
 
     **Raises:** `ValueError` if `system` is not a `LinearSystem`, `dt` is not positive,
-    or `method` is unknown.
+    or `method` is unknown; for `"tustin"` `RuntimeError` (an error at run time under
+    `jax.jit`) if `2/dt` is an eigenvalue of `A`.
 
     Source: Van Loan, 1978 (`"zoh"`); Tustin, 1947.
 
@@ -57,8 +56,8 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
     check_instance(system, LinearSystem, "system", "c2d")
     check_step(dt, "c2d")
     check_choice(method, _METHODS, "method", "c2d")
-    step = jnp.asarray(dt, system.A.dtype)
-    A, B, E, x_next = _sampled(system, step, method)
+    (A, B, E, x_next), failed = _sampled(system, dt, method)
+    A = raise_if(failed, A, "c2d: A has the eigenvalue 2/dt, where there is no rule.")
     about = _operating_point(system)
     return LinearDynamics(A, B, system.C, E, dt, x_next=x_next, **about)
 
@@ -102,10 +101,8 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     check_instance(dynamics, LinearDynamics, "dynamics", "d2c", hint)
     check_time_invariant(dynamics, "dynamics", "d2c")
     check_choice(method, _METHODS, "method", "d2c")
-    convert, distance, rule = _INVERSES[method]
-    inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
-    # Control, constant and disturbance are converted alike, as columns of one matrix.
-    A, inputs, failed = convert(dynamics.A, inputs, dynamics.dt)
+    (A, B, E, drift), failed = _held(dynamics, method)
+    _, distance, rule = _INVERSES[method]
     # Of numbers that are known the eigenvalue at fault can be named.
     if not is_concrete(failed):
         A = eqx.error_if(A, failed, f"d2c: {rule}.")
@@ -114,7 +111,6 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
         worst = values[np.argmin(distance(values))]
         shown = worst.real if worst.imag == 0 else worst
         raise RuntimeError(f"d2c: {rule}; got {shown:.6g}.")
-    B, drift, E = _parts(inputs, dynamics)
     about = _operating_point(dynamics)
     return LinearSystem(A, B, dynamics.C, E, dx_ref=drift, **about)
 
@@ -122,7 +118,7 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
 def _inputs(model: LinearSystem | LinearDynamics, drift: Vector) -> Matrix:
     """The input matrices side by side: of the control, a constant, the disturbance."""
     columns = [model.B, drift[:, None], *([] if model.E is None else [model.E])]
-    return jnp.concatenate(columns, axis=1)
+    return xp.concatenate(columns, axis=1)
 
 
 def _parts(
@@ -139,54 +135,67 @@ def _operating_point(model: LinearSystem | LinearDynamics) -> dict[str, Any]:
     return {name: getattr(model, name) for name in names}
 
 
-@eqx.filter_jit
+_Matrices: TypeAlias = tuple[Matrix, Matrix, Matrix | None, Vector]
+
+
+@host_unless_traced
+@compiled_unless_on_host
 def _sampled(
-    system: LinearSystem, dt: Scalar, method: str
-) -> tuple[Matrix, Matrix, Matrix | None, Vector]:
-    """The matrices of `c2d`, and the state after the one at the operating point."""
+    system: LinearSystem, dt: Any, method: str
+) -> tuple[_Matrices, BoolScalar]:
+    """The matrices of `c2d`, the state after the one at the operating point, and
+    whether there is none."""
     n, inputs = system.state_size, _inputs(system, system.dx_ref)
+    dt = xp.asarray(dt, inputs.dtype)
     if method == "zoh":
         # exp([[A, B], [0, 0]] dt) holds exp(A dt) and the integral times B, however
         # singular A is.
-        k = inputs.shape[1]
-        block = jnp.zeros((n + k, n + k), inputs.dtype)
-        block = block.at[:n, :n].set(system.A).at[:n, n:].set(inputs)
-        sampled = jsl.expm(block * dt)[:n]
+        zero = xp.zeros((inputs.shape[1], n + inputs.shape[1]), inputs.dtype)
+        block = xp.concatenate([xp.concatenate([system.A, inputs], axis=1), zero])
+        sampled = exponential(block * dt)[:n]
+        failed = xp.asarray(False)
     else:
         # x_next - x = dt (A (x + x_next) / 2 + B u).
         half = system.A * (dt / 2)
-        eye = jnp.eye(n, dtype=half.dtype)
-        right = jnp.concatenate([eye + half, inputs * dt], axis=1)
-        # It raises where 2/dt is an eigenvalue of A.
-        operator = lx.MatrixLinearOperator(eye - half)
-        column = lambda b: lx.linear_solve(operator, b, lx.LU()).value
-        sampled = jax.vmap(column, in_axes=1, out_axes=1)(right)
+        eye = xp.eye(n, dtype=half.dtype)
+        right = xp.concatenate([eye + half, inputs * dt], axis=1)
+        sampled = solve(eye - half, right)
+        failed = ~xp.all(xp.isfinite(sampled))
     B, drift, E = _parts(sampled[:, n:], system)
-    return sampled[:, :n], B, E, system.x_ref + drift
+    return (sampled[:, :n], B, E, system.x_ref + drift), failed
 
 
-@eqx.filter_jit
+@host_unless_traced
+@compiled_unless_on_host
 @full_precision
+def _held(dynamics: LinearDynamics, method: str) -> tuple[_Matrices, BoolScalar]:
+    """The matrices of `d2c`, the rate of change at the operating point, and whether
+    there are none."""
+    # Control, constant and disturbance are converted alike, as columns of one matrix.
+    inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
+    A, inputs, failed = _INVERSES[method][0](dynamics.A, inputs, dynamics.dt)
+    B, drift, E = _parts(inputs, dynamics)
+    return (A, B, E, drift), failed
+
+
 def _from_hold(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
     n = A.shape[0]
     log, failed = logarithm(A)
     # The integral of the exponential is one block of an exponential.
-    eye, zero = jnp.eye(n, dtype=A.dtype), jnp.zeros_like(A)
-    block = jnp.block([[log, eye], [zero, zero]])
+    eye, zero = xp.eye(n, dtype=A.dtype), xp.zeros_like(A)
+    block = xp.block([[log, eye], [zero, zero]])
     held = exponential_less_one(block)[:n, n:]
     return log / dt, solve(held, inputs) / dt, failed
 
 
-@eqx.filter_jit
-@full_precision
 def _from_trapezium(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
     n = A.shape[0]
-    eye = jnp.eye(n, dtype=A.dtype)
+    eye = xp.eye(n, dtype=A.dtype)
     # The least singular value, because rounding hides how near -1 an eigenvalue is.
-    sizes = jnp.linalg.svd(lax.stop_gradient(A + eye), compute_uv=False)
-    failed = ~(sizes[-1] > n * jnp.finfo(A.dtype).eps * sizes[0])
-    matrix = jnp.where(failed, eye, A + eye)
-    solved = solve(matrix, jnp.concatenate([A - eye, inputs], axis=1)) * (2 / dt)
+    sizes = xp.linalg.svd(stop_gradient(A + eye), compute_uv=False)
+    failed = ~(sizes[-1] > n * xp.finfo(A.dtype).eps * sizes[0])
+    matrix = xp.where(failed, eye, A + eye)
+    solved = solve(matrix, xp.concatenate([A - eye, inputs], axis=1)) * (2 / dt)
     return solved[:, :n], solved[:, n:], failed
 
 

@@ -132,9 +132,9 @@ def _first_order(model: Any, t: Array, x: State, u: Control) -> Any:
 
     # Where a system names no disturbances its field has no w, and so there is no E.
     if is_system and not model.disturbance_names:
-        return C, *value_and_jacobians(f, x, u)
+        return C, *value_and_jacobians(f, x, u, in_loop=True)
     w = jnp.zeros(model.disturbance_size, x.dtype)
-    return C, *value_and_jacobians(f, x, u, w)
+    return C, *value_and_jacobians(f, x, u, w, in_loop=True)
 
 
 def at_point(

@@ -1,11 +1,19 @@
 """The matrix logarithm, and the exponential of which it is the inverse."""
 
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from .._jax import (
+    custom_jvp,
+    fori_loop,
+    lax,
+    scan,
+    stop_gradient,
+    while_loop,
+    xp,
+)
+from .._typing import Array
 from ..math._linear_solve import full_precision, solve
 
 
@@ -28,20 +36,20 @@ def logarithm(
     """
     # The iterations have no reverse mode, and are not differentiated: they are run on a
     # constant, and the derivative is put beside their value.
-    constant = lax.stop_gradient(A)
-    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    constant = stop_gradient(A)
+    eye = xp.eye(A.shape[0], dtype=A.dtype)
     value, converged = _by_roots(constant)
-    error = jnp.linalg.norm(exponential_less_one(value) + eye - constant)
+    error = xp.linalg.norm(exponential_less_one(value) + eye - constant)
     # The proof of the result: its exponential is A.
-    close = error <= jnp.finfo(A.dtype).eps ** 0.5 * jnp.linalg.norm(constant)
+    close = error <= xp.finfo(A.dtype).eps ** 0.5 * xp.linalg.norm(constant)
     failed = ~(converged & close)
     # The identity in the place of what failed, so that its derivatives are finite.
-    constant = jnp.where(failed, eye, constant)
-    value = jnp.where(failed, 0, value)
-    return _with_derivative(jnp.where(failed, eye, A), constant, value), failed
+    constant = xp.where(failed, eye, constant)
+    value = xp.where(failed, 0, value)
+    return _with_derivative(xp.where(failed, eye, A), constant, value), failed
 
 
-@jax.custom_jvp
+@custom_jvp
 def _with_derivative(A, constant, value):
     """`value`, the logarithm of `A`, with its derivative."""
     del A, constant
@@ -60,9 +68,9 @@ def _with_derivative_jvp(primals, tangents):
         # D is linear in E, which is scaled so that the matrix stays as near to the
         # identity as M is.
         n = M.shape[0]
-        size = jnp.linalg.norm(right)
-        size = jnp.where(size > 0, size, 1)
-        block = jnp.block([[M, right / size], [jnp.zeros_like(M), M]])
+        size = xp.linalg.norm(right)
+        size = xp.where(size > 0, size, 1)
+        block = xp.block([[M, right / size], [xp.zeros_like(M), M]])
         return _by_roots(block)[0][:n, n:] * size
 
     # The derivative of a function of a matrix at M has the derivative at M' for its
@@ -80,21 +88,21 @@ def exponential_less_one(L: Array) -> Array:
     """`exp(L) - I`, by a fixed number of squarings, whose derivatives stay small
     programs. `P` becomes `(I + P)^2 - I`: nothing is lost beside the identity."""
     X = L / 2**_SQUARINGS
-    eye = jnp.eye(L.shape[0], dtype=L.dtype)
+    eye = xp.eye(L.shape[0], dtype=L.dtype)
     # Horner's rule: X + X^2/2! + ... = X (I + X/2 (I + X/3 (I + ...))).
     P = X / _TERMS
     for k in range(_TERMS - 1, 0, -1):
         P = X @ (eye + P) / k
-    return lax.fori_loop(0, _SQUARINGS, lambda _, P: 2 * P + P @ P, P)
+    return fori_loop(0, _SQUARINGS, lambda _, P: 2 * P + P @ P, P)
 
 
 def _by_roots(A: Array) -> tuple[Array, Array]:
     """The logarithm of a root near the identity, times the order of the root."""
-    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    eye = xp.eye(A.shape[0], dtype=A.dtype)
 
     def proceeds(carry):
         root, k, converged = carry
-        far = jnp.linalg.norm(root - eye) > _CLOSE
+        far = xp.linalg.norm(root - eye) > _CLOSE
         return far & converged & (k < _MAX_ROOTS)
 
     def body(carry):
@@ -102,12 +110,12 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
         root, converged = _square_root(root)
         return root, k + 1, converged
 
-    start = (A, jnp.asarray(0), jnp.asarray(True))
-    root, k, converged = lax.while_loop(proceeds, body, start)
+    start = (A, xp.asarray(0), xp.asarray(True))
+    root, k, converged = while_loop(proceeds, body, start)
     # log A = 2^k log A^(1/2^k): inverse scaling and squaring.
     X = root - eye
-    converged = converged & (jnp.linalg.norm(X) <= _CLOSE)
-    X = jnp.where(converged, X, 0)
+    converged = converged & (xp.linalg.norm(X) <= _CLOSE)
+    X = xp.where(converged, X, 0)
 
     # Gauss-Legendre for the integral over [0, 1] of X (I + x X)^-1.
     def add(total, rule):
@@ -116,8 +124,8 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
         return total + weight / 2 * solve(eye + (1 + node) / 2 * X, X), None
 
     nodes, weights = np.polynomial.legendre.leggauss(8)
-    rules = jnp.asarray(nodes, A.dtype), jnp.asarray(weights, A.dtype)
-    total, _ = lax.scan(add, jnp.zeros_like(A), rules)
+    rules = xp.asarray(nodes, A.dtype), xp.asarray(weights, A.dtype)
+    total, _ = scan(add, xp.zeros_like(A), rules)
     return total * 2.0**k, converged
 
 
@@ -127,27 +135,27 @@ def _square_root(A: Array) -> tuple[Array, Array]:
     `M` converges to the identity and `Y` to the root, and neither does if an eigenvalue
     is on the closed negative real axis.
     """
-    n, eps = A.shape[0], jnp.finfo(A.dtype).eps
+    n, eps = A.shape[0], xp.finfo(A.dtype).eps
     # Y_{k+1} = Y_k (I + M_k^-1) / 2, M_{k+1} = (I + (M_k + M_k^-1) / 2) / 2, which is
     # Newton's method for Y^2 = A, in a form that stays stable under rounding.
-    eye = jnp.eye(n, dtype=A.dtype)
+    eye = xp.eye(n, dtype=A.dtype)
     small = 10 * n * eps
 
     def proceeds(carry):
         _, _, error, before, k = carry
         # It converges quadratically: once close, what no longer shrinks is rounding.
         going = (error > small) & ((error < before / 2) | (before > 0.1))
-        return going & jnp.isfinite(error) & (k < _MAX_ROOT_STEPS)
+        return going & xp.isfinite(error) & (k < _MAX_ROOT_STEPS)
 
     def body(carry):
         M, Y, error, _, k = carry
         inverse = solve(M, eye)
         Y = (Y + Y @ inverse) / 2
         M = eye / 2 + (M + inverse) / 4
-        return M, Y, jnp.linalg.norm(M - eye), error, k + 1
+        return M, Y, xp.linalg.norm(M - eye), error, k + 1
 
-    far = jnp.asarray(jnp.inf, A.dtype)
-    start = (A, A, jnp.asarray(jnp.finfo(A.dtype).max, A.dtype), far, jnp.asarray(0))
-    _, root, error, *_ = lax.while_loop(proceeds, body, start)
+    far = xp.asarray(xp.inf, A.dtype)
+    start = (A, A, xp.asarray(xp.finfo(A.dtype).max, A.dtype), far, xp.asarray(0))
+    _, root, error, *_ = while_loop(proceeds, body, start)
     # Written so that NaN counts as no root.
     return root, error < eps**0.5 * n

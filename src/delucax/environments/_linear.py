@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 
@@ -224,11 +225,23 @@ def _random(
     m = check_count(controls, "controls", "lds")
     check_number(radius, "spectral_radius", "lds")
     check_range(radius, "spectral_radius", "lds")
-    a, b, c = jr.split(key, 3)
-    A = jr.normal(a, (n, n))
+    shapes = ((n, n), (n, m))
+    if observations is not None:
+        shapes += ((check_count(observations, "observations", "lds"), n),)
+    A, B, *C = _normal(key, shapes)
+    return _scaled(A, radius), B, C[0] if C else None
+
+
+@eqx.filter_jit
+def _normal(key: PRNGKey, shapes: tuple[tuple[int, int], ...]) -> list[Matrix]:
+    """Standard normal entries, each matrix drawn with a key of its own."""
+    keys = jr.split(key, 3)
+    return [jr.normal(key, shape) for key, shape in zip(keys, shapes, strict=False)]
+
+
+@host_unless_traced
+def _scaled(A: Matrix, radius: Any) -> Matrix:
+    """`A` of this spectral radius."""
     # The eigenvalues scale with the matrix.
-    A = A * (radius / jnp.max(jnp.abs(jnp.linalg.eigvals(A))))
-    B = jr.normal(b, (n, m))
-    if observations is None:
-        return A, B, None
-    return A, B, jr.normal(c, (check_count(observations, "observations", "lds"), n))
+    factor = radius / xp.max(xp.abs(xp.linalg.eigvals(A)))
+    return A * xp.asarray(factor, A.dtype)

@@ -1,5 +1,8 @@
 """Ventilators: lungs, breath waveforms, learned lung models and controllers."""
 
+from typing import TYPE_CHECKING
+
+from .._lazy import lazily as _lazily
 from .._module import stack as stack, unstack as unstack
 from ._breath_controllers import (
     BangBang as BangBang,
@@ -7,7 +10,7 @@ from ._breath_controllers import (
     BreathPolicy as BreathPolicy,
 )
 from ._breath_file import read_breaths as read_breaths, write_breaths as write_breaths
-from ._breaths import Breaths as Breaths, explore as explore, Explorer as Explorer
+from ._breaths import Breaths as Breaths
 from ._learned_lung import LearnedLung as LearnedLung
 from ._lung_models import (
     GreyBoxLung as GreyBoxLung,
@@ -21,12 +24,6 @@ from ._lung_tasks import (
     learned_lung as learned_lung,
     single_compartment as single_compartment,
 )
-from ._lung_training import (
-    breath_error as breath_error,
-    fit_lungs as fit_lungs,
-    pid_grid as pid_grid,
-    train_controllers as train_controllers,
-)
 from ._lungs import (
     AbstractLung as AbstractLung,
     BalloonLung as BalloonLung,
@@ -39,7 +36,6 @@ from ._runner import (
     Runner as Runner,
     SimulatedRunner as SimulatedRunner,
 )
-from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
 from ._ventilation import (
     BreathCost as BreathCost,
     PressureSensor as PressureSensor,
@@ -47,3 +43,25 @@ from ._ventilation import (
     ventilation as ventilation,
 )
 from ._waveform import BreathWaveform as BreathWaveform
+
+
+if TYPE_CHECKING:
+    from ._explorer import explore as explore, Explorer as Explorer
+    from ._lung_training import (
+        breath_error as breath_error,
+        fit_lungs as fit_lungs,
+        pid_grid as pid_grid,
+        train_controllers as train_controllers,
+    )
+    from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
+else:
+    # Controllers, Optax and the training loop are imported as they are used.
+    __getattr__, __dir__ = _lazily(
+        __name__,
+        {
+            "_explorer": "explore Explorer",
+            "_lung_training": "breath_error fit_lungs pid_grid train_controllers",
+            "_shooting": "least_error ShootingMPC",
+        },
+    )
+del TYPE_CHECKING

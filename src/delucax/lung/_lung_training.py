@@ -1,5 +1,6 @@
 """Lungs fitted to breaths, and controllers to lungs."""
 
+import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -25,7 +26,8 @@ from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
 from ._breath_controllers import Breathing
-from ._breaths import Breaths, GAINS
+from ._breaths import Breaths
+from ._explorer import GAINS
 from ._learned_lung import LearnedLung
 from ._ventilation import waveform_of
 from ._waveform import as_pips, BreathWaveform, LENGTH, PIPS
@@ -108,9 +110,9 @@ def fit_lungs(
 
         u = jnp.linspace(0.0, 50.0, 40).reshape(10, 4)
         breaths = lung.Breaths(u, 0 * u, 5 + u / 2, dt=0.03)
-        model = lung.LearnedLung(breaths, width=2, boundary=1, key=jax.random.key(1))
-        few = dict(teacher_steps=0, steps=5, batch_size=None)
-        fitted = lung.fit_lungs(model, breaths, key=jax.random.key(2), **few)
+        model = lung.LungModel(lung.SingleCompartment())
+        options = dict(trainable="dynamics.dynamics.system.resistance", steps=5)
+        fitted = lung.fit_lungs(model, breaths, key=jax.random.key(2), **options)
         ```
     """
     where = "fit_lungs"
@@ -268,6 +270,12 @@ class _FiniteGradients(eqx.Module):
         return (cost, {"diverged": diverged}), jax.tree.map(kept, slope)
 
 
+@functools.lru_cache
+def _falling_adam(learning_rate: float, steps: int) -> optax.GradientTransformation:
+    """The same object each time, so that a training like the last compiles nothing."""
+    return optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
+
+
 def train_controllers(
     envs: Environment,
     controllers: Any,
@@ -321,6 +329,7 @@ def train_controllers(
     !!! example
 
         ```python
+        import delucax as dlx
         import equinox as eqx
         import jax
         import jax.numpy as jnp
@@ -328,11 +337,11 @@ def train_controllers(
 
         task = lambda R: lung.single_compartment(resistance=R)
         envs = eqx.filter_vmap(task)(jnp.array([5.0, 20.0]))
-        keys = jax.random.split(jax.random.key(0), (1, 2))  # one seed, two lungs
-        policy = lambda key: lung.BreathPolicy(lung.BreathWaveform(), 0.03, key=key)
-        policies = eqx.filter_vmap(eqx.filter_vmap(policy))(keys)
+        target = dict(dt=0.03, reference=lung.BreathWaveform())
+        pid = lambda kp: dlx.controllers.LeakyPID(kp, 3.0, **target)
+        pids = eqx.filter_vmap(eqx.filter_vmap(pid))(jnp.array([[0.5, 1.0]]))
         few = dict(steps=3, horizon=2, pips=[20.0], key=jax.random.key(1))
-        lung.train_controllers(envs, policies, **few).history.loss
+        lung.train_controllers(envs, pids, **few).model.kp  # one seed, two lungs
         ```
     """
     where = "train_controllers"
@@ -352,7 +361,7 @@ def train_controllers(
         check_bool(shared, "shared", where),
         check_bool(throw, "throw", where),
     )
-    adam = optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
+    adam = _falling_adam(float(learning_rate), steps)
     gradient: Any = analytic if throw else _FiniteGradients(1 if shared else 2)
     options: Any = dict(trainable=trainable, progress=progress, checkpoint=checkpoint)
     options |= dict(checkpoint_every=None if checkpoint is None else 100, throw=throw)

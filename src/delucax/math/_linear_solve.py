@@ -8,7 +8,7 @@ import jax
 import jax.lax as lax
 import lineax as lx
 import numpy as np
-from jaxtyping import Float, Inexact
+from jaxtyping import Complex, Float, Inexact
 
 from .._jax import on_host, xp
 from .._typing import Array, BoolScalar, Square
@@ -44,13 +44,14 @@ def solve(matrix: Square, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
 
 
 def factorised(
-    matrix: Inexact[Array, "m n"],
+    matrix: Inexact[Array, "*stack m n"],
     solver: lx.AbstractLinearSolver | None = None,
     tags: Any = (),
 ) -> Callable[[Inexact[Array, "m k"]], Inexact[Array, "n k"]]:
     """`right -> matrix^-1 right`, for more than one right side in turn.
 
-    A `solver` that is given may need `tags` of the matrix.
+    A `solver` that is given may need `tags` of the matrix. NumPy solves a stack of
+    equations, too.
     """
     if on_host():
         return functools.partial(_by_lapack, matrix, isinstance(solver, lx.QR))
@@ -69,7 +70,7 @@ def factorised(
     return jax.vmap(column, in_axes=1, out_axes=1)
 
 
-def _by_lapack(matrix, least_squares, right):
+def _by_lapack(matrix: Any, least_squares: bool, right: Any) -> Any:
     """The solution on the host, NaN where there is none."""
     if least_squares:
         basis, matrix = np.linalg.qr(matrix)
@@ -77,7 +78,12 @@ def _by_lapack(matrix, least_squares, right):
     try:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
-        return np.full_like(right, np.nan)
+        if matrix.ndim == 2:
+            return np.full_like(right, np.nan)
+        # One of a stack is singular.
+        rights = np.broadcast_to(right, (len(matrix), *right.shape[-2:]))
+        pairs = zip(matrix, rights, strict=True)
+        return np.stack([_by_lapack(M, False, b) for M, b in pairs])
 
 
 def cholesky(matrix: Any) -> Any:
@@ -182,3 +188,16 @@ def lu_solve(
 ) -> Inexact[Array, "n k"]:
     """`solve` by LAPACK at every size, of complex matrices too."""
     return factorised(matrix, lx.LU())(right)
+
+
+def eigenvalues(matrix: Square) -> Complex[Array, " n"]:
+    """Of a matrix that is not finite NaN."""
+    if not on_host():
+        return xp.linalg.eigvals(matrix)
+    values: Any
+    try:
+        values = np.linalg.eigvals(matrix)
+    except np.linalg.LinAlgError:
+        values = np.full(len(matrix), np.nan)
+    # NumPy returns real numbers if all are.
+    return values.astype(np.result_type(matrix, np.complex64))

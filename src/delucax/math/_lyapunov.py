@@ -1,11 +1,11 @@
 """Lyapunov, Stein and Sylvester equations of stable matrices, and Gramians over a
 finite time, by doubling."""
 
-import jax.scipy.linalg as jsl
 from jaxtyping import Float
 
 from .._jax import lax, matmul, scan, stop_gradient, while_loop, xp
 from .._typing import Array, Scalar, Square
+from ._exponential import exponential
 from ._linear_solve import full_precision, solve, symmetric
 from ._norms import largest, relative_size
 
@@ -164,9 +164,9 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     short = time * 0.5**doublings
     block = xp.block([[-A, Q], [xp.zeros_like(A), A.T]]) * short
     # exp([[-A, Q], [0, A']] t) = [[exp(-A t), exp(-A t) W], [0, exp(A' t)]].
-    exponential = jsl.expm(block)
-    power = exponential[n:, n:].T
-    W = power @ exponential[:n, n:]
+    blocks = exponential(block)
+    power = blocks[n:, n:].T
+    W = power @ blocks[:n, n:]
 
     # W(2t) = W(t) + exp(A t) W(t) exp(A' t); of fixed length, which reverse mode needs.
     def double(carry, k):

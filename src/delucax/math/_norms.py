@@ -93,6 +93,18 @@ def largest(matrix: Array) -> Array:
     return _reduced(join, xp.abs(matrix), matrix.ndim)
 
 
+def largest_of_each(*matrices: Array) -> tuple[Array, ...]:
+    """The sizes of the largest entries of matrices of one shape."""
+    if on_host() or not _is_large(matrices[0]):
+        return tuple(map(largest, matrices))
+    # One loop over all, in which nothing is stored.
+    join = lambda a, b: tuple(map(lax.max, a, b))
+    zero = xp.zeros((), matrices[0].dtype)
+    return lax.reduce(
+        tuple(map(xp.abs, matrices)), (zero,) * len(matrices), join, (0, 1)
+    )
+
+
 def relative_size(error: Array, *terms: Array) -> Array:
     """The norm of an equation's residual over the sum of the norms of its terms."""
     return relative_and_total_size(error, xp.stack(terms))[0]

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import is_concrete
+from .._host import host_unless_traced, xp
+from .._typing import Vector
 
 
 _T = TypeVar("_T")
@@ -85,7 +87,8 @@ def coarsest(*arrays: Array) -> float:
     return max(float(jnp.finfo(a.dtype).eps) for a in arrays)
 
 
-def step_between(times: Array, where: str) -> Any:
+@host_unless_traced
+def step_between(times: Vector, where: str) -> Any:
     """The step of a grid of times; `None` for a single time.
 
     It is the first one, or the average one where the grid does not start at 0, because
@@ -97,8 +100,8 @@ def step_between(times: Array, where: str) -> Any:
         return None
     # The rounding of late times is spread over all steps by the average.
     average = (times[-1] - times[0]) / (times.shape[0] - 1)
-    dt = jnp.where(times[0] == 0, times[1], average)
-    last = jnp.maximum(jnp.abs(times[0]), jnp.abs(times[-1]))
+    dt = xp.where(times[0] == 0, times[1], average)
+    last = xp.maximum(xp.abs(times[0]), xp.abs(times[-1]))
     apart = last <= most_steps(times.dtype) * dt
     if is_concrete(apart) and not np.all(apart):
         raise ValueError(
@@ -106,7 +109,7 @@ def step_between(times: Array, where: str) -> Any:
             f"{dt:.3g} at {last:.6g}; use double precision (JAX_ENABLE_X64=1) or times "
             "from 0."
         )
-    return jnp.where(apart, dt, jnp.nan)
+    return xp.where(apart, dt, xp.nan)
 
 
 def reached(times: Array, mark: Array, dt: Any) -> Array:

@@ -263,6 +263,7 @@ class Problem(eqx.Module):
             total = jnp.sum(jax.vmap(self.stage_cost)(*each)) + final
         return total.astype(states.dtype)
 
+    @eqx.filter_jit
     def roll_out(
         self, controls: Array, states: Array | None = None, gains: Array | None = None
     ) -> tuple[Array, Array, Array]:

@@ -1,15 +1,14 @@
 """Riccati equations by doubling, and by the sign of the Hamiltonian matrix."""
 
-import jax
 import lineax as lx
 
-from .._jax import matmul, while_loop, xp
+from .._jax import if_true, matmul, while_loop, xp
 from .._typing import Array, Scalar, Square
-from ..math._linear_solve import factorised, solve, symmetric
+from ..math._linear_solve import factorised, SMALL, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
-from ..math._norms import largest, one_if_zero, size
+from ..math._norms import largest, largest_of_each, one_if_zero, size
 from ._arguments import RiccatiData
-from ._recursion import composed, Element, without_cross_weight
+from ._recursion import Element, without_cross_weight
 from ._search import SECOND, UNIT
 
 
@@ -94,28 +93,39 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
 
     `X0` is what `J` is a correction to, for its size alone.
     """
-    eps = xp.finfo(X0.dtype).eps
+    eps, n = xp.finfo(X0.dtype).eps, len(X0)
+    eye = xp.eye(n, dtype=X0.dtype)
 
     def more(carry):
         _, relative, k = carry
         return (k < MAX_DOUBLINGS) & (relative > eps)
 
     def body(carry):
-        before, _, k = carry
-        after = composed(before, before)
-        # NaN and infinity, times zero, are NaN, which is kept.
-        finite = largest(0 * sum(after[1:], after[0])) == 0
-        # An overflow ends the iteration at the last finite step, whose closed loop is
-        # not stable, which the caller checks.
-        A, _, J = after = jax.tree.map(
-            lambda new, old: xp.where(finite, new, old), after, before
-        )
+        (A, C, J), _, k = carry
+        # As of `composed`. Small matrices are eliminated once, for both right sides; of
+        # large ones products with the inverse take less time than solves.
+        right = xp.concatenate([A, C], axis=1) if n <= SMALL else eye
+        inverse = solve(eye + matmul(C, J), right)
+        solved = inverse[:, :n] if n <= SMALL else matmul(inverse, A)
+        change = symmetric(matmul(A.T, matmul(J, solved)))
+        after, J_after = matmul(A, solved), J + change
         # In units of X = X0 + J, of which J may be a small part.
-        change, whole = largest(J - before[2]), largest(J)
+        sizes = largest_of_each(change, J_after, X0 + J_after, after)
+        changed, whole, size_X, size_A = sizes
         # The next change is at most |A|^2 |J|.
-        next_change = (len(A) * largest(A)) ** 2 * whole
-        relative = xp.minimum(change, next_change) / one_if_zero(largest(X0 + J))
-        return after, xp.where(finite, relative, 0), k + 1
+        relative = xp.minimum(changed, (n * size_A) ** 2 * whole) / one_if_zero(size_X)
+        # An overflow ends the iteration at the last finite step, whose closed loop is
+        # not stable, which the caller checks. A NaN compares false.
+        finite = (whole < xp.inf) & (size_A < xp.inf)
+        relative = xp.where(finite, relative, 0)
+
+        def joined(C):
+            spread = inverse[:, n:] if n <= SMALL else matmul(inverse, C)
+            return C + symmetric(matmul(matmul(A, spread), A.T))
+
+        # The last doubling is one of J alone. A small one is compiled without branches.
+        C = joined(C) if n <= SMALL else if_true(relative > eps, joined, C)
+        return (after, C, xp.where(finite, J_after, J)), relative, k + 1
 
     start = element, xp.asarray(xp.inf, X0.dtype), xp.asarray(0)
     (_, _, J), _, doublings = while_loop(more, body, start)

@@ -32,9 +32,11 @@ from ._level import (
     Game,
     game_at_level,
     GameSolution,
+    inverse_margin,
     inverse_margins,
     joint,
     joint_gain,
+    largest_eigenvalue,
 )
 from ._recursion import (
     hamiltonian,
@@ -282,7 +284,11 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     # X is not semidefinite or a loop not stable (Doyle et al., 1989).
     holds = is_semidefinite(X, 1000) & decided & xp.all(stable)
     solved = left.relative < _rounding(n, A.dtype)
-    return Game(X, left.bounds[0], holds, solved, iterations)
+    # In discrete time the worth of the disturbance falls to zero, in continuous time
+    # the solution grows.
+    growing = inverse_margin(D, X, gamma) if discrete else X
+    distance = 1 / largest_eigenvalue(growing)
+    return Game(X, left.bounds[0], holds, solved, iterations, distance)
 
 
 def _element(discrete, data, problem, gamma, X0):

@@ -16,10 +16,12 @@ from ._level import (
     Game,
     game_at_level,
     GameSolution,
+    inverse_margin,
     inverse_margins,
     joint,
     joint_gain,
     joint_inputs,
+    largest_eigenvalue,
 )
 from ._recursion import flow_values, gain, is_clearly_definite, values
 from ._stabilising import shifted
@@ -186,7 +188,13 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
         # There is no equation to be solved: all that can fail is that X is not finite.
         X = _values(discrete, problem, gamma)
         zero, yes = xp.zeros((), X.dtype), xp.ones((), bool)
-        return Game(X, zero, xp.all(xp.isfinite(X)), yes, xp.asarray(0))
+        if discrete:
+            margins = vmap(lambda D, X: inverse_margin(D, X, gamma))(problem[2], X[1:])
+            growing = xp.max(vmap(largest_eigenvalue)(margins))
+        else:
+            growing = largest_eigenvalue(X[0])
+        holds = xp.all(xp.isfinite(X))
+        return Game(X, zero, holds, yes, xp.asarray(0), 1 / growing)
 
     def barrier(problem, gamma):
         X = _values(discrete, problem, gamma)

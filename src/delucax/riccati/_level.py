@@ -13,6 +13,7 @@ from .._jax import custom_jvp, stop_gradient, vmap, while_loop, xp
 from .._results import raise_on_failure, Result
 from .._typing import Array, Scalar, Square
 from ..math._linear_solve import full_precision, solve
+from ..math._norms import size
 from ._arguments import RiccatiData
 from ._residual import stationary
 
@@ -23,6 +24,7 @@ _WIDEST = 1e18
 """The search gives up this factor away from where it starts."""
 _FACTOR = 4.0
 _MAX_TRIALS = 200
+_SQUARINGS = 3
 _AWAY = (1.0, 4.0, 16.0, 64.0)
 _WEIGHTS = (64 / 21, -8 / 3, 2 / 3, -1 / 21)
 """Of the polynomial through values at the roots of the above, at 0."""
@@ -133,6 +135,7 @@ class Game(NamedTuple):
     holds: Array  # whether all conditions but the equation hold
     solved: Array  # whether the equation is solved
     iterations: Array
+    distance: Array  # a number that falls to zero at the least level
 
     @property
     def good(self) -> Array:
@@ -140,10 +143,17 @@ class Game(NamedTuple):
 
 
 class Bisection(NamedTuple):
-    """The state of the bisection of the least level."""
+    """The state of the bisection of the least level.
+
+    A point is `gamma^-2` and the distance of a feasible level.
+    """
 
     low: Array
     high: Array
+    point: Float[Array, "2"]  # at the upper end
+    estimate: Array  # of the least level, by the last two points
+    error: Array  # of the estimate
+    width_before: Array  # of the bracket, before the last trial
     start: Array
     solvable: Array  # whether there is a solution without a disturbance
     affected: Array  # whether the disturbance has any effect on the cost
@@ -193,7 +203,7 @@ def bisect_level(
             # the logarithms: the level may have any size.
             known = xp.where(xp.isinf(now.high), 1, now.high)
             up = xp.where(now.low == 0, now.start, _FACTOR * now.low)
-            down = xp.where(now.low == 0, known / _FACTOR, xp.sqrt(now.low * known))
+            down = xp.where(now.low == 0, known / _FACTOR, _within(now, tolerance))
             trial = xp.where(xp.isinf(now.high), up, down)
         else:
             trial = gamma
@@ -201,6 +211,7 @@ def bisect_level(
         tried = (A, B, xp.where(first, 0, D), *others)
         game = solve_game(tried, trial, now.base)
         good = game.good
+        point = xp.stack([xp.where(first, 0, trial**-2.0), game.distance])
         # The cost of a unit disturbance, trace D'XD: the square of a typical level, at
         # which the bracket starts.
         X = game.X[1:] if D.ndim == 3 else game.X
@@ -213,15 +224,26 @@ def bisect_level(
             affected=effect > slack,
             base=game.X,
             game=game,
+            point=point,
         )
         # Between neighbouring floating-point numbers the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
+        # The distance is nearly linear in gamma^-2, along the secant.
+        place, value = point
+        slope = (now.point[1] - value) / (now.point[0] - place)
+        estimate = (place - value / slope) ** -0.5
+        # That of the last estimate is the change. It falls as the distance does.
+        error = xp.abs(estimate - now.estimate) * (value / now.point[1])
         # Of a search the best game is kept, at a given level the one that was solved.
         keep = better if gamma is None else xp.ones((), bool)
         later = now._replace(
             low=xp.where(stuck, now.high, xp.where(good, now.low, trial)),
             high=xp.where(better, trial, now.high),
+            point=xp.where(better, point, now.point),
+            estimate=xp.where(better, estimate, now.estimate),
+            error=xp.where(better, error, now.error),
+            width_before=now.high - now.low,
             game=_where(keep | (now.trials == 1), game, now.game),
         )
         return _where(first, at_first, later)._replace(trials=now.trials + 1)
@@ -234,7 +256,11 @@ def bisect_level(
         solvable=no,
         affected=no,
         base=start,
-        game=Game(start, one, no, no, nothing),
+        point=xp.inf * xp.ones(2, A.dtype),
+        estimate=xp.inf * one,
+        error=xp.inf * one,
+        width_before=xp.inf * one,
+        game=Game(start, one, no, no, nothing, one),
         trials=nothing,
     )
     end = while_loop(more, body, begin)
@@ -242,6 +268,25 @@ def bisect_level(
         return end, gamma
     level = xp.where(xp.isfinite(end.high) & end.solvable, end.high, one)
     return end, xp.where(end.solvable & ~end.affected, 0, level)
+
+
+def _within(now: Bisection, tolerance: Array | float) -> Array:
+    """The next level within the bracket.
+
+    It is a little above or below the estimate of the least level, by as much as that is
+    uncertain: where more of the bracket is cut off.
+    """
+    low, high, estimate = now.low, now.high, now.estimate
+    width, middle = high - low, xp.sqrt(low * high)
+    error = xp.maximum(4 * now.error, tolerance * estimate / 4)
+    above, below = estimate + error, estimate - error
+    trial = xp.where(high - above > below - low, above, below)
+    # Bisection is as good if less than half is cut off, and better if the last trial
+    # had not done that.
+    good = xp.maximum(high - above, below - low) > width / 2
+    good = good & (estimate > low) & (estimate < high)
+    good = good & (trial > low) & (trial < high) & (width < 0.7 * now.width_before)
+    return xp.where(good, trial, middle)
 
 
 def game_at_level(
@@ -314,6 +359,21 @@ def _once_differentiable_jvp(primals, tangents):
         "The least attainable gamma has first derivatives only. Give gamma as an "
         "argument for higher ones."
     )
+
+
+def inverse_margin(D: Array, X: Square, gamma: Scalar) -> Array:
+    """`(I - D'XD / gamma^2)^-1`."""
+    eye = xp.eye(D.shape[1], dtype=D.dtype)
+    return solve(eye - D.T @ X @ D / gamma**2, eye)
+
+
+def largest_eigenvalue(X: Square) -> Scalar:
+    """About the largest eigenvalue of a semidefinite matrix, from above."""
+    unit = size(X)
+    power = X / unit
+    for _ in range(_SQUARINGS):
+        power = power @ power
+    return unit * size(power) ** (0.5**_SQUARINGS)
 
 
 def inverse_margins(

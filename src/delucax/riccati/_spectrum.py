@@ -122,8 +122,7 @@ def _growth(A, probing, limit=None):
             rough = rough & (bound >= limit) & (bound - 64 * weight <= limit)
         return ~finished & rough & (weight > 0.5**_SQUARINGS)
 
-    def body(carry):
-        power, span, kept, logarithm, weight, _ = carry
+    def squared(power, logarithm, weight):
         grown = largest(power)
         # A nilpotent matrix, whose radius is zero: no power of it is scaled any more.
         finished = ~(grown > 0)
@@ -132,6 +131,14 @@ def _growth(A, probing, limit=None):
         # norm is the largest entry, which for the flow of a short time is nearly one:
         # logarithms of others would cancel.
         logarithm = logarithm + weight * xp.log(grown)
+        return matmul(scaled, scaled), logarithm, weight / 2, scaled, finished
+
+    def body(carry):
+        power, span, kept, logarithm, weight, _ = carry
+        if probing:
+            # Probing takes as long as a square: it is left out in between.
+            power, logarithm, weight, *_ = squared(power, logarithm, weight)
+        power, logarithm, weight, scaled, finished = squared(power, logarithm, weight)
         if probing:
             # A basis of the range of the power, as the probes see it. What is as small
             # as the rounding of the rest is no direction of it.
@@ -141,7 +148,7 @@ def _growth(A, probing, limit=None):
             span = xp.where(kept, basis, 0)
             left = largest(scaled - span @ (span.T @ scaled))
             finished = finished | (left < 4 * math.sqrt(n) * eps)
-        return matmul(scaled, scaled), span, kept, logarithm, weight / 2, finished
+        return power, span, kept, logarithm, weight, finished
 
     zero, one = xp.zeros((), dtype), xp.ones((), dtype)
     start = (A, probes, xp.zeros(count, bool), zero, one, xp.asarray(False))

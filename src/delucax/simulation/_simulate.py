@@ -152,22 +152,17 @@ def simulate(
         x0 = jnp.array([0.1, 0.0])
 
         def cost(controls):
-            trajectory = dlx.simulate(
-                pendulum,
-                controls,
-                0.0,
-                1.0,
-                x0,
-                stepsize_controller=diffrax.PIDController(rtol=1e-5, atol=1e-6),
-                adjoint=diffrax.BacksolveAdjoint(),
-            )
+            options = dict(solver=diffrax.Midpoint())
+            trajectory = dlx.simulate(pendulum, controls, 0.0, 1.0, x0, **options)
             return jnp.sum(trajectory.final_state**2)
 
         jax.jit(jax.grad(cost))(jnp.zeros((20, 1)))
 
         feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
         sampled = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, dt=0.05)
-        continuous = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, hold=None, dt=0.05)
+        options = dict(hold=None, dt=0.05)
+        options["stepsize_controller"] = diffrax.PIDController(rtol=1e-5, atol=1e-6)
+        continuous = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, **options)
         ```
     """
     where = "simulate"

@@ -6,11 +6,13 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._check import as_vector, check_function
 from .._check_models import check_matrices, checked_names, state_network
 from .._module import (
+    as_float_array,
     function_field,
     indexed_names,
     names_of,
@@ -80,7 +82,8 @@ class LinearSystem(AbstractSystem):
         n, m = self.B.shape
         for name, size in (("x_ref", n), ("u_ref", m), ("dx_ref", n)):
             if getattr(self, name) is None:
-                setattr(self, name, jnp.zeros(size, self.A.dtype))
+                zero = as_float_array(np.zeros(size, self.A.dtype))
+                setattr(self, name, zero)
         self.state_names = checked_names(self.state_names, "x", n, "state_names", where)
         self.control_names = checked_names(
             self.control_names, "u", m, "control_names", where

@@ -179,6 +179,7 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
 
         ```python
         import delucax as dlx
+        import equinox as eqx
         import jax
         import jax.numpy as jnp
         from jaxtyping import Array
@@ -198,7 +199,8 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
 
         loss = dlx.training.scored_cost(dlx.make("pendulum"), horizon=20)
         estimator = dlx.training.LikelihoodRatio(samples=32)
-        value, gradient = estimator(loss, Dithered(), jax.random.key(0))
+        key = jax.random.key(0)
+        value, gradient = eqx.filter_jit(estimator)(loss, Dithered(), key)
         ```
     """
     where = "scored_cost"

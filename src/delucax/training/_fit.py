@@ -18,6 +18,7 @@ from .._check import check_at_most, check_count, check_function, check_key, is_c
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._gradient_estimators import analytic
+from ._optimiser import Optimiser
 from ._record import Checkpoint, checkpoint_path, COLUMNS, describe_run, History
 from ._steps import AbstractSurrogate, CAPACITY, FAULTS, State, Steps
 from ._trainable import partition_trainable
@@ -94,10 +95,10 @@ def fit(
     The steps run in compiled blocks, as one loop on the device. The result does not
     depend on the size of the block, and a run that was cut off and resumed from its
     checkpoint, on the same kind of machine, ends with the same bits. A second call with
-    the same loss function, optimiser object and kind of model does not compile again;
-    an optimiser is a pair of functions, so each new one does. Not for use under `jit`
-    or `vmap`; but a batch of keys trains a batch of models, all at once and each as if
-    it were alone.
+    the same loss function, an optimiser made in the same way, such as a new
+    `optax.adam(1e-3)`, and the same kind of model does not compile again. Not for use
+    under `jit` or `vmap`; but a batch of keys trains a batch of models, all at once and
+    each as if it were alone.
 
     **Arguments:**
 
@@ -169,7 +170,7 @@ def fit(
             optax.adam(0.05),
             steps=200,
             key=jax.random.key(1),
-            data=(states, jax.vmap(field)(states)),
+            data=(states, jax.jit(jax.vmap(field))(states)),
             batch_size=32,
             trainable={"length": dlx.positive},
         )
@@ -210,7 +211,8 @@ def fit(
             "keys."
         )
     assembly, values = partition_trainable(model, trainable, _WHERE)
-    run = Steps(loss, gradient, optimiser, assembly, key, data, batch_size, seeds)
+    own = Optimiser(optimiser)
+    run = Steps(loss, gradient, own, assembly, key, data, batch_size, seeds)
     state = run.start(model, values)
 
     saved, blocks, seconds = None, [], 0.0

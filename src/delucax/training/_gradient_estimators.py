@@ -115,6 +115,7 @@ class EvolutionStrategies(eqx.Module):
 
         ```python
         import delucax as dlx
+        import equinox as eqx
         import jax
         import jax.numpy as jnp
 
@@ -122,7 +123,8 @@ class EvolutionStrategies(eqx.Module):
         loss = dlx.training.expected_cost(env, batch=1, horizon=50)
         controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
         estimator = dlx.training.EvolutionStrategies(sigma=0.1, samples=16)
-        value, gradient = estimator(loss, controller, jax.random.key(0))
+        key = jax.random.key(0)
+        value, gradient = eqx.filter_jit(estimator)(loss, controller, key)
         ```
     """
 
@@ -217,6 +219,7 @@ class LikelihoodRatio(eqx.Module):
 
         ```python
         import delucax as dlx
+        import equinox as eqx
         import jax
         import jax.numpy as jnp
 
@@ -225,7 +228,8 @@ class LikelihoodRatio(eqx.Module):
             return (u - 1.0) ** 2, {"log_prob": -0.5 * (u - mean) ** 2}
 
         estimator = dlx.training.LikelihoodRatio(samples=1000)
-        value, gradient = estimator(loss, jnp.asarray(0.0), jax.random.key(0))
+        key = jax.random.key(0)
+        value, gradient = eqx.filter_jit(estimator)(loss, jnp.asarray(0.0), key)
         ```
     """
 

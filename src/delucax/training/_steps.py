@@ -1,6 +1,7 @@
 """Steps of [`delucax.training.fit`][] in compiled blocks; losses with a memory."""
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from jaxtyping import Array, Int, PyTree
 
 from .._typing import PRNGKey
 from ._gradient_estimators import cost_and_metrics
+from ._optimiser import Optimiser
 from ._record import COLUMNS
 from ._trainable import Assembly, strip_weak_type
 
@@ -130,7 +132,7 @@ class Steps(NamedTuple):
 
     loss: Callable[..., Any]
     gradient: Callable[..., Any]
-    optimiser: optax.GradientTransformation
+    optimiser: Optimiser
     assembly: Assembly
     key: PRNGKey
     data: PyTree
@@ -159,8 +161,8 @@ class Steps(NamedTuple):
 
         **Returns:** the state after them, and the metrics by name, an entry per step.
         """
-        span = jax.device_put(np.array([first, stop], np.int32))
-        state, outcome = self._compiled(state, span)
+        span = jax.device_put((np.int32(first), np.int32(stop)))
+        state, outcome = self._compiled(state, *span)
         rows, count = jax.device_get(outcome)
         return state, {name: column[:count] for name, column in rows.items()}
 
@@ -174,13 +176,12 @@ class Steps(NamedTuple):
 
     @eqx.filter_jit
     def _compiled(
-        self, state: State, span: Int[Array, "2"]
+        self, state: State, first: Int[Array, ""], stop: Int[Array, ""]
     ) -> tuple[State, tuple[dict[str, Array], Array]]:
         def step_of_all(state, k):
             step = lambda model, key, state: self._step(model, key, state, k)
             return _over_seeds(step, self.seeds)(self.assembly, self.key, state)
 
-        first, stop = span[0], span[1]
         # Traced once, here: the loop needs the shapes of a row before it begins.
         step = jax.jit(step_of_all)
         empty = lambda entry: jnp.zeros((CAPACITY, *entry.shape), entry.dtype)
@@ -240,15 +241,15 @@ class Steps(NamedTuple):
         # Line searches of Optax take the loss too.
         value_of = lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0]
         given: Any = dict(value=cost, grad=slope, value_fn=value_of)
-        update = optax.with_extra_args_support(self.optimiser).update
-        updates, after = update(slope, before.optimiser, values, **given)
+        updates, after = self.optimiser.update(slope, before.optimiser, values, **given)
         # The carry of a while loop must keep its dtypes.
         after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
         # In the order in which one leads to the next, so that the first is the cause.
-        faulty = ~jnp.stack([*map(_is_finite, (cost, norm, moved))])
-        fault = jnp.where(jnp.any(faulty), 1 + jnp.argmax(faulty), 0).astype(jnp.int32)
+        fault = jnp.where(_is_finite(moved), np.int32(0), np.int32(3))
+        fault = jnp.where(jnp.isfinite(norm), fault, np.int32(2))
+        fault = jnp.where(jnp.isfinite(cost), fault, np.int32(1))
         # A seed that failed is frozen while the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
@@ -260,7 +261,7 @@ class Steps(NamedTuple):
 
 
 @eqx.filter_jit
-def _first_state(optimiser: Any, seeds: int | None, values: Values) -> PyTree:
+def _first_state(optimiser: Optimiser, seeds: int | None, values: Values) -> PyTree:
     """The state of an optimiser before the first step."""
     return jax.tree.map(strip_weak_type, _over_seeds(optimiser.init, seeds)(values))
 
@@ -321,4 +322,5 @@ def _norm(tree: PyTree) -> Array:
 
 def _is_finite(tree: PyTree) -> Array:
     leaves = jax.tree.leaves(tree)
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
+    finite = (jnp.all(jnp.isfinite(leaf)) for leaf in leaves)
+    return functools.reduce(jnp.logical_and, finite)

@@ -83,10 +83,13 @@ class Explore(AbstractController):
 
         env = dlx.make("lds", A=jnp.array([[0.9, 0.3], [0.0, 0.8]]), B=jnp.eye(2))
 
-        def build(model):
-            return dlx.controllers.gpc(model, env.cost, horizon=20)
+        K = jnp.zeros((2, 2))
 
-        learner = dlx.controllers.Explore(build, jnp.zeros((2, 2)), steps=200)
+        def build(model):
+            base = dlx.controllers.Linear(K)
+            return dlx.controllers.gpc(model, env.cost, base=base, horizon=20)
+
+        learner = dlx.controllers.Explore(build, K, steps=200)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
         ```
     """

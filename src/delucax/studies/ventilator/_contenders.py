@@ -31,6 +31,7 @@ TRUE_PID = dict(
     kd=(0.0, 0.01, 0.03),
 )
 """The gains of the true PIDs that are tried."""
+_TUNED_KINDS = {"PID": PID, "leaky PID": LeakyPID}
 _TUNED_FURTHER = 4
 """The number of PIDs drawn at random that are trained further."""
 _TRAINING_LIMIT = ABORT - 15
@@ -214,7 +215,7 @@ def tuned_pids(
     dt, size = envs.dt[0], trainer.size
     options: Any = dict(steps=size.pid_steps, progress=progress)
     options |= dict(learning_rate=0.03, throw=False)
-    for k, (kind, name) in enumerate(((PID, "PID"), (LeakyPID, "leaky PID"))):
+    for k, (name, kind) in enumerate(_TUNED_KINDS.items()):
         keys = jr.split(jr.fold_in(trainer.key, 20 + k), 4)
         draw_key, search_key, fit_key, judge_key = keys
         drawn = _drawn(kind, size.tuned, dt, trainer.waveform, draw_key)

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
@@ -129,18 +130,25 @@ class Identified(eqx.Module):
 
 def checked(fit: Identified, throw: bool) -> Identified:
     """`fit` with its final result, and without intervals where the solver failed."""
-    finite = jnp.all(jnp.isfinite(fit.estimate))
-    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
-    solver = first_failure(promote(fit.result), diverged)
-    solved = solver == RESULTS.successful
-    known = fit.identifiable & solved
-    excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
-    result = first_failure(solver, excited)
     intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]
-    certain = [jnp.where(solved, end, jnp.nan) for end in intervals(fit)]
-    fit = eqx.tree_at(intervals, fit, certain)
-    fit = eqx.tree_at(lambda fit: [fit.identifiable, fit.result], fit, [known, result])
+    judged = lambda fit: [*intervals(fit), fit.identifiable, fit.result]
+    given = fit.estimate, fit.identifiable, fit.result, intervals(fit)
+    fit = eqx.tree_at(judged, fit, _judged(*given))
+    result: Any = fit.result
     return result.error_if(fit, result != RESULTS.successful) if throw else fit
+
+
+@eqx.filter_jit
+def _judged(estimate: Array, known: Array, result: Result, intervals: list) -> list:
+    """The intervals, what is identifiable, and the result, if the fit is judged."""
+    finite = jnp.all(jnp.isfinite(estimate))
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
+    solver = first_failure(promote(result), diverged)
+    solved = solver == RESULTS.successful
+    known = known & solved
+    excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
+    certain = [jnp.where(solved, end, jnp.nan) for end in intervals]
+    return [*certain, known, first_failure(solver, excited)]
 
 
 class Certainty(NamedTuple):
@@ -186,4 +194,9 @@ class Certainty(NamedTuple):
 def quantile(level: Any, where: str) -> Array:
     """The half-width of a confidence interval in standard deviations."""
     check_range(level, "level", where, 0, 1)
-    return ndtri((1 + as_float_array(level)) / 2)
+    return _two_sided(as_float_array(level))
+
+
+@jax.jit
+def _two_sided(level: Array) -> Array:
+    return ndtri((1 + level) / 2)

@@ -7,9 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import check_bool, check_count, check_finite, check_step
+from ..._host import host_unless_traced, xp
 from ..._message import shortened
 from ..._module import as_float_array
 from ..._results import RESULTS
@@ -75,12 +77,11 @@ def linear(
         names.append("1")
         regressors.append(jnp.ones((*controls.shape[:2], 1), controls.dtype))
 
-    def model_of(estimate):
-        A, B = estimate[:, :n], estimate[:, n : n + m]
-        x_next: Any = estimate[:, -1] if affine else None
-        return LinearDynamics(A, B, dt=dt, x_next=x_next)
+    def matrices_of(estimate):
+        matrices = dict(A=estimate[:, :n], B=estimate[:, n : n + m])
+        return matrices | (dict(x_next=estimate[:, -1]) if affine else {})
 
-    return _fitted(model_of, names, regressors, states[:, 1:], reach, throw)
+    return _fitted(matrices_of, names, regressors, states[:, 1:], dt, reach, throw)
 
 
 def arx(
@@ -158,8 +159,8 @@ def arx(
     back += [controls[:, first - lag : steps + 1 - lag] for lag in lags]
     names = [f"y{i}(k-{lag})" for lag in range(1, a + 1) for i in range(p)]
     names += [f"u{i}(k-{lag})" for lag in lags for i in range(m)]
-    model_of = lambda estimate: _realised(estimate, p, m, a, b, delay, dt)
-    return _fitted(model_of, names, back, outputs[:, first:], reach, throw)
+    matrices_of = lambda estimate: _realised(estimate, p, m, a, b, delay)
+    return _fitted(matrices_of, names, back, outputs[:, first:], dt, reach, throw)
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
@@ -187,11 +188,16 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
 
 @jax.jit
 def _least_squares(
-    regressors: Float[Array, "rows p"], targets: Float[Array, "rows outputs"]
-) -> tuple[Float[Array, "outputs p"], Float[Array, "outputs p"], Array, Certainty]:
-    """The estimate of each output, its standard deviation, that of the residuals, and
-    what the data tell of the output with the largest relative noise."""
+    parts: list[Float[Array, "runs steps _"]],
+    targets: Float[Array, "runs steps outputs"],
+    reach: Array,
+) -> tuple[dict[str, Array], Certainty]:
+    """The estimate of each output with its interval, and what the data tell of the
+    output with the largest relative noise."""
+    regressors = jnp.concatenate(parts, axis=2)
+    regressors = regressors.reshape(-1, regressors.shape[2])
     rows, p = regressors.shape
+    targets = targets.reshape(rows, -1)
     # In units of the regressors' size, so that the rank does not depend on units.
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
@@ -215,30 +221,31 @@ def _least_squares(
     unit = certainty.std / jnp.where(worst > 0, worst, 1)
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
-    return estimate / scale, std, noise, certainty
+    estimate = estimate / scale
+    certainty = certainty._replace(
+        std=std, identifiable=certainty.identifiable & (rows >= p)
+    )
+    ends = dict(low=estimate - reach * std, high=estimate + reach * std)
+    return dict(estimate=estimate, noise=noise, **ends), certainty
 
 
 def _fitted(
-    model_of: Callable[[Array], LinearDynamics],
+    matrices_of: Callable[[Any], dict[str, Any]],
     names: list[str],
     regressors: list[Array],
     targets: Float[Array, "runs steps outputs"],
+    dt: Any,
     reach: Array,
     throw: bool,
 ) -> Identified:
     """The linear model of `targets` by `regressors`, each with a row per step."""
-    rows = jnp.concatenate(regressors, axis=2).reshape(-1, len(names))
-    targets = targets.reshape(-1, targets.shape[2])
-    estimate, std, noise, certainty = _least_squares(rows, targets)
-    enough = certainty.identifiable & (len(rows) >= len(names))
+    of_outputs, certainty = _least_squares(regressors, targets, reach)
+    matrices = host_unless_traced(matrices_of)(of_outputs["estimate"])
     fit = Identified(
-        model=model_of(estimate),
+        model=LinearDynamics(dt=dt, **matrices),
         names=tuple(names),
-        estimate=estimate,
-        low=estimate - reach * std,
-        high=estimate + reach * std,
-        **certainty._replace(std=std, identifiable=enough)._asdict(),
-        noise=noise,
+        **of_outputs,
+        **certainty._asdict(),
         correlation=None,
         x0=None,
         result=RESULTS.successful,
@@ -246,23 +253,24 @@ def _fitted(
     return checked(fit, throw)
 
 
-def _realised(estimate, p, m, a, b, delay, dt) -> LinearDynamics:
-    """The dynamics whose state is the past that the estimate looks back on."""
+def _realised(estimate, p, m, a, b, delay) -> dict[str, Any]:
+    """The matrices of dynamics whose state is the past that the estimate looks back
+    on."""
     # u_{k-1}, ..., u_{k-held}; the control itself is the input.
     held = b + delay - 2
     n = a * p + held * m
     # A is a block companion matrix: the first rows predict, the others move the past on
     # by a step.
     # The coefficients of u_{k-1}, u_{k-2}, ..., of which the first is not in the state.
-    of_controls = jnp.pad(estimate[:, a * p :], ((0, 0), ((delay - 1) * m, 0)))
+    of_controls = xp.pad(estimate[:, a * p :], ((0, 0), ((delay - 1) * m, 0)))
     rows = [
-        jnp.concatenate([estimate[:, : a * p], of_controls[:, m:]], axis=1),
-        jnp.eye(n, k=-p)[p : a * p],
-        jnp.zeros((m, n))[: held * m],
-        jnp.eye(n, k=-m)[a * p + m :],
+        xp.concatenate([estimate[:, : a * p], of_controls[:, m:]], axis=1),
+        np.eye(n, k=-p)[p : a * p],
+        np.zeros((m, n))[: held * m],
+        np.eye(n, k=-m)[a * p + m :],
     ]
-    A = jnp.concatenate(rows).astype(estimate.dtype)
-    B = jnp.zeros((n, m), estimate.dtype).at[:p].set(of_controls[:, :m])
-    B = B.at[a * p : a * p + m].set(jnp.eye(m)[: held * m])
-    C = jnp.eye(p, n, dtype=estimate.dtype)
-    return LinearDynamics(A, B, C, dt=dt)
+    A = xp.concatenate(rows).astype(estimate.dtype)
+    rows = [of_controls[:, :m], np.zeros(((a - 1) * p, m)), np.eye(held * m, m)]
+    B = xp.concatenate(rows).astype(estimate.dtype)
+    C = np.eye(p, n, dtype=estimate.dtype)
+    return dict(A=A, B=B, C=C)

@@ -23,11 +23,12 @@ _NEAR = 0.05
 class Windows(NamedTuple):
     """Recorded data cut into windows, and the scale of each output."""
 
-    begins: Int[np.ndarray, " windows"]
+    begins: Int[Array, " windows"]
     controls: Float[Array, "windows steps m"]
     observations: Float[Array, "windows points y"]
-    counts: Bool[np.ndarray, "windows points"]
+    counts: Bool[Array, "windows points"]
     noise: Float[Array, " y"]
+    floor: Float[Array, " y"]
 
 
 class _Point(NamedTuple):
@@ -53,13 +54,16 @@ class Solution(NamedTuple):
     result: Result
 
 
+@eqx.filter_jit
 def cut_into_windows(
     guesses: Float[Array, "runs points n"],
     observations: Float[Array, "runs points y"],
     controls: Float[Array, "runs steps m"],
     window: int,
+    noise: Float[Array, " y"] | None,
 ) -> tuple[Float[Array, "windows n"], Windows]:
-    """`(starts, windows)`, the noise of which is the spread of each output."""
+    """`(starts, windows)`, the noise of which is by default the spread of each
+    output, and may then be no less than the rounding of a whole window."""
     runs, steps, _ = controls.shape
     n, size = guesses.shape[2], observations.shape[2]
     count = steps // window
@@ -77,7 +81,11 @@ def cut_into_windows(
     spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
     moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
     spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
-    return starts, Windows(begins, inputs, observed, counts, spread)
+    floor = 1e3 * float(jnp.finfo(spread.dtype).eps) * spread
+    if noise is not None:
+        spread, floor = noise, jnp.zeros_like(noise)
+    data = inputs, observed, jnp.asarray(counts), spread, floor
+    return starts, Windows(jnp.asarray(begins), *data)
 
 
 @eqx.filter_jit
@@ -86,7 +94,7 @@ def solve(
     values: dict[str, Array],
     starts: Float[Array, "windows n"],
     data: Windows,
-    max_steps: int,
+    max_steps: Int[Array, ""],
 ) -> Solution:
     """The parameters and the state at the beginning of each window that fit best."""
     flat, unravel = jax.flatten_util.ravel_pytree(values)
@@ -109,7 +117,8 @@ def solve(
         residuals = jnp.where(counts[:, None], residuals, 0).ravel().astype(dtype)
         return residuals, residuals
 
-    *recorded, noise = data
+    *recorded, noise, floor = data
+    noise = jnp.maximum(noise, floor)
     # Forward, for parameters and states are few and residuals many.
     slopes = jax.jacfwd(window, argnums=(0, 1), has_aux=True)
     sensitivity = jax.vmap(slopes, in_axes=(None, 0, 0))
@@ -146,7 +155,7 @@ def solve(
     # The correlation of rounding errors has no meaning.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
     # Of the degrees of freedom, which all outputs share, each has `free / size`.
-    noise = data.noise * jnp.sqrt(each * size / free)
+    noise = noise * jnp.sqrt(each * size / free)
     values = unravel(theta)
     # No more certain than the noise that was given, or than rounding lets it be.
     sigma = jnp.maximum(sigma, 1)
@@ -163,7 +172,7 @@ def solve(
 
 
 def _levenberg_marquardt(
-    linearised: Any, start: _Point, max_steps: int
+    linearised: Any, start: _Point, max_steps: Int[Array, ""]
 ) -> tuple[_Point, Array]:
     """`(the best point, the number of points tried)`.
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -20,13 +21,14 @@ from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import Assembly, partition_trainable
-from ._identified import checked, CORRELATED, Identified, quantile
+from ._identified import Certainty, checked, CORRELATED, Identified, quantile
 from ._linear import runs_of
 from ._multiple_shooting import (
     cut_into_windows,
     flat_constrained,
     per_relative_change,
     relative_unit,
+    Solution,
     solve,
 )
 
@@ -126,7 +128,8 @@ def physical(
         )
     runs, steps = controls.shape[:2]
     window = min(check_count(window, "window", where), steps)
-    max_steps = check_count(max_steps, "max_steps", where)
+    # An array, so that another limit does not compile again.
+    most: Any = np.asarray(check_count(max_steps, "max_steps", where))
     reach = quantile(level, where)
     check_bool(throw, "throw", where)
     if noise is not None:
@@ -151,18 +154,15 @@ def physical(
     ]
 
     def fit(values, window):
-        starts, data = cut_into_windows(guesses, observations, controls, window)
-        spread = data.noise
-        data = data._replace(noise=spread if noise is None else noise)
+        given = guesses, observations, controls
+        starts, data = cut_into_windows(*given, window, noise)
         # First in units of the spread of each output; then from there in units of the
         # residuals that are left, which weighs outputs of unlike noise as they deserve.
-        solution = solve(assembly, values, starts, data, max_steps)
+        solution = solve(assembly, values, starts, data, most)
         if noise is not None:
             return solution
-        # Data without noise leave rounding alone, that of a whole window.
-        floor = 1e3 * float(jnp.finfo(spread.dtype).eps) * spread
-        data = data._replace(noise=jnp.maximum(solution.noise, floor))
-        return solve(assembly, solution.values, solution.starts, data, max_steps)
+        data = data._replace(noise=solution.noise)
+        return solve(assembly, solution.values, solution.starts, data, most)
 
     count = steps // window
     unknown = len(names) + runs * count * n
@@ -171,29 +171,22 @@ def physical(
     # A second attempt, if it is known now that the first did not converge, or that its
     # residuals are correlated from step to step, as the noise is not.
     retries = x0 is None and not few and window > _SHORT_WINDOW
-    failed = solution.result != RESULTS.successful
-    is_known = is_concrete(solution.correlation)
-    if retries and is_known and (failed | (solution.correlation > CORRELATED)):
+    if retries and is_concrete(solution.correlation):
+        failed = solution.result != RESULTS.successful
         # On short windows nothing grows, so that a worse guess does, and there are
         # fewer minima that are not the least.
-        again = fit(fit(values, _SHORT_WINDOW).values, window)
-        if again.result == RESULTS.successful:
-            if failed or jnp.prod(again.noise) < jnp.prod(solution.noise):
+        if failed or float(solution.correlation) > CORRELATED:
+            again = fit(fit(values, _SHORT_WINDOW).values, window)
+            less = np.prod(again.noise) < np.prod(solution.noise)
+            if again.result == RESULTS.successful and (failed or less):
                 solution = again
-    values, estimate, certainty = solution.values, solution.estimate, solution.certainty
-    std = certainty.std
-    known = certainty._replace(
-        std=std * jnp.abs(relative_unit(estimate)),
-        identifiable=certainty.identifiable & (not few),
-    )
-    ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
-    starts = solution.starts.reshape(runs, count, n)[:, 0]
+    low, high, known, starts = _intervals(assembly, solution, reach, few, runs)
     fitted = Identified(
-        model=assembly(values),
+        model=assembly(solution.values),
         names=tuple(names),
-        estimate=estimate,
-        low=jnp.minimum(*ends),
-        high=jnp.maximum(*ends),
+        estimate=solution.estimate,
+        low=low,
+        high=high,
         **known._asdict(),
         noise=solution.noise,
         correlation=solution.correlation,
@@ -203,6 +196,25 @@ def physical(
         result=RESULTS.successful if few else solution.result,
     )
     return checked(fitted, throw)
+
+
+@eqx.filter_jit
+def _intervals(
+    assembly: Assembly, solution: Solution, reach: Array, few: bool, runs: int
+) -> tuple[Array, Array, Certainty, Array]:
+    """The ends of the intervals, the certainty of the estimate, and the state at the
+    beginning of each run."""
+    certainty, starts = solution.certainty, solution.starts
+    std = certainty.std
+    known = certainty._replace(
+        std=std * jnp.abs(relative_unit(solution.estimate)),
+        identifiable=certainty.identifiable & (not few),
+    )
+    below, above = (
+        _ends(assembly, solution.values, d) for d in (-reach * std, reach * std)
+    )
+    first = starts.reshape(runs, -1, starts.shape[1])[:, 0]
+    return jnp.minimum(below, above), jnp.maximum(below, above), known, first
 
 
 def _ends(

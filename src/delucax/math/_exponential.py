@@ -1,0 +1,47 @@
+"""The matrix exponential."""
+
+import math
+
+from .._jax import fori_loop, stop_gradient, xp
+from .._typing import Square
+from ._linear_solve import solve
+
+
+_ORDER = 13
+_NEAR = 5.37
+"""The norm up to which the Padé approximant is exact to rounding, in float64 too."""
+_MAX_SQUARINGS = 32
+
+
+def exponential(A: Square) -> Square:
+    """`exp(A)` by scaling and squaring; NaN if the norm of `A` is above 1e10.
+
+    Source: Higham, 2005.
+    """
+    size = stop_gradient(xp.linalg.norm(A, 1))
+    squarings = xp.maximum(xp.ceil(xp.log2(size / _NEAR)), 0)
+    A = A * xp.where(squarings <= _MAX_SQUARINGS, 0.5**squarings, xp.nan)
+    eye = xp.eye(len(A), dtype=A.dtype)
+    square = A @ A
+    powers = [eye, square, square @ square]
+    powers.append(square @ powers[-1])
+    c = [math.comb(_ORDER, k) / math.perm(2 * _ORDER, k) for k in range(_ORDER + 1)]
+
+    def even(c):
+        """The polynomial `c[0] + c[1] A^2 + c[2] A^4 + ...`."""
+        low = sum(a * power for a, power in zip(c[:4], powers, strict=True))
+        high = sum(a * power for a, power in zip(c[4:], powers[1:], strict=True))
+        return low + powers[-1] @ high
+
+    # The approximant is p(A) / p(-A), and of p the even and the odd part are known.
+    V, U = even(c[::2]), A @ even(c[1::2])
+    start = solve(V - U, V + U)
+
+    # Of fixed length, which reverse mode needs.
+    def double(k, E):
+        more = k < squarings
+        # Zero where it is not used: what overflows there must not reach a derivative.
+        safe = xp.where(more, E, 0)
+        return xp.where(more, safe @ safe, E)
+
+    return fori_loop(0, _MAX_SQUARINGS, double, start)

@@ -1,0 +1,56 @@
+"""Optimisers that are equal if they are made in the same way."""
+
+import functools
+from types import FunctionType
+from typing import Any
+
+import optax
+
+
+class Optimiser:
+    """An Optax optimiser, which is a pair of functions.
+
+    Each call of `optax.adam(1e-3)` makes new functions, and JAX would compile again for
+    each of them. Here two are equal if their code and all that it closes over is, so
+    that the second finds the programs of the first.
+    """
+
+    def __init__(self, transformation: optax.GradientTransformation):
+        self.init = transformation.init
+        self.update = optax.with_extra_args_support(transformation).update
+        self._content = _content(transformation)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Optimiser) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+
+def _content(value: Any, *inside: Any) -> Any:
+    """What `value` consists of, to be compared; an object of another kind by its own
+    `==`, or by its identity where it has no hash."""
+    # The type as well, because 1 equals True and 1.0.
+    kind = type(value)
+    if any(value is other for other in inside):
+        return kind
+    parts = functools.partial(_contents, inside=(*inside, value))
+    if kind is FunctionType:
+        cells = parts(cell.cell_contents for cell in value.__closure__ or ())
+        defaults = parts((value.__defaults__, value.__kwdefaults__))
+        return value.__code__, id(value.__globals__), cells, defaults
+    if kind is functools.partial:
+        return kind, parts((value.func, value.args, value.keywords))
+    if isinstance(value, tuple | list):
+        return kind, parts(value)
+    if isinstance(value, dict):
+        return kind, tuple(value), parts(value.values())
+    try:
+        hash(value)
+    except TypeError:
+        return kind, id(value)
+    return kind, value
+
+
+def _contents(values: Any, inside: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple(_content(value, *inside) for value in values)
