@@ -16,7 +16,12 @@ from .._host import (
     while_loop as while_loop,
     xp as xp,
 )
-from ._batches import by_lanes as by_lanes, fence as fence, matmul as matmul
+from ._batches import (
+    by_lanes as by_lanes,
+    fence as fence,
+    hoisted as hoisted,
+    matmul as matmul,
+)
 from ._components import (
     by_components as by_components,
     COMPONENTS_UP_TO as COMPONENTS_UP_TO,
@@ -26,6 +31,7 @@ from ._components import (
     with_stores as with_stores,
 )
 from ._derivatives import (
+    deferred as deferred,
     first_possible as first_possible,
     is_constant as is_constant,
     jacobian as jacobian,

@@ -134,24 +134,27 @@ mlir.register_lowering(
 )
 
 
+def hoisted(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+    """`function`, traced at `args`, with all arrays that it closes over as leaves."""
+    # Equinox looks into functions with a closure alone, such as this lambda.
+    return eqx.filter_closure_convert(lambda *args: function(*args), *args)
+
+
 def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)` of arrays, whose batches run sequentially on CPU.
 
     In a batch each iteration waits for the longest line search and the slowest member,
     and on CPU nothing is gained in return: a sequential run is between equally fast and
     six times as fast. Accelerators run the batch as one. The function needs a
-    derivative of its own.
+    derivative of its own, and arrays that it closes over as leaves.
     """
-    # Arrays that a cost or a constraint of the user closes over are batched as well.
-    # Equinox looks into functions with a closure alone, such as this lambda.
-    closed = eqx.filter_closure_convert(lambda *args: function(*args), *args)
-    arrays, static = eqx.partition((closed, args), eqx.is_array)
+    arrays, static = eqx.partition((function, args), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
 
     def evaluate(*leaves):
         arrays = jax.tree.unflatten(structure, leaves)
-        closed, args = eqx.combine(arrays, static)
-        return closed(*args)
+        function, args = eqx.combine(arrays, static)
+        return function(*args)
 
     program, shapes = jax.make_jaxpr(evaluate, return_shape=True)(*leaves)
     outs = _lanes.bind(*leaves, program=program, batches=())

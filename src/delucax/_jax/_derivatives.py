@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -119,3 +120,77 @@ batching.primitive_batchers[_nan_tangent] = _batch
 ad.defjvp(_nan_tangent, lambda change, _, ok: _nan_tangent.bind(change, ok), None)
 ad.primitive_transposes[_nan_tangent] = _transpose
 mlir.register_lowering(_nan_tangent, mlir.lower_fun(_value, multiple_results=False))
+
+
+def deferred(
+    function: Callable[[Any, Any], Array], like: Array, given: Any, tangents: Any
+) -> Array:
+    """`function(given, tangents)`, an array like `like`, linear in the tangents.
+
+    It is traced where its value or its transpose is needed, and not where it is called:
+    a tangent that nothing depends on costs no compilation. It must not close over
+    arrays.
+    """
+    arrays, static = eqx.partition(given, eqx.is_array)
+    leaves, structure = jax.tree.flatten((arrays, tangents))
+    linear = len(jax.tree.leaves(tangents))
+
+    def evaluate(*leaves):
+        arrays, tangents = jax.tree.unflatten(structure, leaves)
+        return function(eqx.combine(arrays, static), tangents)
+
+    out = jax.typeof(like)
+    return _deferred.bind(*leaves, function=evaluate, linear=linear, out=out)
+
+
+_deferred = Primitive("deferred")
+"""The function, of which the last `linear` arguments are the tangents, and its type."""
+
+
+def _deferred_value(*values, function, **_):
+    return function(*values)
+
+
+def _deferred_batch(values, dims, *, function, linear, out):
+    size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
+    params: dict[str, Any] = dict(
+        function=jax.vmap(function, dims, axis_size=size),
+        linear=linear,
+        out=out.update(shape=(size, *out.shape)),
+    )
+    return _deferred.bind(*values, **params), 0
+
+
+def _deferred_jvp(primals, tangents, *, function, **params):
+    out = _deferred.bind(*primals, function=function, **params)
+    split = len(primals) - params["linear"]
+    changes = [ad.instantiate_zeros(t) for t in tangents]
+    if all(type(t) is ad.Zero for t in tangents[:split]):
+        inputs = *primals[:split], *changes[split:]
+        return out, _deferred.bind(*inputs, function=function, **params)
+    return out, jax.jvp(function, primals, tuple(changes))[1]
+
+
+def _deferred_transpose(cotangent, *values, function, **_):
+    unknown = [ad.is_undefined_primal(value) for value in values]
+    if type(cotangent) is ad.Zero:
+        return [None] * len(values)
+
+    def linear(*tangents):
+        left = iter(tangents)
+        pairs = zip(unknown, values, strict=True)
+        return function(*(next(left) if free else value for free, value in pairs))
+
+    like = [v.aval for v, free in zip(values, unknown, strict=True) if free]
+    back = iter(jax.linear_transpose(linear, *like)(cotangent))
+    return [next(back) if free else None for free in unknown]
+
+
+_deferred.def_impl(_deferred_value)
+_deferred.def_abstract_eval(lambda *_, out, **params: out)
+batching.primitive_batchers[_deferred] = _deferred_batch
+ad.primitive_jvps[_deferred] = _deferred_jvp
+ad.primitive_transposes[_deferred] = _deferred_transpose
+mlir.register_lowering(
+    _deferred, mlir.lower_fun(_deferred_value, multiple_results=False)
+)

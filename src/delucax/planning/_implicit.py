@@ -15,7 +15,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._jax import by_lanes, nan_tangent
+from .._jax import by_lanes, deferred, hoisted, nan_tangent
 from .._results import RESULTS
 from ..math import matvec
 from ..math._linear_solve import full_precision
@@ -42,22 +42,33 @@ STIFFER = 10.0
 """The weight of the constraints in it, relative to the planner's last one."""
 
 
-@eqx.filter_custom_jvp
 def solution(problem: Problem, start: Start, options: Options) -> Outcome:
     """The outcome of the iteration, differentiable with respect to the problem."""
-    return by_lanes(with_constraints, problem, start, options)
+    # Traced here: a derivative repeats the program, not the tracing of it.
+    iteration = hoisted(with_constraints, problem, start, options)
+    return _solution(iteration, problem, start, options)
 
 
-@solution.def_jvp
+@eqx.filter_custom_jvp
+def _solution(iteration: Any, *given: Any) -> Outcome:
+    return by_lanes(iteration, *given)
+
+
+@_solution.def_jvp
 @full_precision
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
-    out = solution(*primals)
-    change = tangents[0]
+    closed_over, change, *_ = tangents
+    if jax.tree.leaves(closed_over):
+        raise ValueError(
+            "ILQR: the dynamics, the cost or a constraint closes over a number that is "
+            "differentiated. Make it a field of a module, a `delucax.parameter()`."
+        )
+    out = _solution(*primals)
     # None is a tangent of zero that is known to be one.
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
-    return out, nothing._replace(**_tangents(out, primals, change))
+    return out, nothing._replace(**_tangents(out, primals[1:], change))
 
 
 @products_whole()
@@ -80,17 +91,27 @@ def _tangents(out: Outcome, primals: Any, change: Any) -> dict[str, Array]:
     dX, dU, dy, free, definite = _change(X, U, y, problem, given, varied, change)
     cost = lambda varied, X, U: given(varied).total(X, U)
 
-    def gains(varied, X, U, y):
-        problem = given(varied).with_multipliers(y)
-        stages = model(problem, X, U, None, options.second_order)
-        if options.parallel:
-            return in_parallel(stages, out.regularisation).K
-        on_state = options.regularise == "state"
-        return in_sequence(stages, out.regularisation, on_state, None, free).K
+    @full_precision
+    @products_whole()
+    def gains(given, tangents):
+        """The tangent of the gains of the last backward pass, which depend on the
+        problem and the solution alone."""
+        varied, rest, X, U, y, mu, free = given
 
-    # The gains of the last backward pass depend on the problem and the solution alone.
+        def after(varied, X, U, y):
+            problem = eqx.combine(varied, rest).with_multipliers(y)
+            stages = model(problem, X, U, None, options.second_order)
+            if options.parallel:
+                return in_parallel(stages, mu).K
+            on_state = options.regularise == "state"
+            return in_sequence(stages, mu, on_state, None, free).K
+
+        return jax.jvp(after, (varied, X, U, y), tangents)[1]
+
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
-    _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
+    # Few need it, and it takes the third derivatives of the problem.
+    about = varied, rest, X, U, y, out.regularisation, free
+    dK = deferred(gains, out.gains, about, (change, dX, dU, dy))
     ok = solved & definite
     dX, dU, dK, dJ = (nan_tangent(d, ok) for d in (dX, dU, dK, dJ))
     return dict(states=dX, controls=dU, gains=dK, cost=dJ)
