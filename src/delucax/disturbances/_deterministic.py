@@ -126,8 +126,11 @@ class Sinusoid(AbstractEntrywise):
     offset: Real = parameter(0.0)
     size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
-    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
+        return self._wave(times)
+
+    @eqx.filter_jit
+    def _wave(self, times: Vector) -> Rows:
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
         return self._rows(self.amplitude * sin(angle) + self.offset, times)
 

@@ -48,9 +48,12 @@ class Gaussian(AbstractEntrywise):
     def __check_init__(self):
         check_range(self.std, "std", "Gaussian")
 
-    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
-        w = normal(check_key(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
+        return self._draw(check_key(key, "Gaussian"), times)
+
+    @eqx.filter_jit
+    def _draw(self, key: PRNGKey, times: Vector) -> Rows:
+        w = normal(key, (times.shape[0], self.size), times.dtype)
         return (self.std * w + self.mean).astype(times.dtype)
 
 
@@ -84,11 +87,12 @@ class Uniform(AbstractEntrywise):
     def __check_init__(self):
         check_range(self.high, "high", "Uniform", self.low)
 
-    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
-        w = jr.uniform(
-            check_key(key, "Uniform"), (times.shape[0], self.size), times.dtype
-        )
+        return self._draw(check_key(key, "Uniform"), times)
+
+    @eqx.filter_jit
+    def _draw(self, key: PRNGKey, times: Vector) -> Rows:
+        w = jr.uniform(key, (times.shape[0], self.size), times.dtype)
         return (self.low + (self.high - self.low) * w).astype(times.dtype)
 
 
@@ -125,10 +129,12 @@ class RandomWalk(AbstractEntrywise):
         check_range(self.std, "std", "RandomWalk")
         check_range(self.bound, "bound", "RandomWalk")
 
-    @eqx.filter_jit
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
-        shape = (times.shape[0], self.size)
-        e = normal(check_key(key, "RandomWalk"), shape, times.dtype)
+        return self._draw(check_key(key, "RandomWalk"), times)
+
+    @eqx.filter_jit
+    def _draw(self, key: PRNGKey, times: Vector) -> Rows:
+        e = normal(key, (times.shape[0], self.size), times.dtype)
         # In the precision of the times, as the carry of a scan must keep its type.
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
