@@ -1,7 +1,7 @@
 """Derivatives in the mode that solvers support, and NaN tangents of failed solves."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun, Primitive
 from jax.flatten_util import ravel_pytree
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
@@ -65,7 +65,13 @@ def value_and_jacobians(
             point, direction = lax.optimization_barrier((joined, direction))
             return jax.jvp(lambda z: f(*split(z)), (point,), (direction,))
 
-        values, rows = lax.map(along, jnp.eye(joined.size, dtype=joined.dtype))
+        # A solver without forward mode would be refused by XLA alone, too late for
+        # another way. It stands in the program as this primitive.
+        directions = jnp.eye(joined.size, dtype=joined.dtype)
+        traced = jax.make_jaxpr(along)(directions[0])
+        if "custom_lin" in _primitives(traced.jaxpr):
+            raise TypeError("A solver inside has no forward mode.")
+        values, rows = lax.map(jaxpr_as_fun(traced), directions)
         return rows.T, values[0]
 
     in_loop = in_loop and joined.size <= _LOOPED_UP_TO
@@ -73,6 +79,15 @@ def value_and_jacobians(
     J, value = first_possible(forward, jax.jacrev(twice, has_aux=True))(joined)
     ends = np.cumsum([arg.size for arg in args])
     return value, jnp.split(J, ends[:-1], axis=1)
+
+
+def _primitives(jaxpr: Any) -> Iterator[str]:
+    """The names of the operations of a program, those of nested ones included."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for leaf in jax.tree.leaves(list(equation.params.values())):
+            if isinstance(leaf, ClosedJaxpr | Jaxpr):
+                yield from _primitives(getattr(leaf, "jaxpr", leaf))
 
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
