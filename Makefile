@@ -20,6 +20,9 @@ pip := $(bin)/python -m pip --disable-pip-version-check -qq
 # The tests run one process a core, so that each process keeps to one thread.
 one_thread := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
 	XLA_FLAGS="--xla_cpu_multi_thread_eigen=false $$XLA_FLAGS"
+# The checks of annotations take a seventh of the time, and those in single precision see
+# the same code.
+unhooked := --jaxtyping-packages=
 pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8 --dist worksteal
 
 # The tests keep compiled programs on disk by themselves; notebooks are told to.
@@ -64,7 +67,8 @@ test-float32: $(VENV)/.tests ## the tests in single precision
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	JAX_ENABLE_X64=1 $(pytest) $(examples) --ignore tests/plotting $(PYTEST_ARGS)
+	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
+		$(PYTEST_ARGS)
 
 .PHONY: thorough
 thorough: $(VENV)/.tests ## the tests that `test` leaves out: they take long
