@@ -209,8 +209,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--x64", action="store_true", help="in double precision")
     parser.add_argument("--cache", action="store_true", help="a second process, too")
-    parser.add_argument("--out", default=None)
+    parser.add_argument("--out", help="file to write")
     options = parser.parse_args()
+    if options.out and Path(options.out).is_dir():
+        parser.error(f"--out must be a file, got the folder {options.out}.")
     if options.answer:
         print(json.dumps(answer(options.answer)))
         return
