@@ -80,10 +80,11 @@ def hinf_dare(
     end, as the equation alone also has solutions that solve no game. At a given `gamma`
     it is differentiable to any order, in either mode, by the implicit function theorem.
 
-    Without `gamma`, the least one is found by bisection, and has first derivatives. All
-    else is then differentiated at that level, held fixed, and is steep where the
-    saddle point vanishes just below it. Use `gamma=1.05 * hinf_dare(...).gamma` for a
-    design with derivatives that follow the level.
+    Without `gamma`, secants and bisection find the least one, which has first
+    derivatives. All else is then differentiated at that level, held fixed, and is steep
+    where the saddle point vanishes just below it. Use
+    `gamma=1.05 * hinf_dare(...).gamma` for a design with derivatives that follow the
+    level.
 
     **Arguments:**
 

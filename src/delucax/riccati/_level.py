@@ -1,4 +1,4 @@
-"""A game at a level, or at its least one by bisection, and the level's derivative."""
+"""A game at a level, or at the least one, and the level's derivative."""
 
 import functools
 from collections.abc import Callable
