@@ -199,6 +199,9 @@ def test_wrong_arguments(change, match):
 
 
 @once
+@pytest.mark.skipif(
+    jax.__version_info__ < (0, 12), reason="XLA compiled small loops in other ways"
+)
 def test_a_small_program():
     """Of few operations, all but a few of them in loops that XLA on CPU compiles as a
     whole. A call of a library in one of the loops would end that."""
