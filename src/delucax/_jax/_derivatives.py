@@ -9,7 +9,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun, Primitive
+from jax.extend.core import jaxpr_as_fun, Primitive
 from jax.flatten_util import ravel_pytree
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
@@ -69,7 +69,7 @@ def value_and_jacobians(
         # another way. It stands in the program as this primitive.
         directions = jnp.eye(joined.size, dtype=joined.dtype)
         traced = jax.make_jaxpr(along)(directions[0])
-        if "custom_lin" in _primitives(traced.jaxpr):
+        if "custom_lin" in _primitives(traced):
             raise TypeError("A solver inside has no forward mode.")
         values, rows = lax.map(jaxpr_as_fun(traced), directions)
         return rows.T, values[0]
@@ -86,8 +86,8 @@ def _primitives(jaxpr: Any) -> Iterator[str]:
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         for leaf in jax.tree.leaves(list(equation.params.values())):
-            if isinstance(leaf, ClosedJaxpr | Jaxpr):
-                yield from _primitives(getattr(leaf, "jaxpr", leaf))
+            if hasattr(leaf, "eqns"):
+                yield from _primitives(leaf)
 
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
