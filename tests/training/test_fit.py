@@ -140,6 +140,17 @@ def test_optimisers_are_equal_if_made_in_the_same_way():
     assert Optimiser(makers[5]()) != made[5][0]
 
 
+def test_an_optimiser_may_close_over_what_has_no_value_yet():
+    adam = optax.adam(0.1)
+
+    def update(updates, state, params=None):
+        return later(updates), state
+
+    optimiser = Optimiser(optax.GradientTransformation(adam.init, update))
+    assert optimiser == optimiser and optimiser != Optimiser(adam)
+    later = lambda updates: updates
+
+
 def test_weakly_typed_leaves_stay_so():
     model = Line()
     assert model.slope.weak_type

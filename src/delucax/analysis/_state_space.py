@@ -160,11 +160,11 @@ def expanded_gain(
         coupling = _adjoint(G1 @ vectors) @ (G @ vector)
         coupling = coupling + _adjoint(G @ vectors) @ (G1 @ vector)
         mixed = inner(coupling, weights * coupling)
-    at, along, bent = G @ vector, G1 @ vector, G2 @ vector
+    at, first, second = G @ vector, G1 @ vector, G2 @ vector
     gain = norm(at)
     divisor = xp.where(gain > 0, gain, 1)
-    slope = inner(at, along) / divisor
-    curvature = inner(along, along) + inner(at, bent) + mixed - slope**2
+    slope = inner(at, first) / divisor
+    curvature = inner(first, first) + inner(at, second) + mixed - slope**2
     return gain, slope, curvature / divisor
 
 

@@ -1,7 +1,7 @@
 """Optimisers that are equal if they are made in the same way."""
 
 import functools
-from types import FunctionType
+from types import CellType, FunctionType
 from typing import Any
 
 import optax
@@ -36,7 +36,7 @@ def _content(value: Any, *inside: Any) -> Any:
         return kind
     parts = functools.partial(_contents, inside=(*inside, value))
     if kind is FunctionType:
-        cells = parts(cell.cell_contents for cell in value.__closure__ or ())
+        cells = parts(map(_held, value.__closure__ or ()))
         defaults = parts((value.__defaults__, value.__kwdefaults__))
         return value.__code__, id(value.__globals__), cells, defaults
     if kind is functools.partial:
@@ -54,3 +54,11 @@ def _content(value: Any, *inside: Any) -> Any:
 
 def _contents(values: Any, inside: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(_content(value, *inside) for value in values)
+
+
+def _held(cell: CellType) -> Any:
+    """What a function closes over; the cell itself where it has no value yet."""
+    try:
+        return cell.cell_contents
+    except ValueError:
+        return cell
