@@ -1,5 +1,6 @@
 """Analysis of linear models: poles and zeros, Gramians, norms, margins."""
 
+from ._disk_margin import disk_margin as disk_margin, DiskMargin as DiskMargin
 from ._gains import (
     dcgain as dcgain,
     frequency_response as frequency_response,
@@ -13,12 +14,7 @@ from ._gramians import (
     observability_gramian as observability_gramian,
     observability_matrix as observability_matrix,
 )
-from ._margins import (
-    disk_margin as disk_margin,
-    DiskMargin as DiskMargin,
-    Margins as Margins,
-    margins as margins,
-)
+from ._margins import Margins as Margins, margins as margins
 from ._modes import (
     is_controllable as is_controllable,
     is_detectable as is_detectable,
