@@ -52,3 +52,15 @@ def test_closing_over_what_is_differentiated_is_refused(derivative):
 
     with pytest.raises(ValueError, match="closes over a number that is"):
         jax.jit(derivative(best))(2.0)
+
+
+@once
+def test_closing_over_what_is_traced_outside_is_refused_in_a_derivative():
+    def best(x0, p):
+        stage = lambda t, x, u: p * x @ x + u @ u
+        cost = dlx.costs.Function(stage, lambda t, x: x @ x)
+        return dlx.planning.ilqr(DYNAMICS, cost, x0, np.zeros((5, 1))).cost
+
+    assert jax.jit(best)(X0, 2.0) > 0
+    with pytest.raises(ValueError, match="that a transformation outside traces"):
+        jax.jit(jax.grad(best))(X0, 2.0)

@@ -46,11 +46,15 @@ def solution(problem: Problem, start: Start, options: Options) -> Outcome:
     """The outcome of the iteration, differentiable with respect to the problem."""
     # Traced here: a derivative repeats the program, not the tracing of it.
     iteration = hoisted(with_constraints, problem, start, options)
-    return _solution(iteration, problem, start, options)
+    closed_over = jax.tree.leaves(iteration)
+    # The derivative, traced elsewhere, would meet it as a tracer that has escaped.
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in closed_over)
+    return _solution(iteration, problem, start, options, traced)
 
 
 @eqx.filter_custom_jvp
 def _solution(iteration: Any, *given: Any) -> Outcome:
+    *given, _ = given
     return by_lanes(iteration, *given)
 
 
@@ -58,17 +62,19 @@ def _solution(iteration: Any, *given: Any) -> Outcome:
 @full_precision
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     closed_over, change, *_ = tangents
-    if jax.tree.leaves(closed_over):
+    *given, traced = primals[1:]
+    if traced or jax.tree.leaves(closed_over):
         raise ValueError(
             "ILQR: the dynamics, the cost or a constraint closes over a number that is "
-            "differentiated. Make it a field of a module, a `delucax.parameter()`."
+            "differentiated, or that a transformation outside traces. Make it a field "
+            "of a module, a `delucax.parameter()`."
         )
     out = _solution(*primals)
     # None is a tangent of zero that is known to be one.
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
-    return out, nothing._replace(**_tangents(out, primals[1:], change))
+    return out, nothing._replace(**_tangents(out, given, change))
 
 
 @products_whole()
