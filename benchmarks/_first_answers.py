@@ -363,8 +363,9 @@ for _kind, _adaptive in (("fixed steps", False), ("adaptive steps", True)):
     case(_peer)(diffeqsolve(_adaptive))
 
 
-def quadrotor(constrained: bool) -> Callable[[], tuple[Thunk, ...]]:
-    """A plan of 50 steps of the planar quadrotor."""
+def quadrotor(constrained: bool, start: Any) -> Callable[[], tuple[Thunk, ...]]:
+    """A plan of 50 steps of the planar quadrotor, from controls or from where
+    delucax finds that they should be."""
 
     def prepare():
         import jax.numpy as jnp
@@ -375,14 +376,16 @@ def quadrotor(constrained: bool) -> Callable[[], tuple[Thunk, ...]]:
         x0 = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
         low = lambda t, x, u: 0.2 - x[1] - 0.3 * x[0]
         constraints = dlx.planning.Constraints(low) if constrained else None
-        given = env.dynamics, env.cost, x0, 50
+        given = env.dynamics, env.cost, x0, start
         return (lambda: dlx.planning.ilqr(*given, constraints=constraints),)
 
     return prepare
 
 
-case("ilqr of the quadrotor", 2.0)(quadrotor(False))
-case("ilqr of the quadrotor, a state constraint", 3.0)(quadrotor(True))
+_zero = np.zeros((50, 2))
+case("ilqr of the quadrotor", 2.0)(quadrotor(False, _zero))
+case("ilqr of the quadrotor, a state constraint", 3.0)(quadrotor(True, _zero))
+case("ilqr of the quadrotor, the default start")(quadrotor(False, 50))
 
 
 @case("MPC, first step", 2.0)
