@@ -157,6 +157,7 @@ def assert_same_leaf(a, b):
         assert a == b
 
 
+@once
 @pytest.mark.parametrize("name", THINGS)
 def test_round_trip_is_exact(name, tmp_path):
     thing = THINGS[name]()

@@ -94,7 +94,9 @@ def test_finite_on_many(name, seed, edges):
 
 @needs_x64
 @every
-def test_linearisation_is_the_central_difference(name):
+def test_derivatives_are_central_differences(name):
+    """The linearisation entry by entry, and the gradient with respect to every constant
+    along a direction."""
     system = system_of(name)
     held = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
     x, u = (one[0] for one in drawn(name, 1, seed=2))
@@ -113,6 +115,25 @@ def test_linearisation_is_the_central_difference(name):
         a, b, c, d = jnp.split(f, 4)
         slopes = (8 * (a - b) - (c - d)) / (12 * h)
         return dlx.linearize(system, 0.0, *jnp.split(z, cuts)[:2]), slopes, field(z)
+
+    rng = np.random.default_rng(5)
+    theta, unravel = ravel_pytree(eqx.filter(system, eqx.is_inexact_array))
+    rest = eqx.filter(system, eqx.is_inexact_array, inverse=True)
+    weight = rng.normal(size=system.state_size)
+
+    @jax.jit
+    @jax.value_and_grad
+    def weighed(theta):
+        one = eqx.combine(unravel(theta), rest)
+        return weight @ one.vector_field(0.0, x, u, held)
+
+    way = rng.normal(size=theta.size) * (np.abs(theta) + 0.01)
+    value, gradient = weighed(theta)
+    f = [weighed(theta + s * 1e-4 * way)[0] for s in (2, 1, -1, -2)]
+    quotient = (8 * (f[1] - f[2]) - (f[0] - f[3])) / (12 * 1e-4)
+    assert np.all(np.isfinite(gradient))
+    close = 1e-8 * (1 + abs(value) + abs(quotient))
+    assert_close(np.dot(gradient, way), quotient, atol=close)
 
     model, slopes, dx = both(system, z)
     blocks = [model.A, model.B] + ([] if model.E is None else [model.E])
@@ -138,8 +159,13 @@ def test_equilibria_rest(name):
     assert x.dtype == u.dtype == jnp.zeros(()).dtype
 
 
+# A field of forces, one with a constraint on the state, one with disturbances.
+ROLLED = [n for n in SYSTEMS if n in ("Acrobot", "Quadrotor")]
+ROLLED += [n for n in SYSTEMS if "vortices" in n]
+
+
 @needs_x64
-@every
+@pytest.mark.parametrize("name", ROLLED)
 def test_gradient_of_a_rollout(name):
     """The gradient of a rollout with respect to the start, the controls and every
     constant, along a direction, against its difference quotient."""

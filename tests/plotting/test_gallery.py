@@ -37,7 +37,7 @@ def test_pictures_move_and_are_small():
 
 
 # `test_drawings` draws every system.
-DRAWN = {"pendulum", "cartpole", "lds", "balloon_lung"}
+DRAWN = {"pendulum", "balloon_lung"}
 
 
 def test_code_of_the_page_draws_its_pictures(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -141,6 +142,14 @@ def test_what_passed_the_limit_is_not_saved(tmp_path):
 
 
 def test_tuned_pids_are_the_best_that_were_tried(tmp_path, monkeypatch):
+    """The training itself is that of `test_learning`: here it makes them stronger."""
+
+    def stronger(envs, pids, *, steps, **options):
+        gain = lambda pid: pid.first.kp
+        model = eqx.tree_at(gain, pids, 1.5 * gain(pids))
+        return SimpleNamespace(model=model, history={"diverged": np.zeros(steps)})
+
+    monkeypatch.setattr(lung, "train_controllers", stronger)
     monkeypatch.delitem(_contenders._TUNED_KINDS, "leaky PID")  # compiles as long
     waveform = lung.BreathWaveform()
     envs = stack([lung.single_compartment(resistance=R) for R in (5.0, 50.0)])
@@ -165,15 +174,17 @@ def test_pids_are_drawn_over_orders_of_magnitude(name, most):
     assert type(pids) is kind and pids.kp.shape == (400,)
     ranges = (pids.kp, 0.03, 8.0), (pids.ki, 0.05, 40.0), (pids.kd, most / 70, most)
     for gains, low, high in ranges:
+        gains = np.asarray(gains)
         # Half of the PIDs have no derivative.
         used = gains[gains > 0]
         assert len(used) == 400 or 150 < len(used) < 250
-        assert low <= jnp.min(used) < 2 * low and high / 2 < jnp.max(used) <= high
+        assert low <= np.min(used) < 2 * low and high / 2 < np.max(used) <= high
     for values in (forwards.gain, forwards.offset):
-        assert 150 < jnp.sum(values == 0) < 250
+        assert 150 < np.sum(np.asarray(values) == 0) < 250
     # Each of them runs.
-    runs = eqx.filter_vmap(lambda one: one(0.0, jnp.array([5.0]), one.init())[0])(drawn)
-    assert jnp.all(jnp.isfinite(runs)) and len(jnp.unique(runs)) == 400
+    run = eqx.filter_vmap(lambda one: one(0.0, jnp.array([5.0]), one.init())[0])
+    runs = np.asarray(eqx.filter_jit(run)(drawn))
+    assert np.all(np.isfinite(runs)) and len(np.unique(runs)) == 400
 
 
 def test_what_has_no_finite_error_is_not_chosen():
