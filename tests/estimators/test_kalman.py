@@ -237,14 +237,7 @@ def test_angles_wrap():
 
 def noisy(log_levels, stiffness):
     """A filter of an oscillator whose constants are all unknown."""
-
-    def field(t, x, u, w):
-        return jnp.stack([x[1], u[0] - stiffness * x[0] - 0.1 * x[1]])
-
-    system = dlx.system(field, states=("x", "v"), controls=("force",))
-    dynamics = dlx.Discretized(system, dt=0.2)
-    dynamics = dlx.linearize(dynamics, 0.0, jnp.zeros(2), jnp.zeros(1))
-    dynamics = eqx.tree_at(lambda d: d.C, dynamics, C)
+    dynamics = dlx.LinearDynamics(A.at[1, 0].set(-0.2 * stiffness), B, C, dt=0.2)
     q, r = jnp.exp(log_levels)
     return c.KalmanFilter(dynamics, q * jnp.eye(2), r * jnp.eye(1))
 

@@ -244,12 +244,12 @@ RATES = ("system.k0", "system.UA")
 def reactor(k0=1.0, UA=1.0, E=1.0, unit=1.0):
     """With parameters that are off by these factors."""
     system = Reactor(7.2e10 * k0 / unit, 2.092 * UA, 8750.0 * E, unit)
-    return dlx.Discretized(system, 0.05, diffrax.Euler(), substeps=8)
+    return dlx.Discretized(system, dt=0.05, substeps=4)
 
 
 def reacted(seed=0):
     """200 steps under a new jacket temperature every other step."""
-    levels = np.random.default_rng(1002).uniform(280.0, 320.0, size=(100, 1))
+    levels = jr.uniform(jr.key(1002), (100, 1), minval=280.0, maxval=320.0)
     controls = np.repeat(levels, 2, 0)
     states = np.asarray(open_loop(reactor(), jnp.array([0.5, 350.0]), controls))
     drawn = np.random.default_rng(seed).normal(size=states.shape)
