@@ -72,14 +72,14 @@ def test_moments_of_a_square(alpha):
     expected = mean**2 + variance
     S = 4 * mean**2 * variance + 2 * variance**2 + V
     gain = 2 * mean * variance / S
-    after = ukf.update(0.0, y, ukf.init())
+    after = eqx.filter_jit(ukf.update)(0.0, y, ukf.init())
     close = dict(rtol=1e-12)
     assert_close(after.mean, [mean + gain * (2.0 - expected)], **close)
     assert_close(after.covariance, [[variance - gain**2 * S]], **close)
     ekf = EKF(dynamics, jnp.eye(1), [[V]], **options)
     S = 4 * mean**2 * variance + V
     gain = 2 * mean * variance / S
-    after = ekf.update(0.0, y, ekf.init())
+    after = eqx.filter_jit(ekf.update)(0.0, y, ekf.init())
     assert_close(after.mean, [mean + gain * (2.0 - mean**2)], **close)
 
 

@@ -45,11 +45,12 @@ def test_no_bounded_sequence_is_worse():
     tried *= 0.5 / np.linalg.norm(tried, axis=2, keepdims=True)
     steady = np.stack([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 60)])
     steady = np.broadcast_to(0.5 * steady[:, None], (60, 30, 2))
-    (own, *others), (g, *_) = costs(np.concatenate([[found.w], tried, steady]))
+    values = costs(np.concatenate([[found.w], tried, steady]))
+    (own, *others), (g, *_) = map(np.asarray, values)
     assert_close(found.total_cost, own, rtol=1e-12)
     assert found.total_cost > 1.0001 * np.max(others)
     # A local maximum: each step already goes along its own gradient.
-    along = np.sum(np.asarray(g) * found.w, axis=1)
+    along = np.sum(g * found.w, axis=1)
     assert_close(along, 0.5 * np.linalg.norm(g, axis=1), rtol=1e-3, atol=1e-2)
 
 
