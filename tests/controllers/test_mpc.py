@@ -79,11 +79,11 @@ def test_every_planner_balances(kind, options):
     env, _ = regulated()
     planner = getattr(dlx.planning, kind)(**options)
     mpc = MPC(env.dynamics, env.cost, 12, planner=planner, bounds=(-2.0, 2.0))
-    held = dlx.rollout(env, mpc, key=KEY)
-    fallen, x = 0.0, np.asarray(env.initial_state)
-    for _ in range(12):
+    held = dlx.rollout(env, mpc, key=KEY, horizon=40)
+    fallen, x = 0.0, np.array([0.5, -0.3])
+    for _ in range(40):
         fallen, x = fallen + x @ x, np.asarray(A) @ x
-    assert held.total_cost < 0.2 * (fallen + x @ np.asarray(env.cost.final) @ x)
+    assert held.total_cost < 0.2 * fallen
     assert np.all(np.abs(held.controls) <= 2)
 
 
@@ -182,21 +182,18 @@ def test_a_stall_at_rounding_is_no_failed_plan():
     of a cost, with more to gain than rounding, is a failed plan."""
     env, _, cost = reactor()
     env = dlx.Environment(env.dynamics, cost, control_bounds=(280.0, 320.0))
+    mpc = MPC(env.dynamics, cost, 30, bounds=env.control_bounds, planner=LONG)
+    run = dlx.rollout(env, mpc, key=KEY, x0=jnp.array([0.6495, 346.71]), horizon=20)
+    assert run.states.dtype == jnp.float32
+    assert run.incident_counts["failed_plan"] == 0
     kinked = dlx.make("pendulum")
-    for task, charged, x0, steps, failed in (
-        (env, cost, [0.6495, 346.71], 20, 0),
-        (kinked, kinked.cost, [1.0, 0.0], 3, 3),
-    ):
-        mpc = MPC(
-            task.dynamics,
-            charged,
-            30,
-            bounds=task.control_bounds,
-            planner=dlx.planning.ILQR(50),
-        )
-        run = dlx.rollout(task, mpc, key=KEY, x0=jnp.array(x0), horizon=steps)
-        assert run.states.dtype == jnp.float32
-        assert run.incident_counts["failed_plan"] == failed
+    given = kinked.dynamics, kinked.cost, 30
+    mpc = MPC(*given, bounds=kinked.control_bounds, planner=LONG)
+    _, state = eqx.filter_jit(mpc)(0.0, jnp.array([1.0, 0.0]), mpc.init())
+    assert state.failures.count == 1
+
+
+LONG = dlx.planning.ILQR(50)
 
 
 @needs_x64
@@ -226,7 +223,7 @@ def test_the_first_plan_on_an_unstable_plant():
         assert failures == 0
 
 
-@once
+@needs_x64
 def test_a_start_of_ones_own():
     env, lqr, cost = reactor()
     given = env.dynamics, cost, 30
@@ -235,19 +232,17 @@ def test_a_start_of_ones_own():
     law = dlx.planning.Start(
         held, jnp.tile(lqr.x_ref, (31, 1)), jnp.tile(lqr.K, (30, 1, 1))
     )
-    line = jnp.tile(lqr.x_ref, (31, 1))
     act = eqx.filter_jit(lambda mpc: mpc(0.0, x0, mpc.init())[0])
     controls = {}
     for name, options in {
         "default": {},
         "other controls": dict(start=held + 5.0),
         "a law": dict(start=law),
-        "states": dict(planner=dlx.planning.ILQR(states=line)),
         "alone": dict(start=dlx.planning.Start(held)),
     }.items():
         mpc = MPC(*given, bounds=(280.0, 320.0), throw=False, **options)
         controls[name] = np.asarray(act(mpc))
-    for name in ("other controls", "a law", "states"):
+    for name in ("other controls", "a law"):
         assert_close(controls[name], controls["default"], atol=0.02)
     assert np.abs(controls["alone"] - controls["default"]) > 1
     assert MPC(*given, start=held + 5.0).start.controls[1, 0, 0] == held[0, 0] + 5

@@ -1,4 +1,8 @@
-"""Lungs learned from breaths, and controllers learned in lungs."""
+"""Lungs learned from breaths, and controllers learned in lungs.
+
+Precision plays no part: what compiles for long runs in double precision, where nothing
+checks annotations; the examples of the functions run with those checks.
+"""
 
 import diffrax
 import equinox as eqx
@@ -7,15 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, once, user_error
+from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
 from delucax import lung
 from delucax._module import stack, unstack
 from delucax.studies.ventilator._contenders import FeedForward
 
-
-pytestmark = once
 
 KEY = jax.random.key(0)
 
@@ -40,6 +42,7 @@ def learned(breaths, **options):
     return lung.LearnedLung(breaths, **(small | options), key=KEY)
 
 
+@needs_x64
 @pytest.mark.parametrize("published", [False, True])
 def test_prediction_is_what_the_dynamics_do(breaths, published):
     model = learned(breaths, boundary=2, published=published)
@@ -61,6 +64,7 @@ def test_prediction_is_what_the_dynamics_do(breaths, published):
     assert len(model.state_names) == model.state_size
 
 
+@needs_x64
 def test_fitting_learns(breaths):
     train, test = breaths[:24], breaths[24:]
     model = learned(train)
@@ -74,6 +78,7 @@ class Asked(Exception):
     pass
 
 
+@once
 def test_another_optimiser(breaths):
     """Of both parts."""
 
@@ -89,6 +94,7 @@ def test_another_optimiser(breaths):
         lung.fit_lungs(model, breaths, key=KEY, teacher_steps=-1)
 
 
+@needs_x64
 def test_physics_is_found(breaths):
     path = "dynamics.dynamics.system."
     start = single(10.0, 30.0)
@@ -105,6 +111,7 @@ def euler_task(resistance):
     return lung.single_compartment(resistance=resistance, solver=diffrax.Euler())
 
 
+@needs_x64
 def test_controller_learns_and_the_grid_knows_the_best():
     models = stack([single(R) for R in (5.0, 50.0)])
     simulated = eqx.filter_vmap(lambda m: lung.learned_lung(m, noise=0.2))(models)
@@ -131,6 +138,7 @@ def test_controller_learns_and_the_grid_knows_the_best():
     assert least[0] < own[0]
 
 
+@once
 def test_a_learned_lung_is_corrected_by_what_is_read(breaths):
     model = learned(breaths)
     before = model.resting()
@@ -140,6 +148,7 @@ def test_a_learned_lung_is_corrected_by_what_is_read(breaths):
     assert np.sum(np.asarray(after != before)) == 1
 
 
+@once
 def test_an_alarm_costs_more_than_an_error():
     cost = lung.BreathCost(lung.BreathWaveform(), index=2, limit=45.0)
     u = jnp.zeros(2)
@@ -149,6 +158,7 @@ def test_an_alarm_costs_more_than_an_error():
     assert_close(lower(0.5, jnp.array([0.0, 0.0, 44.0]), u), 24.0)
 
 
+@once
 def test_expiration_counts_if_it_is_told_to():
     x, u = jnp.array([0.0, 0.0, 9.0]), jnp.zeros(2)  # 4 above PEEP
     assert_close(lung.BreathCost(lung.BreathWaveform(), 2)(2.0, x, u), 0.0)
@@ -159,6 +169,7 @@ def test_expiration_counts_if_it_is_told_to():
         dlx.make("lung/single_compartment", expiration_weight=-1.0)
 
 
+@once
 def test_stacks_come_apart():
     lungs = [lung.SingleCompartment(R) for R in (5.0, 20.0)]
     both = stack(lungs)
@@ -172,6 +183,7 @@ def test_stacks_come_apart():
         stack([])
 
 
+@once
 def test_a_damaged_checkpoint_is_refused(breaths, tmp_path):
     path = tmp_path / "lungs.fit"
     path.write_bytes(b"delucax-file 1 0000\nnonsense")
@@ -182,6 +194,7 @@ def test_a_damaged_checkpoint_is_refused(breaths, tmp_path):
         )
 
 
+@once
 def test_wrong_arguments(breaths):
     with user_error(match="kind must be 'mlp' or 'cnn', got 'rnn'"):
         lung.BreathPolicy(lung.BreathWaveform(), 0.03, "rnn", key=KEY)
@@ -204,6 +217,7 @@ class Root(dlx.AbstractController):
         return 10 * jnp.sqrt(self.gain)[None].astype(y.dtype), state
 
 
+@needs_x64
 @pytest.mark.parametrize("shared", [False, True])
 def test_those_that_diverge_harm_no_other(shared):
     env = lung.learned_lung(single(20.0))
