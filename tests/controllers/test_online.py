@@ -52,8 +52,6 @@ def follow(env, controller, x0, w):
 PENDULUM = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
 LEARNERS = {
     "GPC": lambda d, cost: c.gpc(d, cost),
-    "SFC": lambda d, cost: c.sfc(d, cost, memory=6, filters=2),
-    "NeuralGPC": lambda d, cost: c.neural_gpc(d, cost, width=3, key=jax.random.key(0)),
     "BPC": lambda d, cost: c.BPC(d, c.gpc(d, cost).loop.base, delta=5.0),
 }
 
@@ -132,7 +130,7 @@ def test_loss_is_what_the_step_would_have_cost(along):
     states, *_ = follow(env, learner, np.zeros(2), w)
     theta = jnp.asarray(np.random.default_rng(3).normal(size=(1, 6)))
     other = states._replace(theta=jnp.broadcast_to(theta, (12, 1, 6)))
-    losses = jax.vmap(learner.loss)(jnp.arange(12.0), other)
+    losses = jax.jit(jax.vmap(learner.loss))(jnp.arange(12.0), other)
     expected = run(learner.fixed(theta), w).costs
     assert_close(losses, expected, rtol=1e-10, atol=1e-10)
 
@@ -256,9 +254,11 @@ def test_adaptive_keeps_up():
 
 
 def test_births_and_deaths():
-    """Experts live as published, and one of the slots always holds the first."""
+    """Experts live as published, and one of the slots always holds the first. One that
+    lives is followed, and for a while."""
     slots, every, steps = 6, 2, 60
-    learner = c.Adaptive(c.gpc(PLANT, COST, memory=2), slots=slots, every=every)
+    options = dict(slots=slots, every=every, play="switch")
+    learner = c.Adaptive(c.gpc(PLANT, COST, memory=2), **options)
     env = dlx.Environment(PLANT, COST)
     w = np.random.default_rng(5).normal(size=(steps, 2))
     states, *_ = follow(env, learner, np.zeros(2), w)
@@ -279,12 +279,6 @@ def test_births_and_deaths():
         weights = np.asarray(states.weights[step])
         assert np.all((weights > 0) == (found > step))
         assert np.isclose(weights.sum(), 1)
-
-
-def test_switching_follows_one():
-    w = np.random.default_rng(6).normal(size=(100, 2))
-    learner = c.Adaptive(c.gpc(PLANT, COST, memory=2), every=5, play="switch")
-    states, applied, *_ = follow(dlx.Environment(PLANT, COST), learner, np.zeros(2), w)
     chosen = np.asarray(states.chosen)
     assert len(set(chosen)) > 1 and np.mean(chosen[1:] != chosen[:-1]) < 0.5
     assert np.all(np.take_along_axis(states.weights, chosen[:, None], 1) > 0)
@@ -312,9 +306,20 @@ def test_explore_identifies():
     states, *_, costs, _ = follow(env, learner, np.zeros(2), w)
     model = jax.tree.map(lambda leaf: leaf[-1], states.model)
     assert np.max(np.abs(model.A - A)) < 0.1 and np.max(np.abs(model.B - B)) < 0.1
-    known = run(c.gpc(PLANT, COST), w).costs
-    assert np.mean(costs[3500:]) < 1.3 * np.mean(known[3500:])
-    assert np.mean(costs[3500:]) < 0.3 * np.mean(run(c.Linear(K), w).costs[3500:])
+    reached = np.mean(costs[3500:])
+    # A learner that knows the plant has 0.09 of the regulator's cost.
+    assert reached < 1.3 * 0.09 * mean_cost(dlx.riccati.dare(A, B, Q, R).K, w)
+    assert reached < 0.3 * mean_cost(K, w)
+
+
+def mean_cost(K, w):
+    """Of a gain, over the last 500 steps."""
+    x, costs = np.zeros(2), []
+    for now in w:
+        u = -np.asarray(K) @ x
+        costs.append(x @ x + u @ u)
+        x = A @ x + B @ u + now
+    return np.mean(costs[-500:])
 
 
 @needs_x64
@@ -512,9 +517,12 @@ def test_bad_input(make, match):
 
 
 def test_traced_dynamics_need_a_horizon():
+    base = c.Linear([[0.4, 1.2]])
+
     def cost(b, **options):
         dynamics = dlx.LinearDynamics(A, b * B)
-        return run(c.gpc(dynamics, COST, **options), SLOW[:30], dynamics).total_cost
+        learner = c.gpc(dynamics, COST, base=base, memory=3, **options)
+        return run(learner, SLOW[:30], dynamics).total_cost
 
     with user_error(match="horizon must be given"):
         jax.jit(cost)(1.0)

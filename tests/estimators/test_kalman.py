@@ -6,7 +6,6 @@ import pytest
 import scipy.linalg
 from helpers import (
     assert_close,
-    assert_gradient,
     central_difference,
     needs_x64,
     user_error,
@@ -74,7 +73,7 @@ def textbook(kalman, ys, us):
 
 @pytest.mark.parametrize(
     "n, p, steps",
-    [(3, 2, None), (7, 6, None), (3, 1, 8)],
+    [(7, 6, None), (3, 1, 8)],
 )
 def test_as_in_the_textbook(n, p, steps):
     kalman, ys, us = problem(n, p, steps=steps)
@@ -177,7 +176,7 @@ def test_steady_state():
 
 
 def test_steady_smoother_is_that_of_the_stationary_start():
-    transient, ys, us = problem(2, 1, T=6)
+    transient, ys, us = problem(3, 2, k=1, T=6)
     dynamics, W, V = transient.dynamics, transient.W, transient.V
     steady = c.KalmanFilter(dynamics, W, V, steady_state=True)
     same = c.KalmanFilter(dynamics, W, V, covariance=steady.covariance)
@@ -217,7 +216,8 @@ def test_linearised_sensor():
     dynamics = dlx.linearize(dlx.Discretized(system, 0.1), 0.0, jnp.ones(2), [0.0])
     dynamics = eqx.tree_at(lambda d: d.C, dynamics, -jnp.sin(1.0) * C)
     kalman = c.KalmanFilter(dynamics, W, V, y_ref=[np.cos(1.0)])
-    belief = kalman.update(0.0, jnp.array([np.cos(1.0)]), kalman.init())
+    update = eqx.filter_jit(kalman.update)
+    belief = update(0.0, jnp.array([np.cos(1.0)]), kalman.init())
     assert_close(belief.mean, np.ones(2), atol=1e-14)
 
 
@@ -229,22 +229,15 @@ def test_angles_wrap():
         dynamics, W, 0.1 * jnp.eye(2), observation_difference=difference
     )
     y = jnp.array([0.3, 0.1])
-    here = wrapped.update(0.0, y, wrapped.init())
-    turned = wrapped.update(0.0, y + turn, wrapped.init())
+    update = eqx.filter_jit(wrapped.update)
+    here, turned = (update(0.0, y, wrapped.init()) for y in (y, y + turn))
     assert_close(turned.mean, here.mean, atol=1e-13)
     assert here.mean[0] > 0.2
 
 
 def noisy(log_levels, stiffness):
     """A filter of an oscillator whose constants are all unknown."""
-
-    def field(t, x, u, w):
-        return jnp.stack([x[1], u[0] - stiffness * x[0] - 0.1 * x[1]])
-
-    system = dlx.system(field, states=("x", "v"), controls=("force",))
-    dynamics = dlx.Discretized(system, dt=0.2)
-    dynamics = dlx.linearize(dynamics, 0.0, jnp.zeros(2), jnp.zeros(1))
-    dynamics = eqx.tree_at(lambda d: d.C, dynamics, C)
+    dynamics = dlx.LinearDynamics(A.at[1, 0].set(-0.2 * stiffness), B, C, dt=0.2)
     q, r = jnp.exp(log_levels)
     return c.KalmanFilter(dynamics, q * jnp.eye(2), r * jnp.eye(1))
 
@@ -266,20 +259,9 @@ def test_gradient_of_the_likelihood():
     assert_close(hessian, rows, rtol=1e-6, atol=1e-7)
 
 
-@needs_x64
-def test_gradient_of_the_smoother():
-    kalman = problem(3, 2)[0]
-    ys, us = jnp.ones((4, 2)), jnp.ones((4, 1))
-
-    def size(W):
-        smoothed = c.smooth(eqx.tree_at(lambda k: k.W, kalman, W), ys, us)
-        return jnp.sum(smoothed.mean**2) + jnp.sum(smoothed.covariance**2)
-
-    assert_gradient(size, kalman.W, rtol=1e-6, atol=1e-8)
-
-
 def test_batch_and_its_bad_member():
-    """A member that fails says so, and harms neither the others nor the gradient."""
+    """A member that fails says so, and harms neither the others nor the gradient, which
+    is a central difference."""
     ys = jnp.stack([YS, 2 * YS, YS])
     dynamics = dlx.LinearDynamics(A, B, C)
 
@@ -293,7 +275,8 @@ def test_batch_and_its_bad_member():
         good &= jnp.array([True, True, False])
         likelihoods = jnp.where(good, found.filtered.log_likelihood, 0)
         energy = jnp.where(good[:, None, None], found.mean, 0) ** 2
-        return jnp.sum(likelihoods) + jnp.sum(energy), found
+        spread = jnp.where(good[:, None, None, None], found.covariance, 0) ** 2
+        return jnp.sum(likelihoods) + jnp.sum(energy) + jnp.sum(spread), found
 
     noises = jnp.array([0.1, 0.3, -5.0])
     value = jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))
@@ -306,6 +289,13 @@ def test_batch_and_its_bad_member():
     assert_close(found.mean[:2], alone.mean[:2], **CLOSE)
     assert_close(gradients[0], expected[0], **CLOSE)
     assert_close(gradients[1], expected[1], **CLOSE)
+    fine = np.abs(noises)
+    slopes = [
+        central_difference(lambda z: value(z, 1.0)[0][0], fine),
+        central_difference(lambda z: value(fine, z)[0][0], 1.0),
+    ]
+    for found, slope in zip(expected, slopes, strict=True):
+        assert_close(found, slope, rtol=1e-6, atol=1e-7)
 
 
 def test_covariance_stays_semidefinite():
@@ -327,15 +317,14 @@ def test_precision_and_file(tmp_path):
     dtype = jnp.float32
     dynamics = dlx.LinearDynamics(A.astype(dtype), B.astype(dtype), C.astype(dtype))
     noise = W.astype(dtype), V.astype(dtype)
-    for steady_state in (False, True):
-        kalman = c.KalmanFilter(dynamics, *noise, steady_state=steady_state)
-        found = c.smooth(kalman, YS.astype(dtype))
-        assert found.mean.dtype == found.filtered.log_likelihoods.dtype == dtype
-        dlx.save(tmp_path / "kalman.dlx", kalman)
-        loaded = dlx.load(tmp_path / "kalman.dlx")
-        assert jax.tree.structure(loaded) == jax.tree.structure(kalman)
-        again = c.smooth(loaded, YS.astype(dtype))
-        np.testing.assert_array_equal(again.mean, found.mean)
+    kalman = c.KalmanFilter(dynamics, *noise, steady_state=True)
+    found = c.smooth(kalman, YS.astype(dtype))
+    assert found.mean.dtype == found.filtered.log_likelihoods.dtype == dtype
+    dlx.save(tmp_path / "kalman.dlx", kalman)
+    loaded = dlx.load(tmp_path / "kalman.dlx")
+    assert jax.tree.structure(loaded) == jax.tree.structure(kalman)
+    again = c.smooth(loaded, YS.astype(dtype))
+    np.testing.assert_array_equal(again.mean, found.mean)
 
 
 def test_failures():
@@ -351,7 +340,7 @@ def test_failures():
     short = c.KalmanFilter(short, W, V)
     with pytest.raises(RuntimeError, match="smooth: The states.*At observation 4"):
         c.smooth(short, YS)
-    found = c.run_filter(short, YS, throw=False)
+    found = c.smooth(short, YS, throw=False).filtered
     assert found.result == dlx.RESULTS.diverged
     np.testing.assert_array_equal(np.isnan(found.updated.mean[:, 0]), [0] * 4 + [1] * 4)
     with pytest.raises(eqx.EquinoxRuntimeError, match="not finite"):

@@ -3,10 +3,10 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-import optax
 import pytest
 from helpers import (
     assert_close,
+    central_difference,
     dtype,
     needs_x64,
     user_error,
@@ -17,7 +17,6 @@ import delucax as dlx
 from delucax.training import (
     analytic,
     EvolutionStrategies,
-    fit,
     LikelihoodRatio,
     scored_cost,
 )
@@ -77,21 +76,21 @@ def environment(*, bound=1e6, **kwargs):
 def exact_cost(weights):
     """E[J] by the moments of the joint state (x, h), in closed form."""
     gain, decay, log_std = weights
-    variance = jnp.exp(2 * log_std)
-    moments = jnp.outer(jnp.append(START, 0.0), jnp.append(START, 0.0))
-    remember = jnp.array([[1.0, 0.0]])
+    variance = np.exp(2 * log_std)
+    moments = np.outer(np.append(START, 0.0), np.append(START, 0.0))
+    remember = np.array([[1.0, 0.0]])
     total = 0.0
     for _ in range(HORIZON):
-        row = jnp.concatenate([remember, decay * jnp.ones((1, 1))], axis=1)  # next h
+        row = np.concatenate([remember, decay * np.ones((1, 1))], axis=1)  # next h
         act = -gain * row
-        total += jnp.trace(Q @ moments[:2, :2])
+        total += np.trace(Q @ moments[:2, :2])
         total += R[0, 0] * ((act @ moments @ act.T)[0, 0] + variance)
-        plant = jnp.concatenate([jnp.asarray(A), jnp.zeros((2, 1))], axis=1) + B @ act
-        step = jnp.concatenate([plant, row])
-        drive = jnp.append(B[:, 0], 0.0)
-        w = jnp.diag(jnp.array([NOISE**2, NOISE**2, 0.0]))
-        moments = step @ moments @ step.T + variance * jnp.outer(drive, drive) + w
-    return total + jnp.trace(FINAL @ moments[:2, :2])
+        plant = np.concatenate([A, np.zeros((2, 1))], axis=1) + B @ act
+        step = np.concatenate([plant, row])
+        drive = np.append(B[:, 0], 0.0)
+        w = np.diag(np.array([NOISE**2, NOISE**2, 0.0]))
+        moments = step @ moments @ step.T + variance * np.outer(drive, drive) + w
+    return total + np.trace(FINAL @ moments[:2, :2])
 
 
 @eqx.filter_jit
@@ -131,12 +130,12 @@ NO_BASELINE = (LikelihoodRatio(32, baseline=False), 16000)
 )
 def test_the_gradient_of_a_random_closed_loop_is_unbiased(estimator):
     estimator, count = estimator
-    weights = jnp.array([0.8, 0.4, -1.0])
-    value, exact = jax.jit(jax.value_and_grad(exact_cost))(weights)
+    weights = np.array([0.8, 0.4, -1.0])
+    exact = central_difference(exact_cost, weights)
     loss = scored_cost(environment())
     costs, gradients = estimates(estimator, loss, Recalling(), count)
-    assert_mean(costs, float(value))
-    assert_mean(gradients, np.asarray(exact, float), power=0.25)
+    assert_mean(costs, exact_cost(weights))
+    assert_mean(gradients, exact, power=0.25)
 
 
 def test_a_baseline_lowers_the_variance():
@@ -240,13 +239,14 @@ def test_estimators_share_one_signature(estimator):
         return cost, {"log_prob": jnp.sum(model.gain), "limit": model.limit}
 
     model = Part(gain=jnp.ones(2))
-    value, gradient = estimator(loss, model, jr.key(0))
+    estimate = eqx.filter_jit(estimator)
+    value, gradient = estimate(loss, model, jr.key(0))
     cost, metrics = value
     assert_close(cost, 4.0, rtol=1e-6)
     assert metrics["limit"] == 2.0  # a constant is not perturbed
     assert gradient.gain.shape == (2,) and gradient.limit is None
     assert gradient.gain.dtype == model.gain.dtype
-    again = estimator(loss, model, jr.key(0))[1]
+    again = estimate(loss, model, jr.key(0))[1]
     np.testing.assert_array_equal(gradient.gain, again.gain)
     # Under jit, and on plain arrays, where every one moves.
     _, gradient = jax.jit(
@@ -259,22 +259,6 @@ def test_a_loss_without_metrics_returns_a_scalar():
     for estimator in ESTIMATORS[:2]:
         value, _ = estimator(lambda x, key: jnp.sum(x**2), jnp.ones(2), jr.key(0))
         assert_close(value, 2.0, rtol=1e-6)
-
-
-def test_the_likelihood_ratio_trains_a_policy():
-    env = environment(bound=2.0)
-    fitted = fit(
-        scored_cost(env),
-        Recalling(gain=0.0, log_std=-0.5),
-        optax.adam(0.05),
-        60,
-        key=jr.key(0),
-        gradient=LikelihoodRatio(64),
-        progress=False,
-    )
-    loss = fitted.history.loss
-    assert loss[-10:].mean() < 0.9 * loss[:10].mean()
-    assert "log_prob" in fitted.history.metrics
 
 
 def test_wrong_estimators_are_named():

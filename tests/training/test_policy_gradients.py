@@ -10,7 +10,6 @@ import pytest
 from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
-from delucax.studies import holds_upright
 from delucax.training import (
     actor_critic,
     ActorCritic,
@@ -53,23 +52,17 @@ def model_of(policy=None, key=0):
 
 
 @eqx.filter_jit
-def started(ppo, model):
-    """The memory of the first step."""
-    memory = ppo.init(model, jr.key(0))
-    return ppo.update(model, memory, jnp.asarray(0), jr.key(1))
-
-
-@eqx.filter_jit
-def gradient_of(surrogate, model, memory):
-    """Of the loss; the policy has not moved, so no divergence is to be seen."""
-
-    def loss(model):
-        value, metrics = surrogate(model, memory, jr.key(2))
-        return value, metrics
-
+def started(surrogate, model):
+    """The first memory, and of the loss of it the metrics and the gradient."""
+    memory = surrogate.init(model, jr.key(0))
+    loss = lambda model: surrogate(model, memory, jr.key(2))
     slope, metrics = eqx.filter_grad(loss, has_aux=True)(model)
-    moved = jnp.abs(metrics.get("kl", 0.0)) > 1e-13
-    return eqx.error_if(slope, moved, "the ratio is not 1")
+    return memory, metrics, slope
+
+
+def has_not_moved(metrics):
+    """As the policy has not, the ratio is 1."""
+    return abs(metrics["kl"]) < 1e-13
 
 
 def by_hand(costs, values, ends_with, stops):
@@ -113,7 +106,8 @@ def test_gradient_of_ppo_is_the_policy_gradient_at_first():
     env = environment()
     model = model_of()
     ppo = PPO(env, 5, epochs=1, minibatches=1, value_weight=0.0)
-    memory = started(ppo, model)
+    memory, metrics, slope = started(ppo, model)
+    assert has_not_moved(metrics)
     rows = memory.rows
 
     def scored(model):
@@ -126,13 +120,12 @@ def test_gradient_of_ppo_is_the_policy_gradient_at_first():
         )
         return jnp.mean(score * flat(rows.advantages))
 
-    slope = gradient_of(ppo, model, memory)
     expected = eqx.filter_jit(eqx.filter_grad(scored))(model)
     for a, b in zip(
         jax.tree.leaves(slope.policy), jax.tree.leaves(expected.policy), strict=True
     ):
         assert_close(a, b, atol=1e-12)
-    assert_close(jnp.mean(rows.advantages), 0, atol=1e-12)
+    assert_close(np.mean(rows.advantages), 0, atol=1e-12)
 
 
 @needs_x64
@@ -141,10 +134,10 @@ def test_ppo_follows_the_memory_of_a_policy():
     policy = c.GRU(2, 1, 3, key=jr.key(4))
     model = model_of(policy)
     ppo = PPO(environment(), 4, epochs=1, minibatches=1)
-    memory = started(ppo, model)
+    memory, metrics, slope = started(ppo, model)
+    assert has_not_moved(metrics)
     assert memory.rows.times.shape == (4, 6)
-    slope = gradient_of(ppo, model, memory)
-    assert float(jnp.max(jnp.abs(slope.policy.base.cell.weight_hh))) > 0
+    assert np.max(np.abs(slope.policy.base.cell.weight_hh)) > 0
 
 
 @needs_x64
@@ -154,15 +147,14 @@ def test_window_of_shac_is_the_whole_gradient_where_it_spans_the_horizon():
     base = c.MLP(2, 1, width=4, depth=1, key=jr.key(0))
     model = ActorCritic(base, c.MLP(2, 1, width=4, depth=1, key=jr.key(1)))
     shac = SHAC(env, 1, window=6, discount=1.0, bootstrap=False, value_weight=0.0)
-    memory = eqx.filter_jit(shac.init)(model, jr.key(0))
-    slope = gradient_of(shac, model, memory)
+    memory, _, slope = started(shac, model)
     total = expected_cost(env, batch=1)
-    expected = eqx.filter_grad(total)(base, jr.key(5))
-    scale = 6 * memory.statistics.targets.std
+    expected = eqx.filter_jit(eqx.filter_grad(total))(base, jr.key(5))
+    scale = 6 * np.asarray(memory.statistics.targets.std)
     for a, b in zip(
         jax.tree.leaves(slope.policy), jax.tree.leaves(expected), strict=True
     ):
-        assert_close(a * scale, b, rtol=1e-9, atol=1e-12)
+        assert_close(np.asarray(a) * scale, b, rtol=1e-9, atol=1e-12)
 
 
 @needs_x64
@@ -173,20 +165,25 @@ def test_gradient_is_cut_between_windows():
 
     def total(K, **options):
         run = dlx.rollout(env, c.Linear(K), key=jr.key(0), **options)
-        return run.total_cost
+        return run.total_cost, run.states
 
-    states = dlx.rollout(env, c.Linear(gain), key=jr.key(0)).states
-
-    def stretches(K):
+    def stretches(K, states):
         own = environment(control_bounds=None, cost=_without_end(env.cost))
         first = dlx.rollout(own, c.Linear(K), key=jr.key(0), x0=states[0], horizon=4)
         last = dlx.rollout(env, c.Linear(K), key=jr.key(0), x0=states[4], horizon=2)
         return first.total_cost + last.total_cost
 
-    found = jax.grad(lambda K: total(K, truncate=4))(gain)
-    assert_close(found, jax.grad(stretches)(gain), rtol=1e-12)
-    assert_close(total(gain, truncate=4), total(gain), rtol=1e-14)
-    assert float(jnp.max(jnp.abs(found - jax.grad(total)(gain)))) > 1e-3
+    @jax.jit
+    def slopes(K):
+        slope = lambda f: jax.value_and_grad(f, has_aux=True)
+        (whole, states), plain = slope(total)(K)
+        (cut, _), found = slope(lambda K: total(K, truncate=4))(K)
+        return whole, cut, plain, found, jax.grad(stretches)(K, states)
+
+    whole, cut, plain, found, expected = map(np.asarray, slopes(gain))
+    assert_close(found, expected, rtol=1e-12)
+    assert_close(cut, whole, rtol=1e-14)
+    assert np.max(np.abs(found - plain)) > 1e-3
 
 
 def _without_end(cost):
@@ -195,37 +192,40 @@ def _without_end(cost):
 
 @needs_x64
 def test_moments_are_those_of_all_rows():
-    rows = jr.normal(jr.key(0), (20, 3)) * 4 + 2
-    valid = jnp.arange(20) % 3 > 0
-    moments = Moments.empty(jnp.zeros(3))
-    for part in (slice(0, 7), slice(7, 20)):
-        moments = moments.joined(rows[part], valid[part])
-    assert_close(moments.mean, jnp.mean(rows[valid], axis=0), rtol=1e-12)
-    assert_close(moments.std, jnp.std(rows[valid], axis=0), rtol=1e-12)
+    rows = np.random.default_rng(0).normal(size=(21, 3)) * 4 + 2
+    valid = np.arange(21) % 3 > 0
+    valid[7:] = np.arange(14) % 5 > 0
+
+    @jax.jit
+    def joined(rows, valid):
+        moments = Moments.empty(jnp.zeros(3))
+        for part in (slice(0, 7), slice(7, 21)):
+            moments = moments.joined(rows[part], valid[part])
+        return moments.mean, moments.std
+
+    mean, std = joined(rows, valid)
+    assert_close(mean, np.mean(rows[valid], axis=0), rtol=1e-12)
+    assert_close(std, np.std(rows[valid], axis=0), rtol=1e-12)
 
 
-@once
-def test_a_seed_of_ppo_does_not_depend_on_the_others():
-    """Beside another seed it is trained to the same policy."""
-    env = environment()
-    keys = jr.split(jr.key(0), 3)
-    make = lambda key: actor_critic(env, width=4, depth=1, key=key)
-    models = eqx.filter_jit(eqx.filter_vmap(make))(keys)
-    ppo = PPO(env, 2, epochs=2, minibatches=2)
-    optimiser = optax.chain(optax.clip_by_global_norm(0.1), optax.adam(1e-2))
-
-    def beside(other):
-        pair = np.array([other, 2])
-        both = jax.tree.map(lambda a: a[pair] if eqx.is_array(a) else a, models)
-        fitted = fit(ppo, both, optimiser, 6, key=keys[pair], progress=False)
-        assert fitted.history.loss.shape == (6, 2)
-        return fitted.history.loss, eqx.filter(fitted.model, eqx.is_inexact_array)
-
-    first, second = (jax.tree.leaves(beside(other)) for other in (0, 1))
-    assert np.any(first[0][:, 0] != second[0][:, 0])
-    assert_close(first[0][:, 1], second[0][:, 1], rtol=1e-4, atol=1e-5)
-    for a, b in zip(first[1:], second[1:], strict=True):
-        assert_close(a[1], b[1], rtol=1e-3, atol=1e-4)
+@needs_x64
+def test_ppo_learns():
+    """From doing nothing nearly to the best."""
+    start = np.array([0.5, 0.4])
+    env = environment(control_bounds=(-3.0, 3.0))
+    model = actor_critic(env, width=4, depth=1, key=jr.key(0))
+    ppo = PPO(env, 32, epochs=2, minibatches=2, discount=1.0, bootstrap=False)
+    optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1e-2))
+    fitted = fit(ppo, model, optimiser, 1000, key=jr.key(1), progress=False)
+    cost = eqx.filter_jit(expected_cost(env, batch=1))
+    found = float(cost(fitted.model.policy.base, jr.key(0)))
+    idle = least = 3 * np.eye(2)
+    for _ in range(6):
+        K = np.linalg.solve(np.eye(1) + B.T @ least @ B, B.T @ least @ A)
+        least = np.eye(2) + A.T @ least @ (A - B @ K)
+        idle = np.eye(2) + A.T @ idle @ A
+    assert start @ idle @ start > 1.5 * start @ least @ start
+    assert start @ least @ start < found < 1.05 * start @ least @ start
 
 
 @once
@@ -329,10 +329,9 @@ def test_log_probability_stands_for_an_entropy_that_is_not_known():
     assert model.policy.has_memory  # as no policy is asked what it remembers
     env = environment()
     ppo = PPO(env, 2, 3, epochs=1, minibatches=1)
-    memory = started(ppo, model)
+    memory, metrics, _ = started(ppo, model)
     assert memory.rows.times.shape == (2, 3)
-    _, metrics = eqx.filter_jit(ppo)(model, memory, jr.key(0))
-    assert_close(metrics["entropy"], -jnp.mean(memory.rows.log_prob), rtol=1e-5)
+    assert_close(metrics["entropy"], -np.mean(memory.rows.log_prob), rtol=1e-5)
     assert not model_of().policy.has_memory
 
 
@@ -371,21 +370,3 @@ def test_policy_and_critic_begin_flat():
     for network in (model.critic, model.policy):
         slope = jax.grad(lambda y, network=network: network(0.0, y, None)[0].sum())(y)
         assert 0 < jnp.linalg.norm(slope) < 0.02
-
-
-@once
-def test_ppo_swings_up():
-    env = dlx.make("pendulum")
-    corner = np.array([np.pi, 8.0])
-    spread = {"initial_state.low": -corner, "initial_state.high": corner}
-    ppo = PPO(
-        dlx.replace(env, spread), 64, 100, discount=0.95, epochs=10, minibatches=8
-    )
-    model = actor_critic(env, 32, 1, key=jr.key(0))
-    optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(3e-3))
-    fitted = fit(ppo, model, optimiser, 3200, key=jr.key(1), progress=False)
-    starts = jax.vmap(env.reset)(jr.split(jr.key(2), 100))
-    run = lambda x0: dlx.rollout(
-        env, fitted.model.policy.base, key=jr.key(0), x0=x0, horizon=400
-    )
-    assert int(jnp.sum(holds_upright(jax.vmap(run)(starts)))) >= 95

@@ -2,6 +2,8 @@
 
 import re
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -23,37 +25,55 @@ B = np.array([[0.0], [1.0]])
 TRUE = dict(mass=1.3, length=0.8)
 
 
+SOLVER = diffrax.Midpoint()  # of two stages: its programs are small
+
+
+def pendulum(**constants):
+    return dlx.Discretized(dlx.systems.Pendulum(**constants), 0.05, SOLVER)
+
+
+GUESS = pendulum()
+BOTH = "system.length", "system.mass"
+open_loop = eqx.filter_jit(dlx.open_loop)
+
+
 def recorded(seed=0, noise=0.01, damping=0.0):
     """20 s of a pendulum under a new torque every 0.25 s, at 40 dB."""
-    plant = dlx.Discretized(dlx.systems.Pendulum(**TRUE, damping=damping), dt=0.05)
-    controls = 3 * jnp.repeat(jr.normal(jr.key(3), (80, 1)), 5, 0)
-    states = dlx.open_loop(plant, jnp.array([3.0, 0.0]), controls)
-    std = noise * jnp.std(states, axis=0)
-    return states + std * jr.normal(jr.key(10 + seed), states.shape), controls, std
+    controls = 3 * np.repeat(np.random.default_rng(3).normal(size=(80, 1)), 5, 0)
+    plant = pendulum(**TRUE, damping=damping)
+    states = np.asarray(open_loop(plant, jnp.array([3.0, 0.0]), controls))
+    std = noise * np.std(states, axis=0)
+    drawn = np.random.default_rng(10 + seed).normal(size=states.shape)
+    return states + std * drawn, controls, std
 
 
-GUESS = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+def of_linear(controls, w):
+    """The states of `A`, `B` from 0."""
+    states = [np.zeros(2)]
+    for u, d in zip(controls, w, strict=True):
+        states.append(A @ states[-1] + B @ u + d)
+    return np.stack(states)
 
 
 def test_length_and_mass_within_one_percent():
     inside = 0
     for seed in range(10):
         states, controls, std = recorded(seed)
-        found = sysid.physical(
-            GUESS, states, controls, ("system.length", "system.mass")
-        )
-        assert found.names == ("system.length", "system.mass")
+        found = sysid.physical(GUESS, states, controls, BOTH)
+        assert found.names == BOTH
         truth = np.array([TRUE["length"], TRUE["mass"]])
         assert np.all(np.abs(found.estimate / truth - 1) < 0.01)
         assert_close(found.noise / std, 1, atol=0.15)
         inside += np.sum((found.low < truth) & (truth < found.high))
+        assert_close(found.x0, [3.0, 0.0], atol=3 * float(std.max()))
+    assert "identifiable" in repr(found)
     # Of 20 intervals of 95%: fewer than 16 has a chance below 0.3%.
     assert inside >= 16
 
 
 def test_residuals_of_a_wrong_model_are_said_to_be_correlated():
     """Of a pendulum whose friction the model leaves out."""
-    paths, friction = ("system.length", "system.mass"), 0.3
+    paths, friction = BOTH, 0.3
     for seed in range(3):
         states, controls, _ = recorded(seed, damping=friction)
         missing = sysid.physical(GUESS, states, controls, paths)
@@ -87,9 +107,9 @@ def test_direction_that_is_not_identifiable_is_reported():
 
 
 def test_data_that_say_nothing_say_so():
-    controls = jnp.zeros((400, 1))  # as many as are recorded: compiled once
-    still = jnp.tile(jnp.array([jnp.pi, 0.0]), (401, 1))
-    paths = ("system.length", "system.mass")
+    controls = np.zeros((400, 1))  # as many as are recorded: compiled once
+    still = np.tile([np.pi, 0.0], (401, 1))
+    paths = BOTH
     found = sysid.physical(GUESS, still, controls, paths, throw=False)
     assert found.result == dlx.RESULTS.unexciting
     assert not np.any(found.identifiable)
@@ -107,27 +127,18 @@ def test_too_little_data_say_so():
     found = sysid.linear(**few)
     assert found.result == dlx.RESULTS.unexciting
     assert not np.all(found.identifiable) and np.all(np.isfinite(found.estimate))
+    assert found.x0 is None
     with pytest.raises(Exception, match="is not identifiable"):
         sysid.linear(states[:3], controls[:2])
 
 
-def test_two_observations_do_not_tell_two_parameters():
-    # They are four numbers, two of which tell where it starts.
-    states, controls, _ = recorded()
-    both = "system.mass", "system.length"
-    found = sysid.physical(GUESS, states[:2], controls[:1], both, throw=False)
-    assert found.result == dlx.RESULTS.unexciting
-
-
 def test_linear_models():
-    true = dlx.LinearDynamics(A, B, dt=0.1)
-    controls = jr.normal(jr.key(0), (400, 1))
-    exact = dlx.open_loop(true, jnp.zeros(2), controls)
-    found = sysid.linear(exact, controls, dt=0.1)
+    rng = np.random.default_rng(0)
+    controls, w = rng.normal(size=(400, 1)), 0.1 * rng.normal(size=(400, 2))
+    found = sysid.linear(of_linear(controls, 0 * w), controls, dt=0.1)
     assert_close(found.model.A, A, atol=1e-12)
     assert_close(found.model.B, B, atol=1e-12)
-    w = 0.1 * jr.normal(jr.key(1), (400, 2))
-    noisy = dlx.open_loop(true, jnp.zeros(2), controls, w)
+    noisy = of_linear(controls, w)
     found = sysid.linear(noisy, controls, dt=0.1)
     truth = np.concatenate([A, B], axis=1)
     # The textbook's covariance, to all digits.
@@ -138,29 +149,27 @@ def test_linear_models():
     assert_close(found.noise, 0.1, rtol=0.15)
     shifted = sysid.linear(noisy + 3.0, controls, affine=True)
     assert_close(shifted.model.A, found.model.A, atol=0.02)
-    feedback = noisy[:-1] @ jnp.array([[0.3], [-0.2]])
+    feedback = noisy[:-1] @ np.array([[0.3], [-0.2]])
     closed = sysid.linear(noisy, feedback, throw=False)
     assert closed.result == dlx.RESULTS.unexciting
     assert closed.identifiable.tolist() == [False, True, True]
 
 
 def test_level_of_the_intervals():
-    plant = dlx.LinearDynamics(A, B)
-    controls = jr.normal(jr.key(0), (60, 1))
-    w = 0.1 * jr.normal(jr.key(1), (60, 2))
-    states = dlx.open_loop(plant, jnp.zeros(2), controls, w)
+    rng = np.random.default_rng(0)
+    controls = rng.normal(size=(60, 1))
+    states = of_linear(controls, 0.1 * rng.normal(size=(60, 2)))
     back = dict(outputs_back=1, controls_back=1)
-    pendulum, torques, _ = recorded()
+    angles, torques, _ = recorded()
     fits = (
         lambda level: sysid.linear(states, controls, level=level),
         lambda level: sysid.arx(states, controls, **back, level=level),
-        lambda level: sysid.physical(
-            GUESS, pendulum, torques, ("system.length", "system.mass"), level=level
-        ),
+        lambda level: sysid.physical(GUESS, angles, torques, BOTH, level=level),
     )
     for fitted in fits:
         half, most = fitted(0.5), fitted(0.95)
-        ratio = (half.high - half.low) / (most.high - most.low)
+        widths = [np.asarray(f.high) - np.asarray(f.low) for f in (half, most)]
+        ratio = widths[0] / widths[1]
         # The quantiles of a normal distribution; positive values have skewed ends.
         assert_close(ratio, np.full(ratio.shape, 0.67449 / 1.95996), rtol=1e-3)
         with user_error(match="level must be between 0 and 1, got 1.5"):
@@ -168,49 +177,48 @@ def test_level_of_the_intervals():
 
 
 def test_arx_is_the_dynamics_that_it_came_from():
-    true = dlx.LinearDynamics(A, B)
-    controls = jr.normal(jr.key(0), (200, 1))
-    outputs = dlx.open_loop(true, jnp.zeros(2), controls)[:, :1]
+    controls = np.random.default_rng(0).normal(size=(200, 1))
+    outputs = of_linear(controls, np.zeros((200, 2)))[:, :1]
     found = sysid.arx(outputs, controls, outputs_back=2, controls_back=1, delay=2)
     assert_close(found.estimate, [[1.7, -0.72, 0.1]], atol=1e-10)
-    model = found.model
-    x = jnp.array([outputs[2, 0], outputs[1, 0], controls[1, 0]])
-    states = dlx.open_loop(model, x, controls[2:])
-    again = states @ model.C.T
-    assert_close(again, outputs[2:], atol=1e-9)
+    A_, B_, C_ = (np.asarray(M) for M in (found.model.A, found.model.B, found.model.C))
+    x, again = np.array([outputs[2, 0], outputs[1, 0], controls[1, 0]]), []
+    for u in controls[2:]:
+        again.append(C_ @ x)
+        x = A_ @ x + B_ @ u
+    assert_close(np.stack([*again, C_ @ x]), outputs[2:], atol=1e-9)
 
 
 def test_neural_fits_predict():
     states, controls, _ = recorded(noise=1e-3)
-    spread = jnp.std(states, axis=0)
+    spread = np.std(states, axis=0)
     loss = sysid.PredictionError(scale=spread)
     data = sysid.windows(states, controls, 3, dt=0.05)
     assert data[1].shape == (398, 4, 2)
-    options = dict(width=16, depth=1, dt=0.05, key=jr.key(0))
-    step = jnp.std(jnp.diff(states, axis=0), axis=0)
+    options = dict(width=8, depth=1, dt=0.05, key=jr.key(0))
+    step = np.std(np.diff(states, axis=0), axis=0)
     net = sysid.NeuralDynamics(2, 1, x_scale=spread, step_scale=step, **options)
-    before = loss(net, data, jr.key(0))
-    options = dict(key=jr.key(1), data=data, batch_size=64, progress=False)
-    fitted = fit(loss, net, optax.adam(1e-2), 300, **options)
-    assert float(loss(fitted.model, data, jr.key(0))) < 0.5 * float(before)
+    fitted = fit(loss, net, optax.adam(1e-2), 300, key=jr.key(1), data=data)
+    losses = fitted.history.loss
+    assert losses[-1] < 0.5 * losses[0]
     # The data's own system leaves nothing but noise.
-    own = dlx.Discretized(dlx.systems.Pendulum(**TRUE), dt=0.05)
-    assert float(loss(own, data, jr.key(0))) < 1e-4
+    assert eqx.filter_jit(loss)(pendulum(**TRUE), data, jr.key(0)) < 1e-4
 
 
 def test_neural_options():
-    states, controls = jnp.arange(22.0).reshape(11, 2), jnp.zeros((10, 1))
+    states, controls = np.arange(22.0).reshape(11, 2), np.zeros((10, 1))
     times, some, inputs = sysid.windows(states, controls, 3, dt=0.5, stride=4)
     assert_close(times, [0.0, 2.0])
-    assert_close(some, jnp.stack([states[:4], states[4:8]]))
+    assert_close(some, np.stack([states[:4], states[4:8]]))
     assert inputs.shape == (2, 3, 1)
     with user_error(match="stride must be a whole number of at least 1"):
         sysid.windows(states, controls, 3, stride=0)
     net = sysid.NeuralDynamics(2, 1, 8, 1, activation=jax.nn.relu, key=jr.key(0))
-    hidden, last = net.network.layers
-    z = jnp.array([1.0, -2.0, 0.5])
-    step = last(jax.nn.relu(hidden(z)))
-    assert_close(net(0.0, z[:2], z[2:]), z[:2] + step)
+    first, last = net.network.layers
+    z = np.array([1.0, -2.0, 0.5])
+    hidden = np.maximum(first.weight @ z + first.bias, 0)
+    after = z[:2] + last.weight @ hidden + last.bias
+    assert_close(net(0.0, z[:2], z[2:]), after, rtol=1e-12)
 
 
 class Reactor(dlx.AbstractSystem):
@@ -242,10 +250,10 @@ def reactor(k0=1.0, UA=1.0, E=1.0, unit=1.0):
 def reacted(seed=0):
     """200 steps under a new jacket temperature every other step."""
     levels = jr.uniform(jr.key(1002), (100, 1), minval=280.0, maxval=320.0)
-    controls = jnp.repeat(levels, 2, 0)
-    states = dlx.open_loop(reactor(), jnp.array([0.5, 350.0]), controls)
-    noise = jnp.array([0.01, 0.5])
-    return states + noise * jr.normal(jr.key(seed), states.shape), controls
+    controls = np.repeat(levels, 2, 0)
+    states = np.asarray(open_loop(reactor(), jnp.array([0.5, 350.0]), controls))
+    drawn = np.random.default_rng(seed).normal(size=states.shape)
+    return states + np.array([0.01, 0.5]) * drawn, controls
 
 
 @given(st.floats(-10, 20), st.sampled_from([(0.6, 1.5), (1.4, 1.3), (0.7, 0.6)]))
@@ -254,12 +262,13 @@ def test_units_of_a_parameter_do_not_matter(power, off):
     states, controls = reacted()
     found = sysid.physical(reactor(*off, unit=10.0**power), states, controls, RATES)
     assert found.result == dlx.RESULTS.successful
-    estimate = found.estimate * jnp.array([1, 10.0**power])
+    estimate = np.asarray(found.estimate) * np.array([1, 10.0**power])
     plain = sysid.physical(reactor(), states, controls, RATES)
     assert_close(estimate, plain.estimate, rtol=1e-4)
-    assert_close(found.std / found.estimate, plain.std / plain.estimate, rtol=1e-3)
+    relative = [np.asarray(f.std) / np.asarray(f.estimate) for f in (found, plain)]
+    assert_close(*relative, rtol=1e-3)
     assert_close(found.x0, [0.5, 350.0], atol=2.0)
-    assert_close(plain.x0, jnp.array([0.5, 350.0]), rtol=0.02)
+    assert_close(plain.x0, [0.5, 350.0], rtol=0.02)
 
 
 def test_a_fit_that_did_not_converge_gives_no_intervals():
@@ -285,18 +294,14 @@ def test_a_fit_that_did_not_converge_gives_no_intervals():
 
 def test_the_start_of_each_run_is_returned():
     states, controls, std = recorded()
-    found = sysid.physical(GUESS, states, controls, ("system.length", "system.mass"))
-    assert_close(found.x0, [3.0, 0.0], atol=3 * float(std.max()))
-    assert "identifiable" in repr(found)
-    both = jnp.stack([states[:41], states[40:81]]), controls[:80].reshape(2, 40, 1)
-    found = sysid.physical(GUESS, *both, "system.length")
+    both = np.stack([states[:41], states[40:81]]), controls[:80].reshape(2, 40, 1)
+    # With the true mass the residuals are not correlated, and one attempt will do.
+    guess = pendulum(mass=TRUE["mass"])
+    found = sysid.physical(guess, *both, "system.length")
     assert_close(found.x0, both[0][:, 0], atol=3 * float(std.max()))
-    assert sysid.linear(states, controls).x0 is None
 
 
-@pytest.mark.parametrize(
-    "off, paths", [((0.6, 1.5), RATES), ((1.4, 0.6), RATES), ((1, 1, 1.3), "system.E")]
-)
+@pytest.mark.parametrize("off, paths", [((0.6, 1.5), RATES), ((1, 1, 1.3), "system.E")])
 def test_intervals_of_a_reactor_cover_the_truth(off, paths):
     truth = np.array([2.092, 7.2e10] if paths == RATES else [8750.0])
     inside = []
@@ -330,13 +335,16 @@ def test_few_programs_are_compiled():
     with counted_programs() as events:
         sysid.linear(states[:82], controls[:81], throw=False)
     assert 0 < len(events) <= 16
+    # Two observations are four numbers, two of which tell where it starts: they do not
+    # tell two parameters.
     options = dict(window=9, noise=0.01, throw=False)
     fit = lambda **more: sysid.physical(
-        GUESS, states[:28], controls[:27], "system.mass", **options, **more
+        GUESS, states[:2], controls[:1], BOTH, **options, **more
     )
     with counted_programs() as events:
-        fit(max_steps=20)
+        found = fit(max_steps=20)
     assert 0 < len(events) <= 24
+    assert found.result == dlx.RESULTS.unexciting
     with counted_programs() as events:
         fit(max_steps=19)
     assert not events

@@ -111,22 +111,12 @@ class LearnedLung(AbstractDynamics):
         sizes |= dict(u_window=u_window, p_window=p_window)
         for name, value in sizes.items():
             check_count(value, name, where)
-        hidden_key, output_key, valve_key, key = jr.split(key, 4)
-        inputs, size = u_window + p_window, 2 * max(u_window, p_window, boundary)
-        shape = boundary, 16
-        # Variances of one over the inputs keep what enters a tanh about 1.
-        self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
-        self.output = 0.1 * jr.normal(output_key, shape) / 16**0.5
-        self.line = jnp.zeros(inputs)
-        self.valve = mlp("scalar", "scalar", 8, 1, key=valve_key)
-        self.network = mlp(inputs, "scalar", width, depth, key=key)
-        inhaling = breaths.u_out < 0.5
-        moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
-        self.u_mean, u_std = moments(breaths.u_in)
-        self.p_mean, p_std = moments(breaths.pressure)
-        # It is divided by, and 0 where all are the same.
-        self.u_std, self.p_std = u_std + 1e-3, p_std + 1e-3
-        self.start = jnp.mean(breaths.pressure[..., 0])
+        shape = boundary, 16, 2 * max(u_window, p_window, boundary)
+        inputs = u_window + p_window
+        weights = _first_weights(key, shape, inputs, width, depth)
+        self.hidden, self.output, self.line, self.valve, self.network = weights
+        scales = _scales(breaths.u_in, breaths.u_out, breaths.pressure)
+        self.u_mean, self.u_std, self.p_mean, self.p_std, self.start = scales
         self.dt = breaths.dt
         self.u_window, self.p_window = u_window, p_window
         self.published = check_bool(published, "published", where)
@@ -284,3 +274,33 @@ def _windows(values: Array, size: int) -> Array:
     count = values.shape[0] - size + 1
     shifts = [values[size - 1 - i : size - 1 - i + count] for i in range(size)]
     return jnp.stack(shifts, axis=1)
+
+
+# One program, and not one for each array.
+@eqx.filter_jit
+def _first_weights(
+    key: PRNGKey, shape: tuple[int, int, int], inputs: int, width: int, depth: int
+) -> tuple[Array, Array, Array, eqx.nn.MLP, eqx.nn.MLP]:
+    """Those of the first steps, the line, the valve and the network."""
+    hidden_key, output_key, valve_key, key = jr.split(key, 4)
+    # Variances of one over the inputs keep what enters a tanh about 1.
+    hidden = jr.normal(hidden_key, shape) / shape[2] ** 0.5
+    output = 0.1 * jr.normal(output_key, shape[:2]) / shape[1] ** 0.5
+    valve = mlp("scalar", "scalar", 8, 1, key=valve_key)
+    network = mlp(inputs, "scalar", width, depth, key=key)
+    return hidden, output, jnp.zeros(inputs), valve, network
+
+
+@host_unless_traced
+def _scales(u_in: Any, u_out: Any, pressure: Any) -> tuple[Any, ...]:
+    """Mean and standard deviation of controls and pressures in inspirations, and the
+    pressure before them."""
+    moments = []
+    for values in (u_in, pressure):
+        inhaling = (u_out < 0.5).astype(values.dtype)
+        share = inhaling / xp.sum(inhaling)
+        mean = xp.sum(share * values)
+        # It is divided by, and 0 where all are the same.
+        std = xp.sqrt(xp.sum(share * (values - mean) ** 2)) + 1e-3
+        moments += [mean, std]
+    return (*moments, xp.mean(pressure[..., 0]))
