@@ -17,6 +17,28 @@ from ..dynamics import AbstractDynamics
 from ._breaths import Breaths
 
 
+@eqx.filter_jit
+def _boundary(key: PRNGKey, boundary: int, size: int) -> tuple[Array, ...]:
+    """The first weights of the networks at the beginning of a breath, and two keys."""
+    hidden_key, output_key, *keys = jr.split(key, 4)
+    shape = boundary, 16
+    # Variances of one over the inputs keep what enters a tanh about 1.
+    hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
+    return hidden, 0.1 * jr.normal(output_key, shape) / 16**0.5, *keys
+
+
+@eqx.filter_jit
+def _moments(breaths: Breaths) -> tuple[Array, ...]:
+    """Means and standard deviations of control and pressure, and the first pressure."""
+    inhaling = breaths.u_out < 0.5
+    moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
+    u_mean, u_std = moments(breaths.u_in)
+    p_mean, p_std = moments(breaths.pressure)
+    start = jnp.mean(breaths.pressure[..., 0])
+    # It is divided by, and 0 where all are the same.
+    return u_mean, u_std + 1e-3, p_mean, p_std + 1e-3, start
+
+
 class LearnedLung(AbstractDynamics):
     r"""A lung learned from breaths: a network of the last controls and pressures, and
     networks of their own for the first steps of an inspiration.
@@ -111,22 +133,12 @@ class LearnedLung(AbstractDynamics):
         sizes |= dict(u_window=u_window, p_window=p_window)
         for name, value in sizes.items():
             check_count(value, name, where)
-        hidden_key, output_key, valve_key, key = jr.split(key, 4)
         inputs, size = u_window + p_window, 2 * max(u_window, p_window, boundary)
-        shape = boundary, 16
-        # Variances of one over the inputs keep what enters a tanh about 1.
-        self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
-        self.output = 0.1 * jr.normal(output_key, shape) / 16**0.5
+        self.hidden, self.output, valve_key, key = _boundary(key, boundary, size)
         self.line = jnp.zeros(inputs)
         self.valve = mlp("scalar", "scalar", 8, 1, key=valve_key)
         self.network = mlp(inputs, "scalar", width, depth, key=key)
-        inhaling = breaths.u_out < 0.5
-        moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
-        self.u_mean, u_std = moments(breaths.u_in)
-        self.p_mean, p_std = moments(breaths.pressure)
-        # It is divided by, and 0 where all are the same.
-        self.u_std, self.p_std = u_std + 1e-3, p_std + 1e-3
-        self.start = jnp.mean(breaths.pressure[..., 0])
+        self.u_mean, self.u_std, self.p_mean, self.p_std, self.start = _moments(breaths)
         self.dt = breaths.dt
         self.u_window, self.p_window = u_window, p_window
         self.published = check_bool(published, "published", where)

@@ -242,16 +242,15 @@ def ilqr(
 
         dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[100.0, 10.0])
-        start = jnp.zeros((60, 1))
-        hanging = jnp.array([jnp.pi, 0.0])
-        plan = dlx.planning.ilqr(dynamics, cost, hanging, start, bounds=(-6.0, 6.0))
+        hanging, start = jnp.array([jnp.pi, 0.0]), jnp.zeros((60, 1))
 
         def optimal(mass):
             heavier = dlx.replace(dynamics, {"system.mass": mass})
-            plan = dlx.planning.ilqr(heavier, cost, jnp.array([0.5, 0.0]), start)
-            return plan.cost
+            plan = dlx.planning.ilqr(heavier, cost, hanging, start, bounds=(-6.0, 6.0))
+            return plan.cost, plan.controls
 
-        plan.cost, jax.jit(jax.grad(optimal))(1.0)
+        least_and_slope = jax.jit(jax.value_and_grad(optimal, has_aux=True))
+        (least, controls), slope = least_and_slope(1.0)
         ```
     """
     planner = ILQR(max_iterations, tolerance)
