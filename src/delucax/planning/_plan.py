@@ -57,9 +57,9 @@ class Plan(AbstractController):
         import jax
         import jax.numpy as jnp
 
-        env = dlx.make("pendulum", horizon=30)
-        x0, start = jnp.array([0.3, 0.0]), jnp.zeros((30, 1))
-        plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, start)
+        env = dlx.make("pendulum", horizon=20)
+        x0 = jnp.array([0.5, 0.0])
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, 20)
         dlx.rollout(env, plan, key=jax.random.key(0), x0=x0 + 0.05).total_cost
         ```
     """
