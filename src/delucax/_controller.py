@@ -41,7 +41,8 @@ class AbstractController(eqx.Module):
                 return -self.gain * y[1:], state
 
         import jax
-        dlx.rollout(dlx.make("pendulum"), Damper(), key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, Damper(), key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
 
     !!! example "One that draws"
@@ -58,7 +59,8 @@ class AbstractController(eqx.Module):
                 state, now = jax.random.split(state)
                 return jax.random.normal(now, (1,), y.dtype), state
 
-        dlx.rollout(dlx.make("pendulum"), Dither(), key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, Dither(), key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 
@@ -255,7 +257,7 @@ class Tally(eqx.Module):
                 return -y[1:], tally.add(jnp.abs(y[0]) > 0.5)
 
         env = dlx.make("pendulum")
-        trajectory = dlx.rollout(env, Cautious(), key=jax.random.key(0))
+        trajectory = dlx.rollout(env, Cautious(), key=jax.random.key(0), x0=[0.1, 0.0])
         trajectory.incident_counts
         ```
     """

@@ -28,6 +28,16 @@ def test_arithmetic(key):
     assert len(MLP(3, 2, depth=0, key=key).network.layers) == 1
 
 
+@once
+def test_first_weights_are_those_of_equinox(key):
+    for depth in (0, 2):
+        network = MLP(3, 2, width=5, depth=depth, key=key).network
+        theirs = eqx.filter_jit(eqx.nn.MLP)(3, 2, 5, depth, key=key)
+        for ours, other in zip(network.layers, theirs.layers, strict=True):
+            np.testing.assert_array_equal(ours.weight, other.weight)
+            np.testing.assert_array_equal(ours.bias, other.bias)
+
+
 def test_squashed_into_bounds(key):
     low, high = jnp.array([0.0, -3.0]), jnp.array([100.0, -1.0])
     policy = MLP(1, 2, width=4, depth=1, bounds=(low, high), key=key)

@@ -9,7 +9,6 @@ from ._fields import (
     check_parameters as check_parameters,
     function_field as function_field,
     marked_leaves as marked_leaves,
-    mlp as mlp,
     parameter as parameter,
     parts_of as parts_of,
     path_string as path_string,
@@ -18,6 +17,7 @@ from ._fields import (
     weight as weight,
 )
 from ._names import indexed_names as indexed_names, names_of as names_of
+from ._networks import mlp as mlp
 from ._paths import (
     check_paths as check_paths,
     get_path as get_path,

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -280,23 +280,6 @@ def as_module(value: Any) -> Any:
     """A plain function as a `StaticFunction`; anything else as it is."""
     is_plain = callable(value) and jax.tree_util.all_leaves([value])
     return StaticFunction(value) if is_plain else value
-
-
-def mlp(
-    inputs: int | Literal["scalar"],
-    outputs: int | Literal["scalar"],
-    width: int,
-    depth: int,
-    activation: Callable = jnp.tanh,
-    **options: Any,
-) -> eqx.nn.MLP:
-    """A fully connected network, linear at its end, that compiled functions take."""
-    functions = as_module(activation), as_module(jax.nn.identity)
-    return _network(inputs, outputs, width, depth, *functions, **options)
-
-
-# One program, and not one for each random number generator of each layer.
-_network = eqx.filter_jit(eqx.nn.MLP)
 
 
 def function_field(default: Any = dataclasses.MISSING) -> Any:

@@ -34,7 +34,8 @@ class Zero(AbstractController):
         import jax
 
         zero = dlx.controllers.Zero(1)
-        dlx.rollout(dlx.make("pendulum"), zero, key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, zero, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 
@@ -62,7 +63,8 @@ class Constant(AbstractController):
         import jax.numpy as jnp
 
         push = dlx.controllers.Constant(jnp.array([0.5]))
-        dlx.rollout(dlx.make("pendulum"), push, key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, push, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 
@@ -94,7 +96,8 @@ class Random(AbstractController):
         import jax.numpy as jnp
 
         explore = dlx.controllers.Random(jnp.array([1.0]))
-        dlx.rollout(dlx.make("pendulum"), explore, key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, explore, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 
@@ -131,7 +134,8 @@ class Linear(AbstractController):
         import jax.numpy as jnp
 
         feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
-        dlx.rollout(dlx.make("pendulum"), feedback, key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, feedback, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 
@@ -164,7 +168,8 @@ class OpenLoop(AbstractController):
         import jax.numpy as jnp
 
         replay = dlx.controllers.OpenLoop(0.5 * jnp.ones((20, 1)))
-        dlx.rollout(dlx.make("pendulum"), replay, key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum")
+        dlx.rollout(env, replay, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 

@@ -123,7 +123,9 @@ class History(AbstractController):
         size = 2 * (3 + 1) + 3
         base = dlx.controllers.MLP(size, 1, width=8, depth=1, key=jax.random.key(0))
         blind = dlx.controllers.History(base, 2, 1, length=3, features=angle)
-        dlx.rollout(env, blind, key=jax.random.key(1), horizon=10).total_cost
+        dlx.rollout(
+            env, blind, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
+        ).total_cost
         ```
     """
 

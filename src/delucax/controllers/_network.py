@@ -68,7 +68,7 @@ class MLP(AbstractController):
             bounds=env.control_bounds,
             key=jax.random.key(0),
         )
-        dlx.rollout(env, policy, key=jax.random.key(1)).total_cost
+        dlx.rollout(env, policy, key=jax.random.key(1), x0=[0.1, 0.0]).total_cost
         ```
     """
 
@@ -177,7 +177,7 @@ def mlp_policy(
 
         env = dlx.make("pendulum")
         policy = dlx.controllers.mlp_policy(env, width=32, key=jax.random.key(0))
-        dlx.rollout(env, policy, key=jax.random.key(1)).total_cost
+        dlx.rollout(env, policy, key=jax.random.key(1), x0=[0.1, 0.0]).total_cost
         ```
     """
     where = "mlp_policy"
@@ -232,7 +232,9 @@ class GRU(AbstractController):
         policy = dlx.controllers.GRU(
             3, 1, width=8, features=env.encode, bounds=(-2, 2), key=jax.random.key(0)
         )
-        dlx.rollout(env, policy, key=jax.random.key(1), horizon=10).total_cost
+        dlx.rollout(
+            env, policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
+        ).total_cost
         ```
     """
 
@@ -308,7 +310,9 @@ class Standardise(eqx.Module):
         env = dlx.make("pendulum")
         features = dlx.controllers.Standardise(jnp.zeros(3), [1, 1, 4], env.encode)
         policy = dlx.controllers.MLP(3, 1, features=features, key=jax.random.key(0))
-        dlx.rollout(env, policy, key=jax.random.key(1), horizon=10).total_cost
+        dlx.rollout(
+            env, policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
+        ).total_cost
         ```
     """
 

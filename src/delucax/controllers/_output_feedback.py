@@ -57,7 +57,7 @@ class OutputFeedback(AbstractController):
             env.dynamics, 1e-6 * jnp.eye(2), 1e-2 * jnp.eye(2)
         )
         controller = dlx.controllers.OutputFeedback(regulator, ekf)
-        dlx.rollout(env, controller, key=jax.random.key(0)).total_cost
+        dlx.rollout(env, controller, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
     """
 

@@ -94,7 +94,7 @@ class Gaussian(_AroundBase):
         env = dlx.make("pendulum")
         mean = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
         policy = dlx.controllers.Gaussian(mean, -1.0, bounds=env.control_bounds)
-        trajectory = dlx.rollout(env, policy, key=jax.random.key(0))
+        trajectory = dlx.rollout(env, policy, key=jax.random.key(0), x0=[0.1, 0.0])
         policy.total_log_prob(trajectory)
         ```
     """
@@ -240,7 +240,9 @@ class Categorical(_AroundBase):
         env = dlx.make("pendulum")
         logits = dlx.controllers.MLP(2, 3, width=8, depth=1, key=jax.random.key(0))
         policy = dlx.controllers.Categorical(logits, [[-2.0], [0.0], [2.0]])
-        dlx.rollout(env, policy, key=jax.random.key(1), horizon=10).controls
+        dlx.rollout(
+            env, policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
+        ).controls
         ```
     """
 

@@ -47,9 +47,9 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
         def cost(key):
             plant = dlx.randomise(env, key, ranges)
             zero = dlx.controllers.Zero(1)
-            return dlx.rollout(plant, zero, key=key).total_cost
+            return dlx.rollout(plant, zero, key=key, x0=[0.1, 0.0]).total_cost
 
-        jax.vmap(cost)(jax.random.split(jax.random.key(0), 8))
+        jax.jit(jax.vmap(cost))(jax.random.split(jax.random.key(0), 8))
         ```
     """
     check_key(key, "randomise")

@@ -265,6 +265,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
         ```python
         import delucax as dlx
+        import jax
         import jax.numpy as jnp
 
         pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
@@ -272,8 +273,12 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
         ekf = dlx.estimators.ExtendedKalmanFilter(
             pendulum, W, V, observation_difference=pendulum.difference
         )
-        belief = ekf.update(0.0, jnp.array([0.1, 0.0]), ekf.init())
-        belief = ekf.predict(0.0, jnp.zeros(1), belief)
+
+        @jax.jit
+        def step(t, y, u, belief):
+            return ekf.predict(t, u, ekf.update(t, y, belief))
+
+        belief = step(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), ekf.init())
         ```
     """
 

@@ -17,6 +17,28 @@ from ..dynamics import AbstractDynamics
 from ._breaths import Breaths
 
 
+@eqx.filter_jit
+def _boundary(key: PRNGKey, boundary: int, size: int) -> tuple[Array, ...]:
+    """The first weights of the networks at the beginning of a breath, and two keys."""
+    hidden_key, output_key, *keys = jr.split(key, 4)
+    shape = boundary, 16
+    # Variances of one over the inputs keep what enters a tanh about 1.
+    hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
+    return hidden, 0.1 * jr.normal(output_key, shape) / 16**0.5, *keys
+
+
+@eqx.filter_jit
+def _moments(breaths: Breaths) -> tuple[Array, ...]:
+    """Means and standard deviations of control and pressure, and the first pressure."""
+    inhaling = breaths.u_out < 0.5
+    moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
+    u_mean, u_std = moments(breaths.u_in)
+    p_mean, p_std = moments(breaths.pressure)
+    start = jnp.mean(breaths.pressure[..., 0])
+    # It is divided by, and 0 where all are the same.
+    return u_mean, u_std + 1e-3, p_mean, p_std + 1e-3, start
+
+
 class LearnedLung(AbstractDynamics):
     r"""A lung learned from breaths: a network of the last controls and pressures, and
     networks of their own for the first steps of an inspiration.
@@ -111,12 +133,12 @@ class LearnedLung(AbstractDynamics):
         sizes |= dict(u_window=u_window, p_window=p_window)
         for name, value in sizes.items():
             check_count(value, name, where)
-        shape = boundary, 16, 2 * max(u_window, p_window, boundary)
-        inputs = u_window + p_window
-        weights = _first_weights(key, shape, inputs, width, depth)
-        self.hidden, self.output, self.line, self.valve, self.network = weights
-        scales = _scales(breaths.u_in, breaths.u_out, breaths.pressure)
-        self.u_mean, self.u_std, self.p_mean, self.p_std, self.start = scales
+        inputs, size = u_window + p_window, 2 * max(u_window, p_window, boundary)
+        self.hidden, self.output, valve_key, key = _boundary(key, boundary, size)
+        self.line = jnp.zeros(inputs)
+        self.valve = mlp("scalar", "scalar", 8, 1, key=valve_key)
+        self.network = mlp(inputs, "scalar", width, depth, key=key)
+        self.u_mean, self.u_std, self.p_mean, self.p_std, self.start = _moments(breaths)
         self.dt = breaths.dt
         self.u_window, self.p_window = u_window, p_window
         self.published = check_bool(published, "published", where)
@@ -274,33 +296,3 @@ def _windows(values: Array, size: int) -> Array:
     count = values.shape[0] - size + 1
     shifts = [values[size - 1 - i : size - 1 - i + count] for i in range(size)]
     return jnp.stack(shifts, axis=1)
-
-
-# One program, and not one for each array.
-@eqx.filter_jit
-def _first_weights(
-    key: PRNGKey, shape: tuple[int, int, int], inputs: int, width: int, depth: int
-) -> tuple[Array, Array, Array, eqx.nn.MLP, eqx.nn.MLP]:
-    """Those of the first steps, the line, the valve and the network."""
-    hidden_key, output_key, valve_key, key = jr.split(key, 4)
-    # Variances of one over the inputs keep what enters a tanh about 1.
-    hidden = jr.normal(hidden_key, shape) / shape[2] ** 0.5
-    output = 0.1 * jr.normal(output_key, shape[:2]) / shape[1] ** 0.5
-    valve = mlp("scalar", "scalar", 8, 1, key=valve_key)
-    network = mlp(inputs, "scalar", width, depth, key=key)
-    return hidden, output, jnp.zeros(inputs), valve, network
-
-
-@host_unless_traced
-def _scales(u_in: Any, u_out: Any, pressure: Any) -> tuple[Any, ...]:
-    """Mean and standard deviation of controls and pressures in inspirations, and the
-    pressure before them."""
-    moments = []
-    for values in (u_in, pressure):
-        inhaling = (u_out < 0.5).astype(values.dtype)
-        share = inhaling / xp.sum(inhaling)
-        mean = xp.sum(share * values)
-        # It is divided by, and 0 where all are the same.
-        std = xp.sqrt(xp.sum(share * (values - mean) ** 2)) + 1e-3
-        moments += [mean, std]
-    return (*moments, xp.mean(pressure[..., 0]))

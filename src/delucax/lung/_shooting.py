@@ -46,13 +46,14 @@ class ShootingMPC(AbstractController):
     !!! example
 
         ```python
+        import equinox as eqx
         import jax.numpy as jnp
         from delucax import lung
 
         model = lung.learned_lung().dynamics.dynamics
         few = dict(horizon=3, iterations=2)
         mpc = lung.ShootingMPC(model, lung.BreathWaveform(), **few)
-        mpc(0.0, jnp.array([5.0]), mpc.init())
+        eqx.filter_jit(mpc)(0.0, jnp.array([5.0]), mpc.init())
         ```
     """
 

@@ -172,7 +172,8 @@ def igpc(
 
         env = dlx.make("pendulum")
         heavier = dlx.replace(env.dynamics, {"system.mass": 1.2})
-        plan = dlx.planning.ilqr(env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20)
+        x0 = jnp.array([0.5, 0.0])
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, 20)
         learned = dlx.planning.igpc(
             heavier, env.dynamics, env.cost, plan, iterations=5
         )

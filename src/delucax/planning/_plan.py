@@ -57,11 +57,10 @@ class Plan(AbstractController):
         import jax
         import jax.numpy as jnp
 
-        env = dlx.make("planar_quadrotor", horizon=30)
-        _, hover = env.dynamics.equilibrium()
-        start = jnp.tile(hover, (30, 1))
-        plan = dlx.planning.ilqr(env.dynamics, env.cost, env.initial_state, start)
-        dlx.rollout(env, plan, key=jax.random.key(0)).total_cost
+        env = dlx.make("pendulum", horizon=20)
+        x0 = jnp.array([0.5, 0.0])
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, 20)
+        dlx.rollout(env, plan, key=jax.random.key(0), x0=x0 + 0.05).total_cost
         ```
     """
 

@@ -76,8 +76,8 @@ def phase_portrait(
                 f"{system.state_names}."
             )
     x, v = (np.linspace(low, high, GRID) for low, high in limits)
-    states = jnp.stack(jnp.meshgrid(jnp.asarray(x), jnp.asarray(v)), axis=-1)
-    field = np.asarray(_field(system, control, states.reshape(-1, 2), where))
+    states = np.stack(np.meshgrid(x, v), axis=-1).reshape(-1, 2)
+    field = np.asarray(_field(system, control, jnp.asarray(states), where))
     field = field.reshape(GRID, GRID, 2)
 
     figure = figures.NotebookFigure(figsize=(6.0, 4.8), layout="constrained")
@@ -141,7 +141,7 @@ def _field(
         constant = as_vector(given, size, "control", where)
         law = lambda x: constant
     w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
-    return jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w))(states)
+    return jax.jit(jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w)))(states)
 
 
 def _turns(

@@ -102,7 +102,7 @@ def hinf_dre(
         A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
         B = jnp.array([[0.0], [1.0]])
         Q, R = jnp.eye(2), jnp.eye(1)
-        dlx.riccati.hinf_dre(A, B, None, Q, R, final=Q, horizon=100).gamma  # 2.9563
+        dlx.riccati.hinf_dre(A, B, None, Q, R, final=Q, horizon=20).gamma  # 2.9563
         ```
     """
     where = "hinf_dre"

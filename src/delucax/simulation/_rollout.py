@@ -120,9 +120,12 @@ def rollout(
 
         env = dlx.make("pendulum")
         controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
-        trajectory = dlx.rollout(env, controller, key=jax.random.key(0))
+        trajectory = dlx.rollout(
+            env, controller, key=jax.random.key(0), x0=[0.1, 0.0]
+        )
         keys = jax.random.split(jax.random.key(1), 100)
-        batch = jax.vmap(lambda k: dlx.rollout(env, controller, key=k))(keys)
+        run = jax.jit(jax.vmap(lambda key: dlx.rollout(env, controller, key=key)))
+        batch = run(keys)
         ```
     """
     where = "rollout"

@@ -159,7 +159,6 @@ def simulate(
         jax.jit(jax.grad(cost))(jnp.zeros((20, 1)))
 
         feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
-        sampled = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, dt=0.05)
         options = dict(hold=None, dt=0.05)
         options["stepsize_controller"] = diffrax.PIDController(rtol=1e-5, atol=1e-6)
         continuous = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, **options)

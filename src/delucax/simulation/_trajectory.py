@@ -66,7 +66,9 @@ class Trajectory(eqx.Module):
 
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)
-        trajectory = dlx.rollout(env, zero, key=jax.random.key(0), horizon=100)
+        trajectory = dlx.rollout(
+            env, zero, key=jax.random.key(0), horizon=100, x0=[0.1, 0.0]
+        )
         trajectory.total_cost, trajectory.states.shape, trajectory[:10].costs
         ```
     """

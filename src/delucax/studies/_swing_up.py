@@ -101,7 +101,7 @@ def holds_upright(
 
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)
-        trajectory = dlx.rollout(env, zero, key=jax.random.key(0))
+        trajectory = dlx.rollout(env, zero, key=jax.random.key(0), x0=[0.1, 0.0])
         studies.holds_upright(trajectory)
         ```
     """

@@ -138,7 +138,9 @@ def actor_critic(
 
         env = dlx.make("pendulum")
         model = dlx.training.actor_critic(env, width=8, depth=1, key=jax.random.key(0))
-        dlx.rollout(env, model.policy, key=jax.random.key(1), horizon=10).total_cost
+        dlx.rollout(
+            env, model.policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
+        ).total_cost
         ```
     """
     where = "actor_critic"

@@ -277,10 +277,9 @@ def worst_case(
 
         A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
         env = dlx.make("lds", A=A, B=B, horizon=100)
-        learner = dlx.controllers.gpc(env.dynamics, env.cost)
-        attack = dlx.training.worst_case(env, learner, key=jax.random.key(0), bound=1.0)
-        again = dlx.rollout(env, learner, key=jax.random.key(1), w=attack.w)
-        attack.total_cost
+        lqr = dlx.controllers.LQR(env.dynamics, jnp.eye(2), jnp.eye(1))
+        attack = dlx.training.worst_case(env, lqr, key=jax.random.key(0), bound=1.0)
+        attack.total_cost, attack.w
         ```
     """
     where = "worst_case"

@@ -47,13 +47,15 @@ def analytic(
 
         ```python
         import delucax as dlx
+        import equinox as eqx
         import jax
         import jax.numpy as jnp
 
         env = dlx.make("pendulum")
         loss = dlx.training.expected_cost(env, batch=8, horizon=50)
         controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
-        value, gradient = dlx.training.analytic(loss, controller, jax.random.key(0))
+        estimator = eqx.filter_jit(dlx.training.analytic)
+        value, gradient = estimator(loss, controller, jax.random.key(0))
         gradient.K
         ```
     """

@@ -81,11 +81,12 @@ def best_in_hindsight(
         import jax
         import jax.numpy as jnp
 
-        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
-        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
-        learner = dlx.controllers.gpc(env.dynamics, env.cost)
-        run = dlx.rollout(env, learner, key=jax.random.key(0))
-        best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        wave = dlx.disturbances.Sinusoid(0.1 * jnp.ones(2), frequency=0.05)
+        env = dlx.make("lds", A=A, B=B, disturbance=wave)
+        lqr = dlx.controllers.LQR(env.dynamics, jnp.eye(2), jnp.eye(1))
+        run = dlx.rollout(env, lqr, key=jax.random.key(0), x0=jnp.zeros(2))
+        best = dlx.controllers.best_in_hindsight(env, lqr, run)
         run.total_cost / best.trajectory.total_cost
         ```
     """
@@ -145,11 +146,12 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... 
         import jax
         import jax.numpy as jnp
 
-        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
-        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
-        learner = dlx.controllers.gpc(env.dynamics, env.cost)
-        run = dlx.rollout(env, learner, key=jax.random.key(0))
-        best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        wave = dlx.disturbances.Sinusoid(0.1 * jnp.ones(2), frequency=0.05)
+        env = dlx.make("lds", A=A, B=B, disturbance=wave)
+        lqr = dlx.controllers.LQR(env.dynamics, jnp.eye(2), jnp.eye(1))
+        run = dlx.rollout(env, lqr, key=jax.random.key(0), x0=jnp.zeros(2))
+        best = dlx.controllers.best_in_hindsight(env, lqr, run)
         dlx.controllers.regret(run, best.trajectory)[-1]
         ```
     """

@@ -152,8 +152,15 @@ def windows(
     steps = check_count(steps, "steps", where)
     stride = check_count(stride, "stride", where)
     check_step(dt, where)
+    check_at_most(steps, controls.shape[1], "steps", where, "of a run")
+    return _cut(states, controls, steps, stride, jnp.asarray(dt, float))
+
+
+@eqx.filter_jit
+def _cut(
+    states: Array, controls: Array, steps: int, stride: int, dt: Array
+) -> tuple[Array, Array, Array]:
     runs, total = controls.shape[:2]
-    check_at_most(steps, total, "steps", where, "of a run")
     begins = np.arange(0, total - steps + 1, stride)
     inside = begins[:, None] + np.arange(steps + 1)
     count = runs * len(begins)
