@@ -166,8 +166,8 @@ def test_gradients_are_central_differences_beside_an_unstable_loop():
         gain, lag, damping = theta
         A = jnp.array([[0.0, 1, 0], [-2, 0, 1], [0, 0, 0]])
         A = A.at[1, 1].set(-damping).at[2, 2].set(-lag)
-        system = LinearSystem(A, jnp.array([[0.0], [1], [2]]), C=gain * jnp.eye(3)[:1])
-        return dlx.c2d(system, 0.1)
+        A, B = jnp.eye(3) + A / 10, jnp.array([[0.0], [0.1], [0.2]])
+        return dlx.LinearDynamics(A, B, C=gain * jnp.eye(3)[:1], dt=0.1)
 
     def measures(theta):
         m = an.margins(loop(theta), throw=False)
