@@ -293,7 +293,7 @@ def test_batches():
     run = lambda x0: dlx.simulate(
         SWITCHED, controls, 0.0, 1.0, x0, stepsize_controller=ADAPTIVE
     )
-    batch = jax.vmap(run)(starts)
+    batch = jax.jit(jax.vmap(run))(starts)
     assert batch.batch_shape == (3,) and batch.times.shape == (3, 5)
     x = np.asarray(starts, float)
     for k in range(4):
