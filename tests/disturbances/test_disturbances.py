@@ -111,8 +111,7 @@ RANDOM = {
     "uniform": lambda n: d.Uniform(-0.1, 0.3, size=n),
     "walk": lambda n: d.RandomWalk(size=n),
     "brownian": lambda n: d.Brownian(n, dt=0.1),
-    "sum": lambda n: d.Gaussian(0.1, size=n) + d.Uniform(-1.0, 1.0, size=n),
-    "window": lambda n: d.Gaussian(0.1, size=n).between(1.0, 20.0),
+    "sum": lambda n: d.Gaussian(0.1, size=n) + d.Uniform(-1, 1, size=n).between(1, 20),
 }
 
 

@@ -37,7 +37,7 @@ def test_bad_members_harm_no_other():
     assert np.all(solved)
     (beside, solved), gradients_beside = both(spoilt, Qs)
     np.testing.assert_array_equal(solved, [True, False, False, True, True, True])
-    others = [0, 3, 4, 5]
+    others = np.array([0, 3, 4, 5])
     assert_close(beside[others], values[others], rtol=1e-14)
     for found, expected in zip(gradients_beside, gradients, strict=True):
         assert_close(found[others], expected[others], rtol=1e-12)
@@ -46,15 +46,6 @@ def test_bad_members_harm_no_other():
     assert_close(slope, (values[4] - values[5]) / (2 * h), rtol=1e-6)
     # And what NumPy computes of concrete numbers.
     assert_close(value(good, np.eye(2))[0], values[0], rtol=1e-11)
-
-
-def test_asymmetry_that_cannot_be_seen():
-    @jax.jit
-    def result(Q):
-        return dlx.riccati.dare(EYE / 2, B, Q, EYE[:1, :1], throw=False).result
-
-    assert result(EYE) == RESULTS.successful
-    assert result(jnp.array([[1.0, 0.5], [0.0, 1.0]])) == RESULTS.ill_posed
 
 
 @pytest.mark.parametrize("n, least, most", [(30, 0, 1e-12), (40, 1e-12, 1e-11)])

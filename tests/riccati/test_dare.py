@@ -147,6 +147,8 @@ def test_compiled_and_where_it_cannot_be_seen():
     unknown = np.where([[True, False], [False, False]], np.nan, A)
     assert solve(unknown, *data[1:]).result == ill_posed
     assert solve(*data[:3], -data[3]).result == ill_posed
+    asymmetric = np.array([[1.0, 0.5], [0.0, 1.0]], dtype())
+    assert solve(*data[:2], asymmetric, data[3]).result == ill_posed
     E = np.diag([1.0, 0.0])
     assert dlx.riccati.dare(*data, None, E, throw=False).result == ill_posed
 
@@ -182,9 +184,10 @@ def test_complex_data():
 @needs_x64
 def test_dead_beat_loop_has_a_gradient():
     nilpotent = jnp.array([[0.0, 1.0], [0.0, 0.0]])
-    solve = lambda A: dlx.riccati.dare(A, jnp.zeros((2, 1)), Q, R)
-    assert solve(nilpotent).spectral_radius == 0
-    gradient = jax.grad(lambda A: jnp.sum(solve(A).X))(nilpotent)
+    rest = np.zeros((2, 1)), Q, R
+    assert dlx.riccati.dare(nilpotent, *rest).spectral_radius == 0
+    total = lambda A: jnp.sum(dlx.riccati.dare(A, *rest, throw=False).X)
+    gradient = jax.jit(jax.grad(total))(nilpotent)
     # X is the sum of (A^k)' A^k, and A^2 = 0: so dX = dA' A + A' dA.
     assert_close(gradient, [[2.0, 2.0], [0.0, 0.0]], atol=1e-12)
 
