@@ -98,16 +98,18 @@ def best():
 def test_every_way_finds_the_optimum(options, best):
     plan = swing(**options)
     assert_close(plan.cost, best.cost, rtol=1e-9)
-    assert plan.residual < 1e-7 and plan.iterations <= best.iterations + 2
+    assert plan.residual < 1e-7 and plan.iterations <= 13
     if options.get("second_order"):
-        assert plan.iterations <= 6
+        near = ilqr(*pendulum(), best.states[0], best.controls + 0.05, **options)
+        assert near.iterations <= 4
+        assert_close(near.cost, best.cost, rtol=1e-12)
 
 
 @needs_x64
 def test_from_states_that_do_not_follow(best):
     dynamics, cost = pendulum()
     start = best.states[0]
-    straight = np.linspace(1, 0, 21)[:, None] * start
+    straight = np.linspace(1, 0, 21)[:, None] * np.asarray(start)
     straight[0] = 5.0  # which is not where it starts
     plan = ilqr(dynamics, cost, start, np.zeros((20, 1)), states=straight)
     assert_close(plan.cost, best.cost, rtol=1e-9)
@@ -248,19 +250,16 @@ def test_a_quadratic_program_between_bounds():
 
     @jax.jit
     @jax.vmap
-    def check(key):
-        keys = jax.random.split(key, 3)
-        root = jax.random.normal(keys[0], (4, 4))
-        H = root @ root.T + 0.01 * jnp.eye(4)
-        g = 3 * jax.random.normal(keys[1], (4,))
-        low = -jax.random.uniform(keys[2], (4,))
-        high = low + 1.0
+    def check(root, g, low):
+        H, high = root @ root.T + 0.01 * jnp.eye(4), low + 1.0
         u, free = solve_box_qp(H, g, low, high)
         slope = g + H @ u
         step = jnp.clip(u - slope, low, high) - u
         return jnp.max(jnp.abs(step)), jnp.max(jnp.abs(jnp.where(free, slope, 0)))
 
-    off, slope = check(jax.random.split(jax.random.key(0), 200))
+    rng = np.random.default_rng(0)
+    root, g = rng.normal(size=(200, 4, 4)), 3 * rng.normal(size=(200, 4))
+    off, slope = check(root, g, -rng.uniform(size=(200, 4)))
     assert jnp.max(off) < 1e-10 and jnp.max(slope) < 1e-10
 
 

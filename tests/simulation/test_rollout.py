@@ -102,12 +102,14 @@ def test_applied_sees_the_saturated_control(key):
 def test_a_batch_is_vmap(key):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
     keys = jax.random.split(key, 3)
-    batch = jax.vmap(lambda k: dlx.rollout(env, FEEDBACK, key=k, horizon=20))(keys)
+    run = lambda k: dlx.rollout(env, FEEDBACK, key=k, horizon=20)
+    batch = jax.jit(jax.vmap(run))(keys)
     assert batch.states.shape == (3, 21, 2) and batch.batch_shape == (3,)
     for i in range(2):
-        one = dlx.rollout(env, FEEDBACK, key=keys[i], horizon=20)
-        assert_close(batch[i].states, one.states, atol=tolerance(2e-5, 1e-12))
-        assert_close(batch.times[i], one.times)
+        one = run(keys[i])
+        states, times = np.asarray(batch.states)[i], np.asarray(batch.times)[i]
+        assert_close(states, one.states, atol=tolerance(2e-5, 1e-12))
+        assert_close(times, one.times)
 
 
 @needs_x64

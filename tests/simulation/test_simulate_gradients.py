@@ -138,7 +138,8 @@ def test_gradient_with_respect_to_the_end():
 )
 def test_gradient_with_respect_to_both_ends(adjoint):
     def f(t0, t1):
-        how = dict(stepsize_controller=FINE, adjoint=adjoint, solver=diffrax.Bosh3())
+        fine = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+        how = dict(stepsize_controller=fine, adjoint=adjoint, solver=diffrax.Bosh3())
         run = dlx.simulate(DRIVEN, CONTROLS[:1], t0, t1, jnp.ones(1), **how)
         return run.final_state[0]
 
