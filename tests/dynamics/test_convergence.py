@@ -40,7 +40,7 @@ def run(dynamics, starts, controls):
 def states(solver, substeps, most):
     """At the switches. As many steps for all, so that one program does: those after the
     end are idle."""
-    starts = np.random.default_rng(0).uniform(-3, 3, (32, 2))
+    starts = jax.random.uniform(jax.random.key(0), (32, 2), minval=-3.0, maxval=3.0)
     controls = np.zeros((8 * most, 1))
     controls[: 8 * substeps, 0] = np.repeat(CONTROLS, substeps)
     dynamics = dlx.Discretized(PENDULUM, 0.4 / substeps, solver)
