@@ -192,18 +192,18 @@ def test_constants_of_a_program_are_solved_when_it_is_traced():
 @once
 def test_transformations_and_threads():
     def recursion(A):
-        return riccati.dre(A, B, Q, R, horizon=2, **NO_THROW)
+        return riccati.dre(A, B, Q, R, horizon=2, **NO_THROW).X[0]
 
-    expected = recursion(A).X
+    expected = recursion(A)
     with jax.ensure_compile_time_eval():
-        np.testing.assert_array_equal(recursion(A).X, expected)
+        np.testing.assert_array_equal(recursion(A), expected)
     # The choice is one of a thread.
     solutions = []
 
     def solve():
         for _ in range(5):
-            solutions.append(recursion(A).X)
-        solutions.append(jax.jit(recursion)(A).X)
+            solutions.append(recursion(A))
+        solutions.append(jax.jit(recursion)(A))
         assert not on_host()
 
     threads = [threading.Thread(target=solve) for _ in range(3)]
@@ -217,7 +217,7 @@ def test_transformations_and_threads():
 
     # A derivative, of which a part is a constant, in a batch.
     def cost(A, scale):
-        return scale * jnp.trace(recursion(A).X) + jnp.trace(expected)
+        return scale * jnp.trace(recursion(A)) + jnp.trace(expected)
 
     slopes = jax.jit(jax.vmap(jax.grad(cost), (None, 0)))(A, np.arange(1.0, 3.0))
     change = np.array([[0.3, -0.1], [0.2, 0.5]])
