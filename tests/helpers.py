@@ -72,6 +72,15 @@ def in_both_modes(f):
     return derivatives
 
 
+def check_first_order(line, step=1e-5):
+    """The derivative of `line`, a number of a number, in reverse mode, is its central
+    difference. Returns the compiled value at 0.1."""
+    both = jax.jit(jax.value_and_grad(line))
+    (low, _), (value, slope), (high, _) = (both(0.1 + h) for h in (-step, 0.0, step))
+    assert_close(slope, (high - low) / (2 * step), rtol=1e-6)
+    return value
+
+
 def check_second_order(line, backwards=False, step=1e-5):
     """The derivatives of `line`, a number of a number, in both modes, and the second
     one, forwards and if asked for backwards, are central differences. Returns the

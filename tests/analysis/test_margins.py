@@ -163,11 +163,12 @@ def test_an_lqr_loop_has_the_margins_that_it_must():
 
 def test_gradients_are_central_differences_beside_an_unstable_loop():
     def loop(theta):
-        gain, lag, damping = theta
-        A = jnp.array([[0.0, 1, 0], [-2, 0, 1], [0, 0, 0]])
-        A = A.at[1, 1].set(-damping).at[2, 2].set(-lag)
-        system = LinearSystem(A, jnp.array([[0.0], [1], [2]]), C=gain * jnp.eye(3)[:1])
-        return dlx.c2d(system, 0.1)
+        gain, stiffness, damping = theta
+        A = jnp.array([[1, 0.3], [0, 1]]) - 0.3 * jnp.stack(
+            [jnp.zeros(2), jnp.stack([stiffness, damping])]
+        )
+        C = gain * jnp.array([[1.0, 0.0]])
+        return dlx.LinearDynamics(A, jnp.array([[0.0], [0.3]]), C, dt=0.3)
 
     def measures(theta):
         m = an.margins(loop(theta), throw=False)
@@ -178,20 +179,22 @@ def test_gradients_are_central_differences_beside_an_unstable_loop():
             m.gain_margin_frequency,
             m.phase_margin_frequency,
             m.delay_margin,
-            m.disk_s.gain_high,
-            m.disk_t.phase,
+            m.disk.gain_high,
+            m.disk.phase,
         ]
         return jnp.stack(values), (jnp.stack(values), m.is_stable)
 
-    theta = np.array([1.4, 0.8, 1.3])
+    theta = np.array([1.5, 2.0, 1.3])
     steps = 1e-6 * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
-    thetas = np.concatenate([theta + steps, [[14, 0.8, 1.3]]])
+    thetas = np.concatenate([theta + steps, [[14, 2.0, 1.3]]])
     found = jax.jit(jax.vmap(jax.jacrev(measures, has_aux=True)))(thetas)
     slopes, (values, stable) = jax.tree.map(np.asarray, found)
     assert list(stable) == [True] * 7 + [False]
     assert np.all(np.isfinite(values[:7]))
     numeric = (values[:3] - values[3:6]).T / 2e-6
     assert_close(slopes[6], numeric, rtol=1e-6, atol=1e-7)
+    # A double pole's gain margin, in closed form.
+    assert_close(values[6, 0], (1.3 / 0.3 - 2) / 1.5, rtol=1e-9)
     # And what NumPy computes of concrete numbers.
     for lane in (6, 7):
         assert_close(measures(thetas[lane])[0], values[lane], rtol=1e-9)

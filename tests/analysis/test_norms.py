@@ -96,62 +96,52 @@ def test_of_two_peaks_the_higher_is_found():
     assert peak.gain > 1.02
 
 
-def spring_chain(theta):
-    stiffness, damping, gain = theta
-    A = jnp.array(
-        [[0, 1, 0, 0], [-2, -0.3, 1, 0.1], [0, 0, 0, 1], [1, 0.1, -1, -0.2]], float
-    )
-    A = A.at[1, 0].add(-stiffness).at[3, 3].add(-damping)
-    B = jnp.array([[0, 0], [1, 0], [0, 0], [0, 1]], float).at[1, 0].mul(gain)
-    C = jnp.array([[1.0, 0, 0.2, 0], [0.0, 0, 1, 0]])
-    return LinearSystem(A, B, C)
+SPRING = (
+    np.array([[0, 1], [-3, -0.3]]),
+    np.array([[0.2, 0], [0.5, 1]]),
+    np.array([[1.0, 0.2], [0, 1]]),
+)
+ALIKE = -2 * np.eye(2), np.eye(2), np.eye(2)
 
 
-THETA = np.array([1.0, 0.1, 1.5])
-SIDES = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
+def measures(e, A, B, C, dA, dB):
+    """The sum of two norms and a frequency, as the model moves."""
+    model = LinearSystem(A + e * dA, B + e * dB, C)
+    peak = an.hinf_norm(model, throw=False)
+    return peak.gain + 0.3 * an.h2_norm(model), peak.frequency
 
 
-def test_gradients_are_central_differences_beside_an_unstable_model():
-    """Forwards; the second ones are those of reverse mode."""
+def test_derivatives_are_central_differences_beside_an_unstable_model():
+    """To second order, of a spring, and one of channels alike."""
+    h, still = 1e-5, np.zeros((2, 2))
+    stiffer, damped, stronger = np.zeros((3, 2, 2))
+    stiffer[1, 0], damped[1, 1], stronger[1, 0] = -1, -1, 1
+    ways = (stiffer, still), (damped, still), (still, stronger)
+    batch = [(e, *SPRING, *way) for way in ways for e in (-h, 0.0, h)]
+    batch += [(0.0, *ALIKE, np.eye(2), still)]
+    batch += [(0.0, SPRING[0] - 5 * damped, *SPRING[1:], *ways[0])]
 
-    def measures(theta):
-        model = spring_chain(theta)
-        peak = an.hinf_norm(model, throw=False)
-        values = jnp.stack([peak.gain, an.h2_norm(model), peak.frequency])
-        return values, values
+    @jax.jit
+    @jax.vmap
+    def derivatives(e, *model):
+        both = jax.value_and_grad(lambda e: measures(e, *model), has_aux=True)
+        (values, slope), ((forwards, turning), second) = jax.jvp(both, (e,), (1.0,))
+        return jnp.stack([*values, slope, forwards, turning, second])
 
-    thetas = np.concatenate([THETA + 1e-6 * SIDES, [[1, -5, 1.5]]])
-    slopes, values = jax.jit(jax.vmap(jax.jacfwd(measures, has_aux=True)))(thetas)
-    numeric = np.transpose(values[:3] - values[3:6]) / 2e-6
-    assert_close(slopes[6], numeric, rtol=1e-6, atol=1e-7)
+    found = np.asarray(derivatives(*map(np.stack, zip(*batch, strict=True))))
+    low, here, high = found[:9].reshape(3, 3, 6).swapaxes(0, 1)
+    # The number, the frequency and the slope; and their derivatives.
+    numeric = (high[:, :3] - low[:, :3]) / (2 * h)
+    assert_close(here[:, [3, 4, 5]], numeric, rtol=1e-6, atol=1e-6)
+    assert_close(here[:, 2], here[:, 3], rtol=1e-9)
     # And what NumPy computes of concrete numbers.
-    assert_close(measures(THETA)[0], values[6], rtol=1e-11)
+    assert_close(measures(*batch[1]), here[0, :2], rtol=1e-11)
+    # Of 1 / a in each of two channels.
+    assert_close(found[9, 0], 0.5 + 0.3 * 2**-0.5, rtol=1e-6)
+    assert_close(found[9, 2], 0.25 + 0.3 * 2**-2.5, rtol=1e-4)
     # The unstable one harms no other.
-    assert np.all(np.isinf(values[7, :2])) and np.all(np.isfinite(values[:7]))
-    assert np.all(np.isfinite(slopes))
-
-
-def test_second_derivatives_are_central_differences():
-    gain = lambda theta: an.hinf_norm(spring_chain(theta), throw=False).gain
-
-    def slope(theta):
-        found = jax.grad(gain)(theta)
-        return found, found
-
-    both = jax.jit(jax.vmap(jax.jacfwd(slope, has_aux=True)))
-    curvatures, slopes = both(THETA + 1e-5 * SIDES)
-    numeric = (slopes[:3] - slopes[3:6]) / 2e-5
-    assert_close(curvatures[6], numeric, rtol=1e-6, atol=1e-6)
-
-
-def test_alike_channels_have_finite_gradients():
-    def gain(a):
-        system = LinearSystem(-a * jnp.eye(3), jnp.eye(3))
-        return an.hinf_norm(system, throw=False).gain
-
-    value, slope = jax.jit(jax.value_and_grad(gain))(2.0)
-    assert_close(value, 0.5, rtol=1e-6)
-    assert_close(slope, -0.25, rtol=1e-4)
+    assert np.isinf(found[10, 0]) and np.all(np.isfinite(found[:9]))
+    assert np.all(np.isfinite(found[:, 2:4]))
 
 
 def test_unstable_models_have_infinite_norms():

@@ -38,10 +38,11 @@ def test_contract(name, key):
     w = disturbance.sequence(key, TIMES)
     assert w.shape == (2000, disturbance.size) == (2000, 2)
     assert w.dtype == TIMES.dtype
-    assert_close(draw(disturbance, key, TIMES), w, atol=1e-4)
-    keys = jax.random.split(key, 3)
-    batch = eqx.filter_jit(jax.vmap(lambda k: disturbance.sequence(k, TIMES)))(keys)
-    assert_close(batch[1], draw(disturbance, keys[1], TIMES), atol=1e-4)
+    keys = jnp.stack([key, jax.random.key(1)])
+    batch = jax.jit(jax.vmap(lambda k: disturbance.sequence(k, TIMES)))(keys)
+    assert_close(batch[0], w, atol=1e-4)
+    other = name in ("gaussian", "uniform", "walk", "brownian", "sum", "window")
+    assert np.any(np.asarray(batch[1] != batch[0])) == other
 
 
 @once
@@ -110,8 +111,7 @@ RANDOM = {
     "uniform": lambda n: d.Uniform(-0.1, 0.3, size=n),
     "walk": lambda n: d.RandomWalk(size=n),
     "brownian": lambda n: d.Brownian(n, dt=0.1),
-    "sum": lambda n: d.Gaussian(0.1, size=n) + d.Uniform(-1.0, 1.0, size=n),
-    "window": lambda n: d.Gaussian(0.1, size=n).between(1.0, 20.0),
+    "sum": lambda n: d.Gaussian(0.1, size=n) + d.Uniform(-1, 1, size=n).between(1, 20),
 }
 
 
@@ -120,7 +120,7 @@ RANDOM = {
 def test_a_short_horizon_is_the_beginning_of_a_long_one(name, key):
     """In both precisions."""
     for size, times, shorter in (
-        (1, TIMES, (99, 2)),
+        (1, TIMES, (2,)),
         (3, TIMES.astype(jnp.float32), (17,)),
     ):
         disturbance = RANDOM[name](size)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers import (
     assert_close,
-    assert_gradient,
     central_difference,
     in_both_modes,
     needs_x64,
@@ -52,18 +51,18 @@ def _pendulum(solver, **kwargs):
 CASES = {
     "Euler": lambda: _pendulum(diffrax.Euler()),
     "RK4": lambda: _pendulum(dlx.dynamics.RK4()),
-    "Tsit5, substeps": lambda: _pendulum(diffrax.Tsit5(), substeps=3),
+    "Heun, substeps": lambda: _pendulum(diffrax.Heun(), substeps=3),
     "ImplicitEuler": lambda: _pendulum(diffrax.ImplicitEuler()),
     "Kvaerno3": lambda: _pendulum(diffrax.Kvaerno3()),
     # `test_late_times.py` and `test_integration.py` have the other adjoints.
-    "adaptive": lambda: _pendulum(diffrax.Tsit5(), stepsize_controller=CONTROLLER),
+    "adaptive": lambda: _pendulum(diffrax.Bosh3(), stepsize_controller=CONTROLLER),
     "Euler-Maruyama": lambda: dlx.Discretized(Noisy(), 0.05, substeps=2),
     "Heun, Stratonovich": lambda: dlx.Discretized(Noisy(), 0.05, diffrax.Heun()),
     "Milstein": lambda: dlx.Discretized(Scalar(), 0.05, diffrax.ItoMilstein()),
 }
 
 
-def _cost(dynamics, checkpoint="step"):
+def _cost(dynamics):
     n = dynamics.state_size
     cost = dlx.costs.Quadratic(jnp.eye(n), 0.1 * jnp.eye(1), final=jnp.eye(n))
     env = dlx.Environment(dynamics, cost, horizon=12)
@@ -76,7 +75,6 @@ def _cost(dynamics, checkpoint="step"):
             controller,
             key=jax.random.key(0),
             x0=leaves[1 + n : 1 + 2 * n],
-            checkpoint=checkpoint,
             throw=False,
         ).total_cost
 
@@ -87,7 +85,7 @@ def _cost(dynamics, checkpoint="step"):
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_are_central_differences(name):
     total, at = _cost(CASES[name]())
-    if name in ("RK4", "Kvaerno3", "Euler-Maruyama"):
+    if name in ("RK4", "Euler-Maruyama"):
         slopes = jax.jit(in_both_modes(lambda x: total(x)[None]))
     else:
         slopes = jax.jit(jax.value_and_grad(total))
@@ -98,14 +96,8 @@ def test_gradients_are_central_differences(name):
         assert_close(gradient.ravel(), expected, atol=1e-8 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("checkpoint", ["sqrt", None])
-def test_checkpoints(checkpoint):
-    total, at = _cost(CASES["RK4"](), checkpoint)
-    assert_gradient(total, at, step=1e-5, rtol=1e-6)
-
-
 def test_second_order():
-    total, at = _cost(CASES["RK4"]())
+    total, at = _cost(CASES["Euler"]())
 
     def slope(x):
         found = jax.grad(total)(x)

@@ -17,16 +17,13 @@ import delucax as dlx
 
 PID = diffrax.PIDController(rtol=1e-6, atol=1e-8)
 KINDS = {
-    "explicit": dict(solver=diffrax.Tsit5()),
     "explicit substeps": dict(solver=dlx.dynamics.RK4(), substeps=3),
-    "implicit": dict(solver=diffrax.Kvaerno3()),
     "implicit substeps": dict(solver=diffrax.ImplicitEuler(), substeps=3),
     "adaptive": dict(solver=diffrax.Tsit5(), stepsize_controller=PID),
     "adaptive implicit": dict(solver=diffrax.Kvaerno3(), stepsize_controller=PID),
-    "Euler-Maruyama": dict(solver=diffrax.Euler(), substeps=2),
     "Milstein": dict(solver=diffrax.ItoMilstein(), substeps=2),
 }
-NOISY = ("Euler-Maruyama", "Milstein")
+NOISY = ("Milstein",)
 X, U = np.array([0.7, -1.3]), np.array([0.4])
 DISTURBANCE = {True: np.array([0.1, -0.2, 0.3, 0.05]), False: np.array([0.1, -0.2])}
 
@@ -114,9 +111,7 @@ def ulps(single, double):
     return np.max(np.abs(single - np.asarray(double)) / np.spacing(np.abs(single)))
 
 
-# Implicit steps, adaptive ones and substeps are each there without the others.
-COMBINED = "implicit substeps", "adaptive implicit"
-LATE = [*(kind for kind in KINDS if kind not in COMBINED), "map"]
+LATE = [*(kind for kind in KINDS if kind != "adaptive implicit"), "map"]
 
 
 @needs_x64
@@ -168,7 +163,6 @@ backwards_alone.defvjp(
 
 
 @needs_x32
-@pytest.mark.parametrize("t", [0.0, 1e4])
 @pytest.mark.parametrize(
     "signal",
     [
@@ -181,17 +175,23 @@ backwards_alone.defvjp(
     ],
     ids=["custom_vjp", "in jit", "in scan", "kink", "callback", "floor"],
 )
-def test_a_field_without_derivatives_is_evaluated_as_it_is(signal, t):
+def test_a_field_without_derivatives_is_evaluated_as_it_is(signal):
     field = lambda t, x, u, w: signal(t) + u - x
     system, h = dlx.system(field, states=1, controls=1), 2.0**-7
     dynamics = dlx.Discretized(system, 2 * h, diffrax.Euler(), substeps=2)
     x, u = jnp.ones(1), jnp.array([0.3])
-    step = lambda t: dynamics.advance(t, x, u, None)[0]
-    t = jnp.float32(t)
-    half = x + h * field(t, x, u, None)
-    expected = half + h * field(t + h, half, u, None)
-    for found in (step(t), jax.jit(step)(t), jax.vmap(step)(t[None])[0]):
-        assert_close(found, expected, rtol=1e-6)
+    step = jax.jit(lambda t: dynamics.advance(t, x, u, None)[0])
+    batch = jax.jit(jax.vmap(step))
+
+    @jax.jit
+    def by_hand(t):
+        half = x + h * field(t, x, u, None)
+        return half + h * field(t + h, half, u, None)
+
+    times = np.array([0.0, 1e4], np.float32)
+    expected = [by_hand(t) for t in times]
+    assert_close([step(t) for t in times], expected, rtol=1e-6)
+    assert_close(batch(times), expected, rtol=1e-6)
 
 
 @needs_x32
@@ -221,23 +221,22 @@ def adaptive(system, adjoint):
     return dlx.Discretized(
         system,
         0.1,
-        diffrax.Tsit5(),
-        stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9),
+        diffrax.Bosh3(),
+        stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
         adjoint=adjoint,
     )
 
 
 @needs_x64
-@pytest.mark.parametrize("name", ["stored", "direct", "backsolve", "fixed"])
+@pytest.mark.parametrize("name", ["stored", "backsolve", "fixed"])
 def test_gradients_of_a_step(name):
     adjoints = {
         "stored": diffrax.RecursiveCheckpointAdjoint(),
-        "direct": diffrax.DirectAdjoint(),
         "backsolve": diffrax.BacksolveAdjoint(),
     }
     system = dlx.system(lambda t, x, u, w: jnp.sin(3 * t) * x + u, states=1, controls=1)
     if name == "fixed":
-        dynamics = dlx.Discretized(system, 0.1, substeps=2)
+        dynamics = dlx.Discretized(system, 0.1, diffrax.Heun(), substeps=2)
     else:
         dynamics = adaptive(system, adjoints[name])
     x, u = jnp.ones(1), jnp.array([0.3])

@@ -187,6 +187,7 @@ def test_linear_cartpole_is_the_nonlinear_one_of_a_point_mass():
     assert_close(A[3, 2], rate, rtol=1e-5)
 
 
+@once
 def test_an_lqr_of_the_linearisation_holds_the_pole(key):
     env = dlx.make("cartpole")
     lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), jnp.eye(4), jnp.eye(1))

@@ -1,5 +1,6 @@
 """A planner of a user's own, written with public names alone."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +29,7 @@ class Shooting(dlx.planning.AbstractPlanner):
         return problem.plan(*problem.roll_out(controls))
 
 
-PENDULUM = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+PENDULUM = dlx.Discretized(dlx.systems.Pendulum(), 0.1, diffrax.Euler())
 COST = dlx.costs.Quadratic([1.0, 0.1], [0.1])
 X0 = jnp.array([0.3, 0.0])
 
@@ -50,7 +51,8 @@ def test_a_planner_of_ones_own():
 
 def test_a_plan_that_diverges_gives_way_to_the_fallback():
     wild = dlx.system(lambda t, x, u, w: 1e3 * x**3 + u, states=1, controls=1)
-    given = dlx.Discretized(wild, dt=0.1), dlx.costs.Quadratic([1.0], [1.0]), [1.0]
+    wild = dlx.Discretized(wild, 0.1, diffrax.Euler())
+    given = wild, dlx.costs.Quadratic([1.0], [1.0]), [1.0]
     plan = Shooting()(*given, jnp.zeros((8, 1)), throw=False)
     assert plan.result == dlx.RESULTS.diverged and not plan.is_usable
     spare = dlx.planning.Start(jnp.ones((8, 1)), jnp.ones((9, 1)), jnp.ones((8, 1, 1)))

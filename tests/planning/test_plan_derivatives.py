@@ -4,6 +4,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import (
     assert_close,
@@ -46,7 +47,7 @@ def outcomes(theta, horizon=12, speed=None, **options):
     start = jnp.zeros((horizon, 1))
     options = dict(tolerance=1e-11, line_search="backtracking") | options
     plan = ilqr(dynamics, cost, x0, start, **options)
-    found = plan.cost, plan.controls[0, 0], plan.gains[3, 0, 1], plan.states[-4, 0]
+    found = plan.cost, plan.controls[0, 0], plan.gains[1, 0, 1], plan.states[-2, 0]
     return jnp.stack(found)
 
 
@@ -60,9 +61,8 @@ def check(f, at):
     return reverse
 
 
-@pytest.mark.parametrize("options", [dict(bounds=(-4.0, 4.0)), dict()])
-def test_against_finite_differences(options):
-    check(lambda theta: outcomes(theta, **options), AT)
+def test_against_finite_differences():
+    check(lambda theta: outcomes(theta, bounds=(-4.0, 4.0)), AT)
 
 
 def check_gradient(f, at):
@@ -75,9 +75,9 @@ def check_gradient(f, at):
 @pytest.mark.parametrize(
     "options",
     [
+        dict(),
         dict(second_order=True),
-        dict(parallel=True, horizon=5),
-        dict(regularise="state"),
+        dict(parallel=True, horizon=2),
     ],
 )
 def test_gradients_of_other_ways(options):
@@ -92,7 +92,7 @@ def test_with_active_constraints():
 
 
 def test_of_bounds_disturbances_and_time_twice():
-    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), 0.1, diffrax.Euler())
     reference = lambda t: jnp.stack([jnp.sin(t), jnp.cos(t)])
     cost = dlx.costs.Tracking([1.0, 0.1], [0.01], reference)
 
@@ -104,29 +104,25 @@ def test_of_bounds_disturbances_and_time_twice():
 
     at = jnp.array([2.5, 0.02, 1.5])
 
-    def slopes(a):
-        both = jax.value_and_grad(optimal)(a)
-        return both[1], both
-
-    both = jax.jit(jax.jacfwd(slopes, has_aux=True))
-    twice, (_, gradient) = both(at)
-    expected = central_difference(lambda a: both(a)[1][0], at, step=1e-5)
+    way = np.array([1.0, -0.5, 0.7])
+    both = jax.jit(lambda a: jax.jvp(jax.value_and_grad(optimal), (a,), (way,)))
+    (_, gradient), (_, twice) = both(at)
+    expected = central_difference(lambda a: both(a)[0][0], at, step=1e-5)
     assert_close(gradient, expected, rtol=1e-5, atol=1e-7)
-    assert jnp.all(jnp.abs(expected) > 1e-3)
-    for i, row in enumerate(twice):
-        expected = central_difference(lambda a, i=i: both(a)[1][1][i], at, step=1e-5)
-        assert_close(row, expected, rtol=1e-5, atol=1e-5)
+    assert np.all(np.abs(expected) > 1e-3)
+    high, low = (both(at + h * way)[0][1] for h in (1e-5, -1e-5))
+    assert_close(twice, (high - low) / 2e-5, rtol=1e-5, atol=1e-5)
 
 
 def test_it_does_not_depend_on_the_guess():
-    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), 0.1, diffrax.Euler())
     cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
 
     def optimal(scale):
         start = scale * jnp.ones((8, 1))
         return ilqr(dynamics, cost, jnp.array([0.5, 0.0]), start).cost
 
-    assert jax.grad(optimal)(1.0) == 0
+    assert jax.jit(jax.grad(optimal))(1.0) == 0
 
 
 def test_an_unconverged_plan_is_not_detached():

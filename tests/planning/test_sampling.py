@@ -42,12 +42,12 @@ def test_the_minimum_of_a_linear_problem(planner, options):
     followed = dlx.open_loop(problem[0], X0, plan.controls)
     assert_close(followed, plan.states, atol=1e-12)
     # A warm start goes on; other keys draw others.
-    options = options | dict(iterations=1)
+    options = options | dict(iterations=20)
     warm = planned(planner, *problem[:3], plan.controls, **options)
     assert_close(warm.trace[0], plan.cost, rtol=1e-14)
     assert warm.cost <= warm.trace[0]
     other = planned(planner, *problem, key=jax.random.key(1), **options)
-    assert other.cost != planned(planner, *problem, **options).cost
+    assert other.cost != plan.cost
 
 
 class Cliff(dlx.AbstractCost):
@@ -70,7 +70,7 @@ def test_what_diverges_has_no_part_in_it(planner, options):
     assert 0 <= plan.cost < 8 == plan.trace[0]
     cost = lambda x: planned(planner, dynamics, Cliff(), x, U).cost
     assert jnp.all(jnp.isfinite(jax.jit(jax.grad(cost))(x0)))
-    start = dict(scale=1e-3, iterations=2)
+    start = dict(scale=1e-3, **options)
     lost = planned(planner, dynamics, Cliff(), x0, U + 1, throw=False, **start)
     assert lost.result == dlx.RESULTS.diverged and jnp.isinf(lost.cost)
     assert_close(lost.controls, U + 1)
@@ -101,15 +101,16 @@ def test_bounds_batches_and_derivatives(planner, options):
 
     keys = jax.random.split(KEY, 2)
     starts = jnp.stack([X0, -2 * X0])
-    costs, controls = jax.jit(jax.vmap(optimal))(starts, keys)
+    steps = 1e-6 * np.concatenate([np.eye(2), -np.eye(2)])
+    starts = jnp.concatenate([starts, X0 + steps])
+    keys = keys[jnp.array([0, 1, 0, 0, 0, 0])]
+    both = jax.jit(jax.vmap(jax.value_and_grad(optimal, has_aux=True)))
+    (costs, controls), slopes = both(starts, keys)
     assert jnp.all((controls >= -0.2) & (controls <= 0.3))
     assert jnp.min(controls) < -0.18 and jnp.max(controls) > 0.28
-    both = jax.jit(jax.value_and_grad(lambda x, key: optimal(x, key)[0]))
-    assert_close(costs[1], both(starts[1], keys[1])[0], rtol=1e-12)
-    slope = both(X0, KEY)[1]
-    for i, way in enumerate(np.eye(2)):
-        up, down = (both(X0 + h * way, KEY)[0] for h in (1e-6, -1e-6))
-        assert_close(slope[i], (up - down) / 2e-6, rtol=1e-8)
+    if planner is MPPI:
+        assert_close(costs[1], optimal(starts[1], keys[1])[0], rtol=1e-12)
+    assert_close(slopes[0], (costs[2:4] - costs[4:]) / 2e-6, rtol=1e-8)
 
 
 @once

@@ -21,9 +21,10 @@ def exam(name, *problem):
     solution = dlx.riccati.care(A, B, Q, R, throw=False)
     X = np.asarray(solution.X)
     residual, loop = riccati_systems.continuous_residual(A, B, Q, R, X)
-    if len(A) < 10:
+    if len(A) < 10 and "," not in name or name.startswith("CAREX 8"):
         # Where R is of high condition, double precision does not measure it.
         residual = riccati_systems.true_residual(False, A, B, Q, R, X)
+        assert residual <= solution.residual, name
     assert residual < 1e-12 and solution.residual < 1e-12, name
     if name == "CAREX 11":
         # X = [[2, 1], [1, 1]], whose loop has the eigenvalues +-i.
@@ -52,9 +53,16 @@ def test_published_systems(number):
 compiled = jax.jit(lambda *problem: dlx.riccati.care(*problem, throw=False))
 
 
-@pytest.mark.parametrize("number", [4, 14])
-def test_compiled(number):
-    check_compiled(number)
+def test_compiled():
+    """One program, of those of two states and one control. `test_care.py` has
+    others."""
+    shapes = [(2, 2), (2, 1)]
+    numbers = [
+        k for k, M in enumerate(SYSTEMS, 1) if [m.shape for m in M[1:3]] == shapes
+    ]
+    assert len(numbers) >= 5
+    for k in numbers:
+        check_compiled(k)
 
 
 @minutes("a program is compiled for each size, the largest of 421 states")

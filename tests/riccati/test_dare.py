@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import assert_close, needs_x64, once, tolerance, user_error
+from helpers import assert_close, dtype, needs_x64, once, tolerance, user_error
 
 import delucax as dlx
 
 
-A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
-B = jnp.array([[0.0], [1.0]])
-Q, R = jnp.eye(2), jnp.eye(1)
+A = np.array([[1.0, 1.0], [0.0, 1.0]])
+B = np.array([[0.0], [1.0]])
+Q, R = np.eye(2), np.eye(1)
 
 
 def random_problem(seed, n, m):
@@ -107,6 +107,9 @@ def rotated(modes, B, seen):
     return A, ROTATION @ np.array(B)[:, None], (Q + Q.T) / 2
 
 
+compiled = jax.jit(lambda *data: dlx.riccati.dare(*data, throw=False))
+
+
 @pytest.mark.parametrize(
     "A, B, Q, status",
     [
@@ -119,23 +122,35 @@ def rotated(modes, B, seen):
     ],
 )
 def test_no_stabilising_solution(A, B, Q, status):
-    A, B = jnp.asarray(A, float), jnp.asarray(B, float)
+    A, B, Q = (np.asarray(M, dtype()) for M in (A, B, Q))
     solution = dlx.riccati.dare(A, B, Q, R, throw=False)
     assert solution.result == getattr(dlx.RESULTS, status)
+    assert compiled(A, B, Q, np.asarray(R, dtype())).result == solution.result
     with pytest.raises(RuntimeError, match="dare: .*throw=False"):
         dlx.riccati.dare(A, B, Q, R)
-    with pytest.raises(eqx.EquinoxRuntimeError):
-        eqx.filter_jit(dlx.riccati.dare)(A, B, Q, R)
 
 
-def test_ill_posed_where_it_cannot_be_seen():
-    solve = jax.jit(lambda A, R: dlx.riccati.dare(A, B, Q, R, throw=False).result)
-    ill_posed = dlx.RESULTS.ill_posed
-    assert solve(A, R) == dlx.RESULTS.successful
-    assert solve(A.at[0, 0].set(jnp.nan), R) == ill_posed
-    assert solve(A, -R) == ill_posed
-    E = jnp.diag(jnp.array([1.0, 0.0]))
-    assert dlx.riccati.dare(A, B, Q, R, None, E, throw=False).result == ill_posed
+@once
+def test_a_compiled_solve_raises():
+    A = np.diag([1.2, 0.5])
+    with pytest.raises(eqx.EquinoxRuntimeError, match="dare: .*stabilis"):
+        jax.block_until_ready(eqx.filter_jit(dlx.riccati.dare)(A, B, Q, R))
+
+
+def test_compiled_and_where_it_cannot_be_seen():
+    data = [np.asarray(M, dtype()) for M in (A, B, Q, R)]
+    solve, ill_posed = compiled, dlx.RESULTS.ill_posed
+    found, at_once = solve(*data), dlx.riccati.dare(*data)
+    assert found.result == at_once.result == dlx.RESULTS.successful
+    assert_close(found.X, at_once.X, rtol=tolerance(3e-4, 1e-11))
+    assert_close(found.K, at_once.K, rtol=tolerance(3e-4, 1e-11))
+    unknown = np.where([[True, False], [False, False]], np.nan, A)
+    assert solve(unknown, *data[1:]).result == ill_posed
+    assert solve(*data[:3], -data[3]).result == ill_posed
+    asymmetric = np.array([[1.0, 0.5], [0.0, 1.0]], dtype())
+    assert solve(*data[:2], asymmetric, data[3]).result == ill_posed
+    E = np.diag([1.0, 0.0])
+    assert dlx.riccati.dare(*data, None, E, throw=False).result == ill_posed
 
 
 def test_least_energy():
@@ -169,9 +184,10 @@ def test_complex_data():
 @needs_x64
 def test_dead_beat_loop_has_a_gradient():
     nilpotent = jnp.array([[0.0, 1.0], [0.0, 0.0]])
-    solve = lambda A: dlx.riccati.dare(A, jnp.zeros((2, 1)), Q, R)
-    assert solve(nilpotent).spectral_radius == 0
-    gradient = jax.grad(lambda A: jnp.sum(solve(A).X))(nilpotent)
+    rest = np.zeros((2, 1)), Q, R
+    assert dlx.riccati.dare(nilpotent, *rest).spectral_radius == 0
+    total = lambda A: jnp.sum(dlx.riccati.dare(A, *rest, throw=False).X)
+    gradient = jax.jit(jax.grad(total))(nilpotent)
     # X is the sum of (A^k)' A^k, and A^2 = 0: so dX = dA' A + A' dA.
     assert_close(gradient, [[2.0, 2.0], [0.0, 0.0]], atol=1e-12)
 

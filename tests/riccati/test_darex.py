@@ -23,6 +23,9 @@ def exam(name, *problem):
     residual, loop = riccati_systems.discrete_residual(A, B, Q, R, solution.X)
     assert solution.result == dlx.RESULTS.successful, name
     assert residual < 1e-12 and solution.residual < 1e-12, name
+    if len(A) < 10 and "," not in name:
+        true = riccati_systems.true_residual(True, A, B, Q, R, solution.X)
+        assert true <= solution.residual, name
     assert solution.spectral_radius < 1, name
     assert np.max(np.abs(np.linalg.eigvals(loop))) < 1, name
     return solution
@@ -48,9 +51,22 @@ def test_published_systems(size):
 compiled = jax.jit(lambda *problem: dlx.riccati.dare(*problem, throw=False))
 
 
-@pytest.mark.parametrize("number", [3, 14])
-def test_compiled(number):
-    check_compiled(number)
+@needs_x64
+def test_compiled():
+    """One program, of those of two states and one control."""
+    shapes = [(2, 2), (2, 1)]
+    numbers = [
+        k for k, M in enumerate(SYSTEMS, 1) if [m.shape for m in M[1:3]] == shapes
+    ]
+    assert len(numbers) >= 5
+    for k in numbers[1:]:  # the first is complex
+        check_compiled(k)
+
+
+@needs_x64
+def test_complex_data_compiled():
+    assert np.iscomplexobj(SYSTEMS[0][1])
+    check_compiled(1)
 
 
 @minutes("a program is compiled for each size")

@@ -5,13 +5,13 @@ import functools
 import hypothesis
 import hypothesis.strategies as st
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import riccati_systems
-from helpers import dtype, needs_x64
+from helpers import dtype, once
 
 import delucax as dlx
+from delucax._host import host_unless_traced
 from delucax.riccati._arguments import RiccatiData
 from delucax.riccati._residual import linear_residual, riccati_residual
 
@@ -20,13 +20,18 @@ N, M = 3, 2
 
 
 @functools.cache
-def measured(discrete, descriptor=False):
+def measured(discrete):
+    return jax.jit(by_numpy(discrete, True))
+
+
+def by_numpy(discrete, descriptor):
+    @host_unless_traced
     def bound(accurately, A, B, Q, R, S, E, X):
         E = E if descriptor else None
         data = RiccatiData(A, B, Q, R, S, E)
         return riccati_residual(discrete, data, X, accurately).bounds[0]
 
-    return jax.jit(bound)
+    return bound
 
 
 def problem(seed, spread):
@@ -41,17 +46,17 @@ def problem(seed, spread):
     return tuple(np.asarray(Y, kind) for Y in (draw(N, N), B, Q, R, S, E, X))
 
 
-@pytest.mark.parametrize("descriptor", [False, True])
 @pytest.mark.parametrize("discrete", [False, True])
 @hypothesis.settings(max_examples=25, deadline=None, derandomize=True)
 @hypothesis.given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0, 3))
-def test_it_bounds_the_true_one(discrete, descriptor, seed, spread):
+def test_it_bounds_the_true_one(discrete, seed, spread):
+    """Compiled, and by NumPy."""
     A, B, Q, R, S, E, X = problem(seed, spread)
     said = [
-        float(measured(discrete, descriptor)(accurately, A, B, Q, R, S, E, X))
+        float(way(accurately, A, B, Q, R, S, E, X))
+        for way in (measured(discrete), by_numpy(discrete, True))
         for accurately in (False, True)
     ]
-    E = E if descriptor else None
     true = riccati_systems.true_residual(discrete, A, B, Q, R, X, S, E)
     assert true <= min(said)
 
@@ -67,23 +72,12 @@ def test_it_is_close_near_a_solution(discrete, seed):
     if not np.all(np.isfinite(X)):
         return
     data = A, B, Q, R, 0 * S, np.eye(N, dtype=A.dtype), X
-    wide, said = (float(measured(discrete)(flag, *data)) for flag in (False, True))
+    of = by_numpy(discrete, False)
+    wide, said = (float(of(np.array(flag), *data)) for flag in (False, True))
     true = riccati_systems.true_residual(discrete, A, B, Q, R, X)
     eps = np.finfo(A.dtype).eps
     assert true <= said <= 2 * true + 0.1 * eps
     assert true <= wide
-
-
-@needs_x64
-def test_a_control_weight_of_high_condition():
-    """CAREX 8, where a residual in double precision is below 1e-13 at an X whose true
-    residual is 1.2e-12."""
-    (data,) = (d for name, *d in riccati_systems.carex() if name == "CAREX 8")
-    data = [np.asarray(Y, float) for Y in data]
-    solution = jax.jit(lambda *data: dlx.riccati.care(*data, throw=False))(*data)
-    true = riccati_systems.true_residual(False, *data, solution.X)
-    assert solution.result == dlx.RESULTS.successful
-    assert true <= solution.residual < 1e-12
 
 
 @pytest.mark.parametrize("discrete", [False, True])
@@ -109,7 +103,7 @@ def test_games(name):
     rng = np.random.default_rng(0)
     kind = dtype()
     solve = getattr(dlx.riccati, name)
-    for _ in range(10):
+    for _ in range(4):
         A = rng.normal(size=(N, N)) / 2
         data = A, rng.normal(size=(N, M)), np.eye(N), np.eye(N), np.eye(M)
         A, B, D, Q, R = (np.asarray(Y, kind) for Y in data)
@@ -124,19 +118,19 @@ def test_games(name):
 
 
 def systems():
-    """The published ones, in this precision; CAREX 20 takes minutes."""
+    """The published ones of few states in single precision, where a bound is hard.
+    `test_carex.py` and `test_darex.py` have them in double precision."""
     for name, *data in riccati_systems.carex() + riccati_systems.darex():
-        complex_data = any(map(np.iscomplexobj, data))
-        if name == "CAREX 20" or complex_data and dtype() != jnp.float64:
+        if len(data[0]) > 12 or any(map(np.iscomplexobj, data)):
             continue
-        kind = complex if complex_data else dtype()
         yield pytest.param(
             name.startswith(("DAREX", "user")),
-            *(np.asarray(Y, kind) for Y in data),
+            *(np.asarray(Y, np.float32) for Y in data),
             id=name.replace(" ", "-"),
         )
 
 
+@once
 @pytest.mark.parametrize("discrete, A, B, Q, R", list(systems()))
 def test_published_systems(discrete, A, B, Q, R):
     solve = dlx.riccati.dare if discrete else dlx.riccati.care

@@ -2,7 +2,6 @@
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,6 +36,7 @@ def as_dtype(data):
     return tuple(None if D is None else np.asarray(D, dtype()) for D in data)
 
 
+@needs_x64
 @pytest.mark.parametrize("descriptor", [False, True])
 @pytest.mark.parametrize("name", ["dare", "care"])
 def test_the_gain_is_that_of_the_plain_problem(name, descriptor):
@@ -44,34 +44,17 @@ def test_the_gain_is_that_of_the_plain_problem(name, descriptor):
     rng = np.random.default_rng(0)
     for seed in range(8):
         plain = problem(seed, descriptor)
-        power = tolerance(2, 5)
-        units = 10.0 ** rng.uniform(-power, power, N)
+        units = 10.0 ** rng.uniform(-5, 5, N)
         data = as_dtype(in_units(units, *plain))
         wanted, solution = solve(*as_dtype(plain)), solve(*data)
         assert solution.result == wanted.result == dlx.RESULTS.successful
         error = np.max(np.abs(solution.K * units - wanted.K))
-        assert error < tolerance(1e-3, 1e-11) * np.max(np.abs(wanted.K))
+        assert error < 1e-11 * np.max(np.abs(wanted.K))
         A, B, Q, R, S, E = data
         true = riccati_systems.true_residual(
             name == "dare", A, B, Q, R, solution.X, S, E
         )
         assert true <= solution.residual
-
-
-@needs_x64
-def test_derivatives():
-    plain = problem(0, False)
-    units = np.array([1e-3, 1.0, 1e2, 1e3])
-
-    @jax.jit
-    @jax.grad
-    def slope(size, A, B, Q, R):
-        return dlx.riccati.care(size * A, B, Q, R, throw=False).K[0, 0]
-
-    here, there = (
-        slope(1.0, *as_dtype(data)[:4]) for data in (plain, in_units(units, *plain))
-    )
-    np.testing.assert_allclose(there * units[0], here, rtol=1e-10)
 
 
 def test_a_gain_in_single_precision():
@@ -91,7 +74,10 @@ CHAINS = {
 
 
 @pytest.mark.parametrize("rows", [False, True])
-@pytest.mark.parametrize("chain", ["double", "triple", "triangular"])
+@pytest.mark.parametrize(
+    "chain",
+    [pytest.param(c, marks=needs_x64) for c in ("double", "triangular")] + ["triple"],
+)
 @pytest.mark.parametrize("name", ["dare", "care"])
 def test_chains_of_integrators(name, chain, rows):
     """One state moves the next alone: nothing but the control and the cost tells how

@@ -117,7 +117,7 @@ def test_mpc_tells_of_its_plans(key):
 
 @once
 def test_what_is_inside_another_controller_is_counted(key):
-    env = dlx.make("pendulum", horizon=10)
+    env = dlx.make("pendulum", horizon=5, solver=diffrax.Euler())
     learner = dlx.controllers.gpc(
         env.dynamics, env.cost, base=dlx.controllers.Linear([[20.0, 5.0]])
     )
@@ -148,18 +148,25 @@ def test_a_learner_refuses_what_is_not_finite(key):
     assert np.any(np.asarray(run.controller_state.theta) != 0)
 
 
+class After(eqx.Module):
+    end: jax.Array
+
+    def __call__(self, t, x):
+        return t > self.end
+
+
 @once
 @pytest.mark.parametrize("end", [3, 8, 9])
 def test_an_episode_that_ends_in_its_last_step_has_ended(key, end):
-    env = dlx.make("pendulum", horizon=8)
-    env = dlx.replace(env, {"terminated": lambda t, x: t > (end - 0.5) * env.dt})
+    env = dlx.make("pendulum", horizon=8, solver=diffrax.Euler())
+    env = dlx.replace(env, {"terminated": After(jnp.asarray((end - 0.5) * env.dt))})
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT)
     assert bool(run.ended) == (end <= 8)
     assert bool(run.summary()["terminated"][0]) == (end <= 8)
     lean = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT, keep=())
     assert lean.statistics()["terminated"] == (end <= 8)
-    for start in (0, 2, 3, 7):
-        for stop in range(start + 1, 9):
+    for start in (0, 2, 7):
+        for stop in {start + 1, 3, 8} - set(range(start + 1)):
             assert bool(run[start:stop].ended) == (end <= stop)
             if end <= 8:
                 assert bool(run[start:stop].terminated[-1]) == (end <= stop)
@@ -174,15 +181,16 @@ def test_a_cut_keeps_the_derivative_of_the_start(key):
         options = dict(key=key, truncate=truncate, horizon=horizon)
         return dlx.rollout(env, feedback, x0=x0, **options).total_cost
 
-    whole = jax.grad(cost)(UPRIGHT, None)
+    slope = jax.jit(jax.grad(cost), static_argnums=(1, 2))
+    whole = slope(UPRIGHT, None)
     assert np.all(np.asarray(whole) != 0)
     for truncate in (6, 100):
-        assert_close(jax.grad(cost)(UPRIGHT, truncate), whole, rtol=1e-12)
+        assert_close(slope(UPRIGHT, truncate), whole, rtol=1e-12)
     # With a cut before step 2 the start is charged for steps 0 and 1.
-    first = jax.grad(cost)(UPRIGHT, None, 2)
+    first = slope(UPRIGHT, None, 2)
     last = dlx.rollout(env, feedback, key=key, x0=UPRIGHT, horizon=2).final_state
     assert env.cost.final(0.1, last) == 0
-    assert_close(jax.grad(cost)(UPRIGHT, 2), first, rtol=1e-12)
+    assert_close(slope(UPRIGHT, 2), first, rtol=1e-12)
 
 
 class Implicit(dlx.AbstractSystem):
@@ -208,8 +216,7 @@ class Implicit(dlx.AbstractSystem):
 @pytest.mark.parametrize(
     "stacked, checkpoint, solver",
     [
-        (False, "step", None),
-        (True, "step", None),
+        (True, "step", diffrax.Euler()),
         (False, "sqrt", diffrax.Heun()),
         (False, None, diffrax.ImplicitEuler()),
     ],
@@ -225,19 +232,14 @@ def test_derivatives_through_a_field_that_solves(key, stacked, checkpoint, solve
         options = dict(key=key, horizon=8, checkpoint=checkpoint)
         return dlx.rollout(there, feedback, x0=z[1:], **options).total_cost
 
-    def last(z):
-        there = dlx.replace(plant, {"system.m": z[0]})
-        return jnp.sum(dlx.open_loop(there, z[1:], jnp.ones((5, 1)))[-1] ** 2)
-
     z = jnp.array([0.7, 0.8, -0.3])
-    for f in (cost, last) if checkpoint == "step" else (cost,):
-        assert_gradient(f, z, step=1e-5, rtol=1e-6, atol=1e-6)
+    assert_gradient(cost, z, step=1e-5, rtol=1e-6, atol=1e-6)
 
 
 @once
 def test_one_solve_counts_too(key):
     pendulum = dlx.systems.Pendulum()
-    options = dict(dt=0.05, key=key, substeps=2)
+    options = dict(dt=0.05, key=key, solver=diffrax.Euler())
     run = dlx.simulate(pendulum, Cautious("failed_plan"), 0.0, 1.0, UPRIGHT, **options)
     fast = np.abs(np.asarray(run.observations[:, 1])) > 1
     assert 0 < fast.sum() < 20

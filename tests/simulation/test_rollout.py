@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import (
     assert_close,
-    central_difference,
+    assert_gradient,
     CountCalls,
     needs_x64,
     once,
@@ -59,9 +59,9 @@ def lds(**kwargs):
 
 def test_matches_a_loop_by_hand(key):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
-    run = dlx.rollout(env, FEEDBACK, key=key, horizon=30, x0=UPRIGHT)
+    run = dlx.rollout(env, FEEDBACK, key=key, horizon=6, x0=UPRIGHT)
     x, total = UPRIGHT, 0.0
-    for k in range(30):
+    for k in range(6):
         u, _ = FEEDBACK(k * 0.05, x, None)
         step = env.step(k * 0.05, x, u, run.disturbances[k])
         assert_close(run.controls[k], step.control, atol=tolerance(1e-5, 1e-12))
@@ -102,12 +102,14 @@ def test_applied_sees_the_saturated_control(key):
 def test_a_batch_is_vmap(key):
     env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.05, size=2))
     keys = jax.random.split(key, 3)
-    batch = jax.vmap(lambda k: dlx.rollout(env, FEEDBACK, key=k, horizon=20))(keys)
+    run = lambda k: dlx.rollout(env, FEEDBACK, key=k, horizon=20)
+    batch = jax.jit(jax.vmap(run))(keys)
     assert batch.states.shape == (3, 21, 2) and batch.batch_shape == (3,)
-    for i in range(3):
-        one = dlx.rollout(env, FEEDBACK, key=keys[i], horizon=20)
-        assert_close(batch[i].states, one.states, atol=tolerance(2e-5, 1e-12))
-        assert_close(batch.times[i], one.times)
+    for i in range(2):
+        one = run(keys[i])
+        states, times = np.asarray(batch.states)[i], np.asarray(batch.times)[i]
+        assert_close(states, one.states, atol=tolerance(2e-5, 1e-12))
+        assert_close(times, one.times)
 
 
 @needs_x64
@@ -127,7 +129,8 @@ def test_checkpoints_change_no_number(key, horizon):
         return run.total_cost
 
     K = jnp.array([[5.0, 1.0]])
-    values = [jax.value_and_grad(cost)(K, c) for c in ("step", "sqrt", None)]
+    both = jax.jit(jax.value_and_grad(cost), static_argnums=1)
+    values = [both(K, c) for c in ("step", "sqrt", None)]
     for value, gradient in values[1:]:
         assert_close(value, values[0][0], rtol=1e-12)
         assert_close(gradient, values[0][1], rtol=1e-10)
@@ -148,7 +151,7 @@ def test_gradient_is_that_of_central_differences(key):
         return dlx.rollout(plant, feedback, key=key, x0=x0, horizon=100).total_cost
 
     at = jnp.array([1.1, 0.1, 15.0, 3.0, 0.2, -0.1])
-    assert_close(jax.grad(cost)(at), central_difference(cost, at), rtol=1e-6)
+    assert_gradient(cost, at, rtol=1e-6)
 
 
 def test_gradient_decay(key):
@@ -174,7 +177,7 @@ class Final(dlx.AbstractCost):
 
 @once
 def test_keep(key):
-    env = dlx.make("pendulum")
+    env = dlx.make("pendulum", solver=diffrax.Euler())
     full = dlx.rollout(env, FEEDBACK, key=key, horizon=9)
     lean = dlx.rollout(env, FEEDBACK, key=key, horizon=9, keep=())
     assert lean.states is lean.controls is lean.costs is lean.observations is None
@@ -405,7 +408,7 @@ def test_what_follows_the_end_does_not_reach_the_gradient(key):
     cost = lambda x0: dlx.rollout(env, zero, key=key, x0=x0).total_cost
     x0 = jnp.ones(1)
     assert dlx.rollout(env, zero, key=key, x0=x0).length < 40
-    assert_close(jax.grad(cost)(x0), central_difference(cost, x0), rtol=1e-6)
+    assert_gradient(cost, x0, rtol=1e-6)
 
 
 @once

@@ -30,7 +30,7 @@ def test_tanks_drain_by_torricelli():
     out = np.sqrt(2 * 981.0) * np.array([0.071 * np.sqrt(9.0), 0.05 * np.sqrt(4.0)])
     expected = [(12.0 - out[0]) / 28, (out[0] - out[1]) / 28]
     assert_close(field(tanks, [9.0, 4.0], [12.0]), expected, rtol=1e-5)
-    slope = jax.jacobian(lambda x: field(tanks, x, [0.0]))(jnp.zeros(2))
+    slope = jax.jit(jax.jacobian(lambda x: field(tanks, x, [0.0])))(jnp.zeros(2))
     assert np.all(np.isfinite(slope)) and slope[0, 0] < 0
 
 
@@ -56,17 +56,19 @@ def test_a_reactor_rests_at_any_concentration():
         assert_close(x[0], c)
     # The root of the vector field, from the numbers of the literature.
     x, u = reactor.equilibrium()
+    slopes = jax.jit(
+        jax.jacobian(lambda z: field(reactor, jnp.stack([0.5, z[0]]), z[1:]))
+    )
     root = scipy.optimize.root(
         lambda z: np.asarray(field(reactor, [0.5, z[0]], [z[1]])),
         [350.0, 300.0],
-        jac=lambda z: np.asarray(
-            jax.jacobian(lambda z: field(reactor, jnp.stack([0.5, z[0]]), z[1:]))(z)
-        ),
+        jac=lambda z: np.asarray(slopes(z)),
         tol=1e-15,
     ).x
     assert_close([x[1], u[0]], root, rtol=1e-14)
     assert_close([x[1], u[0]], [350.001, 300.0014], atol=1e-4)
-    slope = jax.jacobian(lambda rate: s.CSTR(rate=rate).equilibrium()[1])(7.2e10)
+    control = lambda rate: s.CSTR(rate=rate).equilibrium()[1]
+    slope = jax.jit(jax.jacobian(control))(7.2e10)
     assert_close(
         slope[0], (s.CSTR(rate=7.2e10 + 1e4).equilibrium()[1] - u)[0] / 1e4, rtol=1e-2
     )
@@ -75,7 +77,8 @@ def test_a_reactor_rests_at_any_concentration():
 def test_a_reactor_does_not_stay_by_itself():
     reactor = s.CSTR()
     x, u = reactor.equilibrium()
-    poles = np.linalg.eigvals(jax.jacobian(lambda x: field(reactor, x, u))(x))
+    slopes = jax.jit(jax.jacobian(lambda x: field(reactor, x, u)))
+    poles = np.linalg.eigvals(slopes(x))
     assert_close(np.sort(poles.real), [-0.454, 2.834], atol=1e-3)
     dynamics = dlx.Discretized(reactor, 0.05, substeps=8)
     for shift in (-1.0, 1.0):
@@ -136,7 +139,7 @@ def test_lorenz_rests_on_its_wing():
     assert_close(x, [np.sqrt(72), np.sqrt(72), 27], rtol=1e-6)
     x, _ = s.Lorenz(rho=0.5).equilibrium()
     assert_close(x, np.zeros(3))
-    slope = jax.jacobian(lambda rho: s.Lorenz(rho=rho).equilibrium()[0])
+    slope = jax.jit(jax.jacobian(lambda rho: s.Lorenz(rho=rho).equilibrium()[0]))
     assert np.all(np.isfinite(slope(0.5))) and np.all(np.isfinite(slope(28.0)))
 
 

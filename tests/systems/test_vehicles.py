@@ -144,7 +144,7 @@ def test_an_attitude_has_two_quaternions():
     assert_close(quadrotor.rotation(left), quarter, atol=1e-6)
     long = quadrotor.project(x.at[3:7].set(jnp.array([3.0, 0.0, 4.0, 0.0])))
     assert_close(long[3:7], [0.6, 0.0, 0.8, 0.0], rtol=1e-6)
-    gradient = jax.jacobian(quadrotor.project)(jnp.zeros(13))
+    gradient = jax.jit(jax.jacobian(quadrotor.project))(jnp.zeros(13))
     assert np.all(np.isfinite(gradient))
 
 
