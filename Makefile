@@ -67,13 +67,12 @@ test-float32: $(VENV)/.tests ## the tests in single precision
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
-		$(PYTEST_ARGS)
+	JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting $(PYTEST_ARGS)
 
 .PHONY: thorough
-thorough: $(VENV)/.tests ## the tests that `test` leaves out: they take long
-	JAX_ENABLE_X64=0 $(pytest) -m "minutes or slow" $(PYTEST_ARGS)
-	JAX_ENABLE_X64=1 $(pytest) -m "minutes or slow" $(examples) $(PYTEST_ARGS)
+thorough: $(VENV)/.tests ## the few tests that take minutes by their nature
+	JAX_ENABLE_X64=0 $(pytest) -m minutes $(PYTEST_ARGS)
+	JAX_ENABLE_X64=1 $(pytest) -m minutes $(examples) $(PYTEST_ARGS)
 
 .PHONY: test-oldest
 test-oldest: $(VENV)-oldest/.tests ## the spine, with the oldest Python and dependencies allowed
@@ -83,7 +82,7 @@ test-oldest: $(VENV)-oldest/.tests ## the spine, with the oldest Python and depe
 
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom, with little of everything
-	$(lightly) $(kept) CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
+	$(kept) CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
 		--nbmake --nbmake-timeout=600 notebooks
 
 .PHONY: notebooks-full

@@ -37,18 +37,6 @@ def released_programs():
     clear_programs()
 
 
-SLOW = Path(__file__).with_name("slow.txt")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """`slow.txt` names the tests that compile for long: `make thorough` runs them."""
-    slow = set(SLOW.read_text().split("\n"))
-    for item in items:
-        if item.nodeid in slow:
-            item.add_marker(pytest.mark.slow)
-
-
 @pytest.fixture
 def key():
     return jax.random.key(0)
