@@ -36,7 +36,7 @@ spine := tests/contracts tests/simulation tests/planning/test_ilqr.py \
 	tests/riccati/test_dare.py tests/riccati/test_care.py tests/training/test_fit.py
 outward := tests/dynamics/test_integration.py tests/experiments tests/interop tests/plotting
 
-# LLVM's optimiser takes a fifth of the time, for programs that run for milliseconds.
+# The oldest dependencies are tested for what they lack, not for what they compile to.
 lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
 	--xla_llvm_disable_expensive_passes=true $$XLA_FLAGS"; export XLA_FLAGS;
 
