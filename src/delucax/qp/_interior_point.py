@@ -34,29 +34,31 @@ _PATIENCE = 5
 
 
 class Iterate(NamedTuple):
-    """A point of the embedding."""
+    """A point of the embedding; without soft sides `t` and `m` are `None`."""
 
     x: Array
     p: Array
     z: Array
     s: Array
-    t: Array
-    m: Array
+    t: Array | None
+    m: Array | None
     tau: Scalar
     kappa: Scalar
 
 
 class Residuals(NamedTuple):
-    """What is left of each line of the embedding."""
+    """What is left of each line of the embedding, and sums that it has."""
 
     x: Array
     p: Array
     z: Array
-    t: Array
+    t: Array | None
     tau: Scalar
     Hx: Array
-    gap: Scalar  # kappa + (what the last line has beside it), for tau = 1
-    objective: Scalar
+    products: Scalar  # s'z + t'm + tau kappa
+    error: Scalar
+    """The worst residual of the program over what is allowed; of a certificate, if that
+    is less."""
 
 
 class Tolerances(NamedTuple):
@@ -67,14 +69,6 @@ class Tolerances(NamedTuple):
     certificate: Array
 
 
-class Progress(NamedTuple):
-    """The worst residual over what is allowed; likewise of the two certificates."""
-
-    error: Scalar
-    infeasible: Scalar
-    unbounded: Scalar
-
-
 class Outcome(NamedTuple):
     """The last iterate and the number of iterations."""
 
@@ -82,84 +76,83 @@ class Outcome(NamedTuple):
     iterations: Array
 
 
-def largest(a: Array) -> Scalar:
-    """The largest entry in magnitude."""
-    return jnp.max(jnp.abs(a), initial=0)
+def _sums(*arrays: Array) -> list[Scalar]:
+    """The sum of each of some arrays of one shape, in one loop."""
+    stacked = jnp.stack(arrays)
+    return list(jnp.sum(stacked, axis=range(1, stacked.ndim)))
 
 
-def residuals(form: AbstractForm, sides: Sides, at: Iterate) -> Residuals:
-    """The residuals of an iterate."""
-    Hx = form.hessian(at.x)
-    pulled = form.equations_transposed(at.p) + form.rows_transposed(signed(at.z))
-    x = Hx + form.q * at.tau + pulled
-    p = form.equations(at.x) - form.f * at.tau
-    z = both(form.rows(at.x)) - at.t + at.s - sides.h * at.tau
-    Wt = sides.W * at.t
-    t = jnp.where(sides.soft, Wt + sides.v * at.tau - at.z - at.m, 0)
-    squares = (jnp.sum(at.x * Hx) + jnp.sum(at.t * Wt)) / at.tau
-    costs = jnp.sum(form.q * at.x) + jnp.sum(sides.v * at.t)
-    gap = costs + jnp.sum(form.f * at.p) + jnp.sum(sides.h * at.z) + squares
-    objective = (costs + squares / 2) / at.tau
-    z = jnp.where(sides.active, z, 0)
-    return Residuals(x, p, z, t, at.kappa + gap, Hx, gap / at.tau, objective)
+def _largest(*arrays: Array) -> list[Scalar]:
+    """The largest entry in magnitude of each of some arrays of one shape."""
+    stacked = jnp.abs(jnp.stack(arrays))
+    return list(jnp.max(stacked, axis=range(1, stacked.ndim), initial=0))
 
 
-def progress(
+def evaluated(
     form: AbstractForm,
     sides: Sides,
     scaling: Scaling,
     tolerances: Tolerances,
     at: Iterate,
-    left: Residuals,
-) -> Progress:
-    """How far an iterate is from each of the three ends, in the units of the user."""
+) -> Residuals:
+    """The residuals of an iterate, and how far it is from each of the three ends, in
+    the units of the user."""
     atol, rtol, least = tolerances
     D, E, R, c = scaling
+    tau, active = at.tau, sides.active
+    Hx = form.hessian(at.x)
+    pulled = form.equations_transposed(at.p) + form.rows_transposed(signed(at.z))
+    x = Hx + form.q * tau + pulled
+    reached = form.equations(at.x)
+    p = reached - form.f * tau
+    # What is violated is not what the slack does not match.
+    row = both(form.rows(at.x)) - (0 if at.t is None else at.t)
+    row = jnp.where(active, row, 0)
+    over = row - sides.h * tau
+    z = over + at.s
+    slope, square, x_size = _sums(form.q * at.x, Hx * at.x, jnp.abs(at.x) * D)
+    lift, p_size = _sums(form.f * at.p, jnp.abs(at.p) * E)
+    push, z_size, products = _sums(sides.h * at.z, jnp.abs(at.z) * R, at.s * at.z)
+    products = products + tau * at.kappa
+    violated = jnp.where(sides.equality, over, jnp.maximum(over, 0))
+    # A direction of recession does not violate the bounds 0.
+    outward = jnp.where(sides.equality, row, jnp.maximum(row, 0))
+    dual, dual_scale, pulled, flat = _largest(x / D, Hx / D, pulled, Hx)
+    missed, drift = _largest(p / E, reached)
+    violated, row_scale, outward = _largest(violated / R, row / R, outward)
+    t = None
+    if at.t is not None:
+        Wt = sides.W * at.t
+        t = jnp.where(sides.soft, Wt + sides.v * tau - at.z - at.m, 0)
+        costs, squares, extra = _sums(sides.v * at.t, Wt * at.t, at.t * at.m)
+        spring, bent = _largest(t * R, Wt)
+        slope, square, products = slope + costs, square + squares, products + extra
+        dual, flat = jnp.maximum(dual, spring), jnp.maximum(flat, bent)
+    gap = slope + lift + push + square / tau
+    objective = (slope + square / (2 * tau)) / tau
 
     # Residuals of the dual are divided by c D, those of the primal by E or R.
-    def relative(error, *scales):
-        scale = jnp.max(jnp.stack([largest(s) for s in scales]))
-        return largest(error) / (atol + rtol * scale)
+    def relative(error, scale, data):
+        return error / (atol + rtol * jnp.maximum(scale, data))
 
-    tau = at.tau
-    # What is violated, not what the slack does not match.
-    over = jnp.where(sides.equality, left.z, jnp.maximum(left.z - at.s, 0))
-    rows = (left.z - at.s + sides.h * tau) / (R * tau)
-    dual = left.x / (c * D * tau)
-    primal = over / (R * tau)
-    errors = jnp.stack(
-        [
-            relative(dual, left.Hx / (c * D * tau), form.q / (c * D)),
-            relative(primal, jnp.where(sides.active, rows, 0), sides.h / R),
-            relative(left.p / (E * tau), form.f / E),
-            relative(left.t * R / (c * tau), sides.v * R / c),
-            relative(left.gap / c, left.objective / c),
-        ]
-    )
+    size = lambda data: _largest(data)[0]
+    errors = [
+        relative(dual / (c * tau), dual_scale / (c * tau), size(form.q / (c * D))),
+        relative(violated / tau, row_scale / tau, size(sides.h / R)),
+        relative(missed / tau, 0, size(form.f / E)),
+        relative(jnp.abs(gap / (c * tau)), jnp.abs(objective / c), 0),
+    ]
     # A certificate is judged in the scaled problem, whose units mean nothing. It must
     # hold with all data off by the tolerance too: what a tolerance away is feasible has
     # a solution.
     relaxed = atol + rtol
-    support = jnp.sum(form.f * at.p) + jnp.sum(sides.h * at.z)
-    sizes = jnp.sum(jnp.abs(at.p) * E) + jnp.sum(jnp.abs(at.z) * R)
-    support = support + relaxed * sizes
-    pulled = left.x - left.Hx - form.q * tau
-    slope = jnp.sum(form.q * at.x) + jnp.sum(sides.v * at.t)
-    slope = slope + relaxed * c * jnp.sum(jnp.abs(at.x) * D)
-    bounded_by = jnp.stack(
-        [
-            largest(left.Hx),
-            largest(left.p + form.f * tau),
-            largest(jnp.where(sides.equality, left.z + sides.h * tau, 0)),
-            jnp.max(jnp.where(sides.active, left.z - at.s + sides.h * tau, 0)),
-            largest(sides.W * at.t),
-        ]
-    )
-    ratio = lambda error, gain: jnp.where(gain < 0, error / (least * -gain), jnp.inf)
-    # Where a component is NaN, so is the maximum, and it fails every comparison.
-    infeasible = ratio(largest(pulled), support)
-    unbounded = ratio(jnp.max(bounded_by), slope)
-    return Progress(jnp.max(errors), infeasible, unbounded)
+    gains = jnp.stack([lift + push, slope])
+    gains = gains + relaxed * jnp.stack([p_size + z_size, c * x_size])
+    failings = jnp.stack([pulled, jnp.maximum(jnp.maximum(flat, drift), outward)])
+    certificates = jnp.where(gains < 0, failings / (least * -gains), jnp.inf)
+    # NaN fails every comparison.
+    error = jnp.minimum(jnp.max(jnp.stack(errors)), jnp.min(certificates))
+    return Residuals(x, p, z, t, at.kappa + gap, Hx, products, error)
 
 
 class System(NamedTuple):
@@ -218,132 +211,146 @@ def minimise(
 ) -> Outcome:
     """Run the method on a scaled form, from a start or from its own."""
     sides = form.sides()
-    inequality, hinge = sides.inequality, sides.hinge
-    count = 1 + jnp.sum(inequality) + jnp.sum(hinge)
+    is_soft, inequality = form.soft is not None, sides.inequality
+    count = 1 + jnp.sum(inequality)
+    if is_soft:
+        count = count + jnp.sum(sides.hinge)
     one = jnp.ones((), form.q.dtype)
+    none = jnp.zeros_like(sides.h)
     rounding = jnp.finfo(one.dtype).eps
 
     def step(at: Iterate, left: Residuals, first: BoolScalar):
         z = jnp.where(inequality & ~first, at.z, 1)
         s = jnp.where(inequality & ~first, at.s, 1)
-        t, m = jnp.where(hinge, at.t, 1), jnp.where(hinge, at.m, 1)
-        # The compliance of the spring, and of the barrier.
-        stiff = sides.W + jnp.where(hinge, m / t, 0)
-        e = jnp.where(sides.soft & ~first, 1 / jnp.where(sides.soft, stiff, 1), 0)
-        system = assembled(form, sides, s / z + e)
+        barrier = jnp.where(inequality, s / z, 0)
+        t = m = e = stay = 0
+        if is_soft:
+            # Of the violation: `t` stays at zero with stiffness `m / t`.
+            t, m = at.t, jnp.where(sides.hinge, at.m, 0)
+            stay = m / jnp.where(sides.soft, t, 1)
+            stiffness = jnp.where(sides.soft, sides.W + stay, 1)
+            e = jnp.where(sides.soft & ~first, 1 / stiffness, 0)
+        system = assembled(form, sides, barrier + e)
         solve = lambda *right: solved(form, sides, system, right, passes)
 
         def right_of(x, p, r, rt, rs, rm):
-            """Of the lines of `z`, `t`, `s z` and `t m` after elimination."""
-            r = r - jnp.where(inequality, rs / z, 0) + e * (rt + hinge * rm / t)
+            """The right side, of which the lines of `t`, `s z` and `t m` are
+            eliminated."""
+            r = r - rs / z
+            if is_soft:
+                r = r + e * (rt + rm / jnp.where(sides.soft, t, 1))
             return x, p, jnp.where(sides.active, r, 0)
 
         def expanded(solution, rt, rs, rm):
             dx, dp, dz = solution
-            dt = e * (dz + rt + hinge * rm / t)
-            dm = jnp.where(hinge, (rm - m * dt) / t, 0)
-            ds = jnp.where(inequality, (rs - s * dz) / z, 0)
-            return dx, dp, dz, ds, dt, dm
+            ds = jnp.where(inequality, rs / z - barrier * dz, 0)
+            if not is_soft:
+                return dx, dp, dz, ds, None, None
+            rm = rm / jnp.where(sides.soft, t, 1)
+            dt = e * (dz + rt + rm)
+            return dx, dp, dz, ds, dt, jnp.where(sides.hinge, rm - stay * dt, 0)
 
-        none = jnp.zeros_like(at.z)
         # The direction of tau, and the affine one: two columns.
-        data = right_of(-form.q, form.f, sides.h, -sides.v, none, none)
-        targets = -left.t, -s * z, -t * m
+        unit = -sides.v if is_soft else 0, 0, 0
+        data = right_of(-form.q, form.f, sides.h, *unit)
+        targets = -left.t if is_soft else 0, jnp.where(inequality, -s * z, 0), -t * m
         affine = right_of(-left.x, -left.p, -left.z, *targets)
-        columns = jax.vmap(solve)(*(jnp.stack(pair) for pair in zip(data, affine)))
-        column = lambda k: jax.tree.map(lambda a: a[k], columns)
-        along = expanded(column(0), -sides.v, none, none)
+        pairs = zip(data, affine, strict=True)
+        columns = jax.vmap(solve)(*(jnp.stack(pair) for pair in pairs))
+        tau_column, affine = (
+            jax.tree.map(lambda a, k=k: a[k], columns) for k in range(2)
+        )
+        along = expanded(tau_column, *unit)
 
         # The curvature of the last line along tau is a sum of squares.
         tau, kappa = at.tau, at.kappa
-        off, soft_off = at.x / tau - along[0], at.t / tau - along[4]
-        squares = jnp.sum(off * form.hessian(off)) + jnp.sum(sides.W * soft_off**2)
-        springs = jnp.sum(jnp.where(inequality, s / z * along[2] ** 2, 0))
-        springs = springs + jnp.sum(jnp.where(hinge, m / t * along[4] ** 2, 0))
-        slope = kappa / tau + squares + springs
+        off = at.x / tau - along[0]
+        slope = kappa / tau + jnp.sum(off * form.hessian(off))
+        springs = barrier * along[2] ** 2
+        if is_soft:
+            off = at.t / tau - along[4]
+            springs = springs + sides.W * off**2 + stay * along[4] ** 2
+        slope = slope + jnp.sum(springs)
+        x_weight = form.q + 2 * left.Hx / tau
+        t_weight = sides.v + 2 * sides.W * t / tau if is_soft else 0
 
-        def combined(change, tau_right, tau_kappa):
+        def combined(change, tau_right, tau_kappa) -> Iterate:
             dx, dp, dz, _, dt, _ = change
-            total = jnp.sum((form.q + 2 * left.Hx / tau) * dx) + jnp.sum(form.f * dp)
-            total = total + jnp.sum(sides.h * dz)
-            total = total + jnp.sum((sides.v + 2 * sides.W * at.t / tau) * dt)
+            sided = sides.h * dz + (t_weight * dt if is_soft else 0)
+            total = jnp.sum(x_weight * dx) + jnp.sum(form.f * dp) + jnp.sum(sided)
             dtau = (tau_right + total + tau_kappa / tau) / slope
             change = jax.tree.map(lambda a, b: a + dtau * b, change, along)
             return Iterate(*change, dtau, (tau_kappa - kappa * dtau) / tau)
 
         def longest(d: Iterate):
             """The largest step within the bounds, at most 1."""
-            pairs = (
-                (d.z, z, inequality),
-                (d.s, s, inequality),
-                (d.t, t, hinge),
-                (d.m, m, hinge),
-            )
-            worst = [jnp.max(jnp.where(on, -d / v, 0)) for d, v, on in pairs]
-            ends = jnp.stack([*worst, -d.tau / tau, -d.kappa / kappa, one])
-            return 1 / jnp.max(ends)
+            ratios = [jnp.where(inequality, -d.z / z, 0)]
+            ratios = [*ratios, jnp.where(inequality, -d.s / s, 0)]
+            if is_soft:
+                moves = (d.t, t), (d.m, m)
+                ratios += [jnp.where(sides.hinge, -d / v, 0) for d, v in moves]
+            worst = jnp.max(jnp.stack(ratios), initial=1)
+            ends = jnp.maximum(-d.tau / tau, -d.kappa / kappa)
+            return 1 / jnp.maximum(worst, ends)
 
-        predictor = combined(expanded(column(1), *targets), left.tau, -tau * kappa)
-        length = longest(predictor)
-        sigma = (1 - length) ** 3
-        products = jnp.sum(jnp.where(inequality, s * z, 0))
-        products = products + jnp.sum(jnp.where(hinge, t * m, 0)) + tau * kappa
-        aim, share = sigma * products / count, 1 - sigma
+        predictor = combined(expanded(affine, *targets), left.tau, -tau * kappa)
+        sigma = (1 - longest(predictor)) ** 3
+        aim, share = sigma * left.products / count, 1 - sigma
         # The second-order correction of each product.
         targets = (
-            -share * left.t,
-            aim - s * z - predictor.s * predictor.z,
-            aim - t * m - predictor.t * predictor.m,
+            -share * left.t if is_soft else 0,
+            jnp.where(inequality, aim - s * z - predictor.s * predictor.z, 0),
+            jnp.where(sides.hinge, aim - t * m - predictor.t * predictor.m, 0)
+            if is_soft
+            else 0,
         )
         lines = (-share * part for part in (left.x, left.p, left.z))
         corrector = expanded(solve(*right_of(*lines, *targets)), *targets)
         last = aim - tau * kappa - predictor.tau * predictor.kappa
         change = combined(corrector, share * left.tau, last)
         length = jnp.minimum(_TO_BOUNDARY * longest(change), 1)
-        moved = Iterate(*(a + length * d for a, d in zip(at, change, strict=True)))
+        moved = jax.tree.map(lambda a, d: a + length * d, at, change)
 
         # The first iteration finds a start: with unit weights the column of tau solves
         # the problem with squares for the inequalities, of which z = -s.
-        x, p, z = column(0)
-        start = Iterate(
-            x,
-            p,
-            jnp.where(inequality, interior(z, inequality), z),
-            interior(-z, inequality),
-            jnp.where(sides.soft, 1, none),
-            jnp.where(hinge, 1, none),
-            one,
-            one,
+        x, p, z = tau_column
+        found = jnp.where(inequality, interior(z, inequality), z)
+        begun = (
+            (jnp.where(sides.soft, 1, none), jnp.where(sides.hinge, 1, none))
+            if is_soft
+            else (None, None)
         )
+        start = Iterate(x, p, found, interior(-z, inequality), *begun, one, one)
         return jax.tree.map(lambda a, b: jnp.where(first, a, b), start, moved)
 
     def body(carry):
-        at, left, best, least, k, since, warm = carry
-        at = step(at, left, (k == 0) & ~warm)
-        left = residuals(form, sides, at)
-        now = progress(form, sides, scaling, tolerances, at, left)
-        reached = jnp.min(jnp.stack(now))
-        better = reached < least
+        at, left, best, least, k, since = carry
+        at = step(at, left, k == 0)
+        left = evaluated(form, sides, scaling, tolerances, at)
+        better = left.error < least
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), at, best)
         # While the products fall, an error may rise for a while.
-        products = jnp.sum(at.s * at.z * inequality) + jnp.sum(at.t * at.m * hinge)
-        falls = (products + at.tau * at.kappa) / count > rounding * at.tau**2
+        falls = left.products > count * rounding * at.tau**2
         since = jnp.where(better, 0, since + ~falls)
-        least = jnp.where(better, reached, least)
-        return at, left, best, least, k + 1, since, warm
+        return at, left, best, jnp.minimum(left.error, least), k + 1, since
 
     def going(carry):
-        *_, least, k, since, _ = carry
+        *_, least, k, since = carry
         return (least > 1) & (k < max_steps) & (since < _PATIENCE)
 
-    warm = jnp.asarray(start is not None)
+    k = jnp.zeros((), int)
     if start is None:
-        zero = jnp.zeros_like(sides.h)
-        start = Iterate(0 * form.q, 0 * form.f, zero, zero, zero, zero, one, one)
-    left = residuals(form, sides, start)
-    count0 = jnp.zeros((), int)
-    carry = (start, left, start, jnp.asarray(jnp.inf, one.dtype), count0, count0, warm)
-    _, _, best, _, k, _, _ = lax.while_loop(going, body, carry)
+        nothing = (none, none) if is_soft else (None, None)
+        zero = jnp.zeros_like(form.q), jnp.zeros_like(form.f), none, none
+        start = Iterate(*zero, *nothing, one, one)
+        left = jax.tree.map(
+            lambda a: jnp.zeros(a.shape, a.dtype),
+            jax.eval_shape(evaluated, form, sides, scaling, tolerances, start),
+        )
+    else:
+        left, k = evaluated(form, sides, scaling, tolerances, start), k + 1
+    carry = start, left, start, jnp.asarray(jnp.inf, one.dtype), k, jnp.zeros((), int)
+    _, _, best, _, k, _ = lax.while_loop(going, body, carry)
     return Outcome(best, k)
 
 
