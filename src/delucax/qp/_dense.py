@@ -112,13 +112,6 @@ class DenseForm(AbstractForm):
         parts = (c * H, c * q, F, E * self.f, G, *bounds, soft)
         return DenseForm(*parts, self.bounded), scaling
 
-    def is_convex(self):
-        n, size = self.q.shape[0], jnp.max(jnp.abs(self.H), initial=0)
-        # A product C'C is semidefinite up to this.
-        slack = 100 * n * jnp.finfo(self.q.dtype).eps * jnp.where(size > 0, size, 1)
-        L = jnp.linalg.cholesky(self.H + slack * jnp.eye(n, dtype=self.q.dtype))
-        return jnp.all(jnp.isfinite(L))
-
 
 def regularisation(dtype) -> float:
     """What is added to the diagonal of a scaled problem, and taken out of the solution

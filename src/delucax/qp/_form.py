@@ -88,9 +88,9 @@ class AbstractForm(eqx.Module):
     def equilibrated(self) -> tuple["AbstractForm", Scaling]:
         """The same problem with rows and columns of similar size."""
 
-    @abstractmethod
-    def is_convex(self) -> Array:
-        """Whether the Hessian is positive semidefinite, up to rounding."""
+    def admissible(self, x: Array, p: Array) -> tuple[Array, Array]:
+        """A vector without the entries that stand for nothing."""
+        return x, p
 
     def sides(self) -> Sides:
         """The sides of all rows."""

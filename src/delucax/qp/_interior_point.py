@@ -56,9 +56,9 @@ class Residuals(NamedTuple):
     tau: Scalar
     Hx: Array
     products: Scalar  # s'z + t'm + tau kappa
-    error: Scalar
-    """The worst residual of the program over what is allowed; of a certificate, if that
-    is less."""
+    errors: Array
+    """The worst residual over what is allowed: of the program, of the certificate that
+    it is infeasible, and of the one that it is unbounded."""
 
 
 class Tolerances(NamedTuple):
@@ -70,9 +70,10 @@ class Tolerances(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The last iterate and the number of iterations."""
+    """The best iterate, its errors, and the number of iterations."""
 
     iterate: Iterate
+    errors: Array
     iterations: Array
 
 
@@ -117,7 +118,8 @@ def evaluated(
     violated = jnp.where(sides.equality, over, jnp.maximum(over, 0))
     # A direction of recession does not violate the bounds 0.
     outward = jnp.where(sides.equality, row, jnp.maximum(row, 0))
-    dual, dual_scale, pulled, flat = _largest(x / D, Hx / D, pulled, Hx)
+    dual, dual_scale, pulled_most, flat = _largest(x / D, Hx / D, pulled, Hx)
+    push_most = push
     missed, drift = _largest(p / E, reached)
     violated, row_scale, outward = _largest(violated / R, row / R, outward)
     t = None
@@ -128,6 +130,11 @@ def evaluated(
         spring, bent = _largest(t * R, Wt)
         slope, square, products = slope + costs, square + squares, products + extra
         dual, flat = jnp.maximum(dual, spring), jnp.maximum(flat, bent)
+        # A soft side has no part in a certificate.
+        yielding = jnp.where(sides.soft, at.z, 0)
+        resisted = pulled - form.rows_transposed(signed(yielding))
+        pulled_most = _largest(resisted)[0]
+        push_most = push - jnp.sum(sides.h * yielding)
     gap = slope + lift + push + square / tau
     objective = (slope + square / (2 * tau)) / tau
 
@@ -146,13 +153,12 @@ def evaluated(
     # hold with all data off by the tolerance too: what a tolerance away is feasible has
     # a solution.
     relaxed = atol + rtol
-    gains = jnp.stack([lift + push, slope])
+    gains = jnp.stack([lift + push_most, slope])
     gains = gains + relaxed * jnp.stack([p_size + z_size, c * x_size])
-    failings = jnp.stack([pulled, jnp.maximum(jnp.maximum(flat, drift), outward)])
+    failings = jnp.stack([pulled_most, jnp.maximum(jnp.maximum(flat, drift), outward)])
     certificates = jnp.where(gains < 0, failings / (least * -gains), jnp.inf)
-    # NaN fails every comparison.
-    error = jnp.minimum(jnp.max(jnp.stack(errors)), jnp.min(certificates))
-    return Residuals(x, p, z, t, at.kappa + gap, Hx, products, error)
+    errors = jnp.concatenate([jnp.max(jnp.stack(errors))[None], certificates])
+    return Residuals(x, p, z, t, at.kappa + gap, Hx, products, errors)
 
 
 class System(NamedTuple):
@@ -201,10 +207,16 @@ def solved(form, sides: Sides, system: System, right, passes: int):
     return lax.fori_loop(0, passes, refine, start)
 
 
+def stored(tree):
+    """The arrays behind a barrier: XLA would repeat what they are computed from in each
+    loop that reads them, and compile it as often."""
+    return lax.optimization_barrier(tree)
+
+
 def minimise(
     form: AbstractForm,
     scaling: Scaling,
-    start: Iterate | None,
+    start: tuple[Iterate, BoolScalar] | None,
     tolerances: Tolerances,
     max_steps: int,
     passes: int = 2,
@@ -260,7 +272,7 @@ def minimise(
         tau_column, affine = (
             jax.tree.map(lambda a, k=k: a[k], columns) for k in range(2)
         )
-        along = expanded(tau_column, *unit)
+        along = stored(expanded(tau_column, *unit))
 
         # The curvature of the last line along tau is a sum of squares.
         tau, kappa = at.tau, at.kappa
@@ -280,7 +292,7 @@ def minimise(
             total = jnp.sum(x_weight * dx) + jnp.sum(form.f * dp) + jnp.sum(sided)
             dtau = (tau_right + total + tau_kappa / tau) / slope
             change = jax.tree.map(lambda a, b: a + dtau * b, change, along)
-            return Iterate(*change, dtau, (tau_kappa - kappa * dtau) / tau)
+            return stored(Iterate(*change, dtau, (tau_kappa - kappa * dtau) / tau))
 
         def longest(d: Iterate):
             """The largest step within the bounds, at most 1."""
@@ -309,7 +321,7 @@ def minimise(
         last = aim - tau * kappa - predictor.tau * predictor.kappa
         change = combined(corrector, share * left.tau, last)
         length = jnp.minimum(_TO_BOUNDARY * longest(change), 1)
-        moved = jax.tree.map(lambda a, d: a + length * d, at, change)
+        moved = stored(jax.tree.map(lambda a, d: a + length * d, at, change))
 
         # The first iteration finds a start: with unit weights the column of tau solves
         # the problem with squares for the inequalities, of which z = -s.
@@ -321,22 +333,25 @@ def minimise(
             else (None, None)
         )
         start = Iterate(x, p, found, interior(-z, inequality), *begun, one, one)
-        return jax.tree.map(lambda a, b: jnp.where(first, a, b), start, moved)
+        return stored(jax.tree.map(lambda a, b: jnp.where(first, a, b), start, moved))
 
     def body(carry):
         at, left, best, least, k, since = carry
         at = step(at, left, k == 0)
         left = evaluated(form, sides, scaling, tolerances, at)
-        better = left.error < least
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), at, best)
+        # NaN fails the comparison.
+        better = jnp.min(left.errors) < jnp.min(least)
+        best, least = jax.tree.map(
+            lambda a, b: jnp.where(better, a, b), (at, left.errors), (best, least)
+        )
         # While the products fall, an error may rise for a while.
         falls = left.products > count * rounding * at.tau**2
         since = jnp.where(better, 0, since + ~falls)
-        return at, left, best, jnp.minimum(left.error, least), k + 1, since
+        return at, left, best, least, k + 1, since
 
     def going(carry):
         *_, least, k, since = carry
-        return (least > 1) & (k < max_steps) & (since < _PATIENCE)
+        return (jnp.min(least) > 1) & (k < max_steps) & (since < _PATIENCE)
 
     k = jnp.zeros((), int)
     if start is None:
@@ -348,10 +363,13 @@ def minimise(
             jax.eval_shape(evaluated, form, sides, scaling, tolerances, start),
         )
     else:
-        left, k = evaluated(form, sides, scaling, tolerances, start), k + 1
-    carry = start, left, start, jnp.asarray(jnp.inf, one.dtype), k, jnp.zeros((), int)
-    _, _, best, _, k, _ = lax.while_loop(going, body, carry)
-    return Outcome(best, k)
+        # The first iteration, which finds a start, is left out.
+        start, usable = start
+        left, k = evaluated(form, sides, scaling, tolerances, start), k + usable
+    least = jnp.full(3, jnp.inf, one.dtype)
+    carry = start, left, start, least, k, jnp.zeros((), int)
+    _, _, best, least, k, _ = lax.while_loop(going, body, carry)
+    return Outcome(best, least, k)
 
 
 def interior(z: Array, on: Array) -> Array:

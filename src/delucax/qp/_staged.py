@@ -15,9 +15,9 @@ from jax import lax
 from jaxtyping import Float
 
 from .._typing import Array
-from ..math._linear_solve import is_definite, solve
+from ..math._linear_solve import solve
 from ..math._norms import power_of_two
-from ._dense import cost_unit, regularisation, scaled_sides, without_empty_rows
+from ._dense import cost_unit, regularisation, scaled_sides
 from ._form import AbstractForm, Scaling
 
 
@@ -160,20 +160,14 @@ class StagedForm(AbstractForm):
             jnp.concatenate([rows, R], axis=1),
             c,
         )
-        form = self if self.is_free else self._without_constant_rows()
-        bounds, soft = scaled_sides(form, scaling)
+        bounds, soft = scaled_sides(self, scaling)
         F = E[:, None] * self.F * D
         parts = (c * H, c * q, F, E * self.f, G, *bounds, soft)
         return StagedForm(*parts, self.bounded, self.is_free), scaling
 
-    def _without_constant_rows(self):
-        return self
-
-    def is_convex(self):
-        size = jnp.max(jnp.abs(self.H))
-        N = self.q.shape[1]
-        slack = 100 * N * jnp.finfo(size.dtype).eps * jnp.where(size > 0, size, 1)
-        return jnp.all(jax.vmap(is_definite)(self.H + slack * jnp.eye(N, dtype=size.dtype)))
+    def admissible(self, x, p):
+        n = self.f.shape[1]
+        return x.at[-1, n:].set(0), p.at[0].set(0) if self.is_free else p
 
 
 def _eliminated(matrix: Array, right: Array) -> Array:
