@@ -39,13 +39,13 @@ class Point(NamedTuple):
     iterations: Array
 
 
-class Options(NamedTuple):
+class Options(eqx.Module):
     """What does not change the solution."""
 
     start: Any
     tolerances: Tolerances
-    max_steps: int
-    refinements: int
+    max_steps: int = eqx.field(static=True)
+    refinements: int = eqx.field(static=True)
 
 
 def optimum(form: AbstractForm, options: Options) -> Point:
@@ -58,9 +58,8 @@ def _run(form: AbstractForm, options: Options) -> Point:
     start = None
     if options.start is not None:
         start = warm(scaled, scaling, *options.start)
-    passes = 1 + options.refinements
-    tolerances = options.tolerances
-    outcome = minimise(scaled, scaling, start, tolerances, options.max_steps, passes)
+    limits = options.max_steps, options.refinements
+    outcome = minimise(scaled, scaling, start, options.tolerances, *limits)
     at = outcome.iterate
     x, p, z = (part / at.tau for part in (at.x, at.p, at.z))
     D, E, R, c = scaling

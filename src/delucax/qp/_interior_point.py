@@ -29,6 +29,8 @@ from ._form import AbstractForm, both, Scaling, Sides, signed
 
 _TO_BOUNDARY = 0.99
 """The share of the step to the boundary that is taken."""
+_NEGLIGIBLE = 1e-2
+"""So much of the tolerance is no reason to refine a linear system."""
 _PATIENCE = 5
 """It ends after so many steps without a better iterate: rounding is reached."""
 
@@ -56,6 +58,7 @@ class Residuals(NamedTuple):
     tau: Scalar
     Hx: Array
     products: Scalar  # s'z + t'm + tau kappa
+    linear: Scalar  # the worst of the lines `x` and `p`, over what is allowed, times tau
     errors: Array
     """The worst residual over what is allowed: of the program, of the certificate that
     it is infeasible, and of the one that it is unbounded."""
@@ -118,7 +121,7 @@ def evaluated(
     violated = jnp.where(sides.equality, over, jnp.maximum(over, 0))
     # A direction of recession does not violate the bounds 0.
     outward = jnp.where(sides.equality, row, jnp.maximum(row, 0))
-    dual, dual_scale, pulled_most, flat = _largest(x / D, Hx / D, pulled, Hx)
+    dual, *slopes, pulled_most, flat = _largest(x / D, Hx / D, pulled / D, pulled, Hx)
     push_most = push
     missed, drift = _largest(p / E, reached)
     violated, row_scale, outward = _largest(violated / R, row / R, outward)
@@ -136,19 +139,15 @@ def evaluated(
         pulled_most = _largest(resisted)[0]
         push_most = push - jnp.sum(sides.h * yielding)
     gap = slope + lift + push + square / tau
-    objective = (slope + square / (2 * tau)) / tau
 
-    # Residuals of the dual are divided by c D, those of the primal by E or R.
-    def relative(error, scale, data):
-        return error / (atol + rtol * jnp.maximum(scale, data))
-
+    # Each is compared with the terms that cancel in it. Those of the dual are divided
+    # by c D, those of the primal by E or R.
     size = lambda data: _largest(data)[0]
-    errors = [
-        relative(dual / (c * tau), dual_scale / (c * tau), size(form.q / (c * D))),
-        relative(violated / tau, row_scale / tau, size(sides.h / R)),
-        relative(missed / tau, 0, size(form.f / E)),
-        relative(jnp.abs(gap / (c * tau)), jnp.abs(objective / c), 0),
-    ]
+    terms = jnp.abs(jnp.stack([slope, square / tau, lift, push]))
+    found = jnp.stack([dual / c, violated, missed, jnp.abs(gap) / c])
+    scales = jnp.stack([jnp.maximum(*slopes) / c, row_scale, row_scale, jnp.max(terms) / c])
+    data = jnp.stack([size(form.q / (c * D)), size(sides.h / R), size(form.f / E), 0])
+    errors = found / tau / (atol + rtol * jnp.maximum(scales / tau, data))
     # A certificate is judged in the scaled problem, whose units mean nothing. It must
     # hold with all data off by the tolerance too: what a tolerance away is feasible has
     # a solution.
@@ -157,8 +156,9 @@ def evaluated(
     gains = gains + relaxed * jnp.stack([p_size + z_size, c * x_size])
     failings = jnp.stack([pulled_most, jnp.maximum(jnp.maximum(flat, drift), outward)])
     certificates = jnp.where(gains < 0, failings / (least * -gains), jnp.inf)
-    errors = jnp.concatenate([jnp.max(jnp.stack(errors))[None], certificates])
-    return Residuals(x, p, z, t, at.kappa + gap, Hx, products, errors)
+    linear = tau * jnp.maximum(errors[0], errors[2])
+    errors = jnp.concatenate([jnp.max(errors)[None], certificates])
+    return Residuals(x, p, z, t, at.kappa + gap, Hx, products, linear, errors)
 
 
 class System(NamedTuple):
@@ -181,8 +181,8 @@ def assembled(form: AbstractForm, sides: Sides, compliance: Array) -> System:
     return System(form.factorise(weight), compliance, regularised)
 
 
-def solved(form, sides: Sides, system: System, right, passes: int):
-    """The solution `(x, p, z)` of the linear system, refined."""
+def solved(form, sides: Sides, system: System, right, passes: Array | int):
+    """The solution `(x, p, z)` of the linear system, in so many passes."""
     active = sides.active
 
     def once(right):
@@ -193,18 +193,23 @@ def solved(form, sides: Sides, system: System, right, passes: int):
         z = (both(form.rows(x)) - z) / system.regularised
         return x, p, jnp.where(active, z, 0)
 
-    def refine(_, solution):
+    def error(solution):
         x, p, z = solution
         pulled = form.equations_transposed(p) + form.rows_transposed(signed(z))
         stretched = both(form.rows(x)) - system.compliance * z
         made = form.hessian(x) + pulled, form.equations(x), stretched
         left = jax.tree.map(lambda a, b: a - b, right, made)
-        left = (*left[:2], jnp.where(active, left[2], 0))
-        return jax.tree.map(lambda a, b: a + b, solution, once(left))
+        return *left[:2], jnp.where(active, left[2], 0)
 
-    # The first pass starts at zero: so the solver stands in the program once.
-    start = jax.tree.map(jnp.zeros_like, right)
-    return lax.fori_loop(0, passes, refine, start)
+    # The solver stands in the program once, for the solution and its refinements.
+    def refine(k, carry):
+        solution, left = carry
+        solution = jax.tree.map(lambda a, b: a + b, solution, once(left))
+        # The error of the last solution is not of interest.
+        return solution, lax.cond(k + 1 < passes, error, lambda _: right, solution)
+
+    start = jax.tree.map(jnp.zeros_like, right), right
+    return lax.fori_loop(0, passes, refine, start)[0]
 
 
 def stored(tree):
@@ -219,7 +224,7 @@ def minimise(
     start: tuple[Iterate, BoolScalar] | None,
     tolerances: Tolerances,
     max_steps: int,
-    passes: int = 2,
+    refinements: int,
 ) -> Outcome:
     """Run the method on a scaled form, from a start or from its own."""
     sides = form.sides()
@@ -231,7 +236,8 @@ def minimise(
     none = jnp.zeros_like(sides.h)
     rounding = jnp.finfo(one.dtype).eps
 
-    def step(at: Iterate, left: Residuals, first: BoolScalar):
+    def step(at: Iterate, left: Residuals, first: BoolScalar, passes: Array):
+        """The next iterate, and the share of the linear residuals that it has."""
         z = jnp.where(inequality & ~first, at.z, 1)
         s = jnp.where(inequality & ~first, at.s, 1)
         barrier = jnp.where(inequality, s / z, 0)
@@ -333,12 +339,18 @@ def minimise(
             else (None, None)
         )
         start = Iterate(x, p, found, interior(-z, inequality), *begun, one, one)
-        return stored(jax.tree.map(lambda a, b: jnp.where(first, a, b), start, moved))
+        after = jax.tree.map(lambda a, b: jnp.where(first, a, b), start, moved)
+        return stored(after), jnp.where(first, jnp.inf, 1 - length * share)
 
     def body(carry):
-        at, left, best, least, k, since = carry
-        at = step(at, left, k == 0)
+        at, left, best, least, k, since, passes = carry
+        before = left.linear
+        at, share = step(at, left, k == 0, passes)
         left = evaluated(form, sides, scaling, tolerances, at)
+        # Where a residual is larger than it should be, rounding is: from now on the
+        # linear systems are refined once more.
+        rounded = left.linear > 1.5 * share * before + _NEGLIGIBLE * at.tau
+        passes = jnp.minimum(passes + rounded, 1 + refinements)
         # NaN fails the comparison.
         better = jnp.min(left.errors) < jnp.min(least)
         best, least = jax.tree.map(
@@ -347,10 +359,10 @@ def minimise(
         # While the products fall, an error may rise for a while.
         falls = left.products > count * rounding * at.tau**2
         since = jnp.where(better, 0, since + ~falls)
-        return at, left, best, least, k + 1, since
+        return at, left, best, least, k + 1, since, passes
 
     def going(carry):
-        *_, least, k, since = carry
+        *_, least, k, since, _ = carry
         return (jnp.min(least) > 1) & (k < max_steps) & (since < _PATIENCE)
 
     k = jnp.zeros((), int)
@@ -367,8 +379,9 @@ def minimise(
         start, usable = start
         left, k = evaluated(form, sides, scaling, tolerances, start), k + usable
     least = jnp.full(3, jnp.inf, one.dtype)
-    carry = start, left, start, least, k, jnp.zeros((), int)
-    _, _, best, least, k, _ = lax.while_loop(going, body, carry)
+    zero = jnp.zeros((), int)
+    carry = start, left, start, least, k, zero, zero + 1
+    _, _, best, least, k, _, _ = lax.while_loop(going, body, carry)
     return Outcome(best, least, k)
 
 

@@ -11,7 +11,7 @@ from ._staged_problem import StagedMultipliers
 class Solution(eqx.Module):
     """The solution of a quadratic program, or the certificate that there is none.
 
-    Where `result` is `RESULTS.infeasible`, the multipliers are the certificate: those
+    Where `result` is `RESULTS.no_feasible_point`, the multipliers are the certificate: those
     of inequalities are not negative, `E'equalities + G'(upper - lower)` is zero, and
     the sum of each multiplier times its bound is -1, which no feasible point allows.
     `x` and `u` are NaN, and `cost` is infinite. Where it is `RESULTS.unbounded`, `x`

@@ -20,7 +20,7 @@ from ._solution import Solution
 from ._staged_problem import Staged
 
 
-_LOOSE = 1e4
+_LOOSE = 1e2
 """A failed solve whose residuals are within so many times the tolerance is inaccurate."""
 
 
@@ -31,7 +31,7 @@ def solve(
     rtol: RealScalar | None = None,
     atol: RealScalar | None = None,
     max_steps: int = 100,
-    refinements: int = 1,
+    refinements: int = 3,
     throw: bool = True,
 ) -> Solution:
     r"""Solve a convex quadratic program, or show that it has no solution.
@@ -53,12 +53,12 @@ def solve(
     - `rtol`, `atol`: each residual is at most `atol + rtol` times the size of the terms
         that cancel in it. By default both are `1e-8`, in single precision `1e-4`.
     - `max_steps`: the most iterations.
-    - `refinements`: of each linear system; more help where the data are badly scaled.
+    - `refinements`: at most so many of each linear system, as rounding asks for.
     - `throw`: raise unless there is a solution (default); if false, check `result`.
 
     **Returns:** a [`delucax.qp.Solution`][], whose residuals are those of the problem
     as it was given. `result` is `RESULTS.successful` if they meet the tolerance;
-    `RESULTS.infeasible` or `RESULTS.unbounded` with a certificate that was checked;
+    `RESULTS.no_feasible_point` or `RESULTS.unbounded` with a certificate that was checked;
     `RESULTS.inaccurate` if rounding ended the iteration near the tolerance;
     `RESULTS.ill_posed` if the data are not finite or the cost is not convex;
     else `RESULTS.not_converged`.
@@ -146,35 +146,37 @@ def _measured(given: Any, atol: Array, rtol: Array):
     """The four residuals, and the worst over what is allowed."""
     form, (x, p, z) = given
     sides = form.sides()
-    largest = lambda *arrays: jnp.max(
-        jnp.stack([jnp.max(jnp.abs(a), initial=0) for a in arrays])
-    )
-    Hx, reached, row = form.hessian(x), form.equations(x), both(form.rows(x))
+    # Those of one shape at once, in one loop.
+    along = lambda arrays: range(1, arrays[0].ndim + 1)
+    largest = lambda *a: jnp.max(jnp.abs(jnp.stack(a)), axis=along(a), initial=0)
+    sums = lambda *a: jnp.sum(jnp.stack(a), axis=along(a))
+    Hx, reached = form.hessian(x), form.equations(x)
     pulled = form.equations_transposed(p) + form.rows_transposed(signed(z))
-    row = jnp.where(sides.active, row, 0)
+    row = jnp.where(sides.active, both(form.rows(x)), 0)
     over = row - sides.h
     hard = jnp.where(sides.equality, over, jnp.maximum(over, 0) * ~sides.soft)
-    primal = largest(reached - form.f, hard)
     products = jnp.where(sides.inequality, z * jnp.maximum(-over, 0), 0)
-    dual = largest(Hx + form.q + pulled)
-    gap = jnp.sum(x * (Hx + form.q)) + jnp.sum(form.f * p) + jnp.sum(sides.h * z)
-    objective = jnp.sum(x * (Hx / 2 + form.q))
+    dual, *slopes = largest(Hx + form.q + pulled, Hx, form.q, pulled)
+    square, slope = sums(x * Hx, x * form.q)
+    (lift,) = sums(form.f * p)
+    t = bent = pressed = 0 * over
     if form.soft is not None:
         t = jnp.where(sides.soft, jnp.maximum(over, 0), 0)
         most = sides.v + sides.W * t
-        dual = jnp.maximum(dual, largest(jnp.where(sides.soft, jnp.maximum(z - most, 0), 0)))
         products = products + t * jnp.maximum(most - z, 0)
-        gap = gap + jnp.sum(t * most)
-        objective = objective + jnp.sum(t * (sides.v + sides.W * t / 2))
-    allowed = lambda *terms: atol + rtol * largest(*terms)
-    measured = primal, dual, largest(products), jnp.abs(gap)
-    limits = (
-        allowed(row, sides.h, form.f),
-        allowed(Hx, form.q),
-        allowed(objective),
-        allowed(objective),
-    )
-    return measured, jnp.max(jnp.stack(measured) / jnp.stack(limits))
+        bent, pressed = t * most, jnp.where(sides.soft, jnp.maximum(z - most, 0), 0)
+    push, bent = sums(sides.h * z, bent)
+    violated, product, *rows, excess = largest(hard, products, row, sides.h, pressed)
+    missed, reach = largest(reached - form.f, form.f)
+    # Each is compared with the terms that cancel in it.
+    gap = square + slope + lift + push + bent
+    values = jnp.stack([square, slope, lift, push, bent])
+    found = [jnp.maximum(violated, missed), jnp.maximum(dual, excess), product]
+    found = jnp.stack([*found, jnp.abs(gap)])
+    terms = jnp.max(jnp.abs(values))
+    scales = [jnp.maximum(*rows), jnp.max(jnp.stack(slopes)), terms, terms]
+    scales = jnp.maximum(jnp.stack(scales), jnp.stack([reach, 0, 0, 0]))
+    return found, jnp.max(found / (atol + rtol * scales))
 
 
 def _judged(point: Point, error: Array, is_posed: Array) -> tuple[Result, Any]:
@@ -184,16 +186,16 @@ def _judged(point: Point, error: Array, is_posed: Array) -> tuple[Result, Any]:
     unbounded = ~solved & ~infeasible & (point.errors[2] <= 1)
     result = choose(error <= _LOOSE, RESULTS.inaccurate, RESULTS.not_converged)
     result = choose(unbounded, RESULTS.unbounded, result)
-    result = choose(infeasible, RESULTS.infeasible, result)
+    result = choose(infeasible, RESULTS.no_feasible_point, result)
     result = choose(solved, RESULTS.successful, result)
     return choose(is_posed, result, RESULTS.ill_posed), (infeasible, unbounded)
 
 
 def _is_posed(problem: Dense | Staged, form: AbstractForm) -> Array:
     """Whether the data are finite, and the cost convex up to rounding."""
-    posed = ~jnp.any(jnp.isnan(form.lower) | jnp.isnan(form.upper))
-    for array in (*problem.data(), form.q, form.f):
-        posed = posed & jnp.all(jnp.isfinite(array))
+    bounds = (jnp.where(jnp.isinf(b), 0, b) for b in (form.lower, form.upper))
+    arrays = *problem.data(), form.q, form.f, *bounds
+    posed = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(a) for a in arrays])))
     for hessian in problem.hessians():
         n, size = hessian.shape[-1], jnp.max(jnp.abs(hessian), initial=0)
         # A product C'C is semidefinite up to this.
@@ -224,7 +226,7 @@ def _certified(form: AbstractForm, point: Point, infeasible: Array, unbounded: A
 
 def _facts(problem: Dense | Staged, solution: Solution) -> str:
     """Which constraint weighs most in a certificate, where it is known."""
-    if not (solution.result == RESULTS.infeasible):
+    if not (solution.result == RESULTS.no_feasible_point):
         return ""
     given = solution.x, solution.u, solution.multipliers
     _, p, z = problem.unknowns(*given)
