@@ -7,7 +7,7 @@ unique, or a side has neither (it is about to become active or inactive), there 
 derivative, and it is NaN.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,25 +18,24 @@ from jax.flatten_util import ravel_pytree
 from .._jax import by_lanes, nan_tangent
 from .._typing import Array, BoolScalar
 from ..math._linear_solve import full_precision
-from ._form import AbstractForm, both, Scaling, Sides, signed
-from ._interior_point import assembled, Iterate, minimise, solved, Tolerances
+from ._form import AbstractForm, both, Sides, signed
+from ._interior_point import (
+    assembled,
+    Iterate,
+    Method,
+    minimise,
+    Outcome,
+    solved,
+    Tolerances,
+)
 
 
 _CLEAR = 1e3
 """Of a multiplier and its slack, one is this many times the other where it is clear
 whether the side is active, in the scaled problem; both are alike where it is not."""
 _PASSES = 4
-
-
-class Point(NamedTuple):
-    """The last iterate in the units of the program, and how it was found."""
-
-    x: Array
-    p: Array
-    z: Array
-    iterate: Iterate
-    errors: Array
-    iterations: Array
+_OFF = 1e-2
+"""How far a start is moved off its bounds, in the scaled problem."""
 
 
 class Options(eqx.Module):
@@ -48,48 +47,39 @@ class Options(eqx.Module):
     refinements: int = eqx.field(static=True)
 
 
-def optimum(form: AbstractForm, options: Options) -> Point:
+def optimum(form: AbstractForm, options: Options) -> Outcome:
     """The outcome of the method, differentiable with respect to the program."""
     return _optimum(form, options)
 
 
-def _run(form: AbstractForm, options: Options) -> Point:
+def _run(form: AbstractForm, options: Options) -> Outcome:
     scaled, scaling = form.equilibrated()
-    start = None
-    if options.start is not None:
-        start = warm(scaled, scaling, *options.start)
-    limits = options.max_steps, options.refinements
-    outcome = minimise(scaled, scaling, start, options.tolerances, *limits)
-    at = outcome.iterate
-    x, p, z = (part / at.tau for part in (at.x, at.p, at.z))
-    D, E, R, c = scaling
-    point = x * D, p * E / c, z * R / c
-    return Point(*point, at, outcome.errors, outcome.iterations)
+    sides = form.sides(), scaled.sides()
+    method = Method(form, scaled, scaling, *sides, options.tolerances)
+    start = None if options.start is None else warm(method, *options.start)
+    return minimise(method, start, options.max_steps, options.refinements)
 
 
-def warm(form: AbstractForm, scaling: Scaling, x: Array, p: Array, z: Array) -> Any:
-    """A start near a point, moved off the bounds; and whether it is of use."""
-    D, E, R, c = scaling
-    sides = form.sides()
-    usable = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(p)) & jnp.all(jnp.isfinite(z))
-    safe = lambda a, unit: jnp.where(usable, a * unit, 0)
-    x, p, z = safe(x, 1 / D), safe(p, c / E), safe(z, c / R)
-    slack = sides.h - both(form.rows(x))
-    t = m = None
-    # Off the bounds by so much, a start lets the method take long steps.
-    off = jnp.asarray(1e-2, x.dtype)
-    if form.soft is not None:
-        t = jnp.where(sides.soft, jnp.maximum(-slack, off), 0)
-        slack = slack + t
-        m = jnp.where(sides.hinge, jnp.maximum(sides.v + sides.W * t - z, off), 0)
-    s = jnp.where(sides.inequality, jnp.maximum(slack, off), 0)
-    z = jnp.where(sides.inequality, jnp.maximum(z, off), jnp.where(sides.equality, z, 0))
-    one = jnp.ones((), x.dtype)
-    return Iterate(x, p, z, s, t, m, one, off), usable
+def warm(method: Method, x: Array, p: Array, z: Array) -> tuple[Iterate, BoolScalar]:
+    """A start near a point, moved off the bounds; and whether the point is of use."""
+    D, E, R, c = method.scaling
+    sides = method.sides
+    usable = jnp.stack([jnp.all(jnp.isfinite(a)) for a in (x, p, z)]).all()
+    x, p, z = (jnp.where(usable, a, 0) for a in (x / D, p * c / E, z * c / R))
+    slack = sides.h - both(method.scaled.rows(x))
+    # So far off the bounds the method can take long steps.
+    off = jnp.asarray(_OFF, x.dtype)
+    t = jnp.where(sides.soft, jnp.maximum(-slack, off), 0)
+    m = jnp.maximum(sides.v + sides.W * t - z, off)
+    m = jnp.where(sides.hinge, m, 0)
+    s = jnp.where(sides.inequality, jnp.maximum(slack + t, off), 0)
+    inside = jnp.maximum(z, off)
+    z = jnp.where(sides.inequality, inside, jnp.where(sides.equality, z, 0))
+    return Iterate(method.joined(x, p, z, s, t, m), jnp.ones_like(off), off), usable
 
 
 @eqx.filter_custom_jvp
-def _optimum(form: AbstractForm, options: Options) -> Point:
+def _optimum(form: AbstractForm, options: Options) -> Outcome:
     return by_lanes(_run, form, options)
 
 
@@ -98,35 +88,36 @@ def _optimum(form: AbstractForm, options: Options) -> Point:
 def _optimum_jvp(primals: Any, tangents: Any) -> Any:
     change, _ = tangents
     form, _ = primals
-    point = _optimum(*primals)
-    nothing = jax.tree.map(lambda _: None, point)
+    outcome = _optimum(*primals)
+    nothing = jax.tree.map(lambda _: None, outcome)
     if not jax.tree.leaves(change):
-        return point, nothing
+        return outcome, nothing
     change = jax.tree.map(
         lambda p, t: jnp.zeros_like(p) if t is None and eqx.is_inexact_array(p) else t,
         form,
         change,
         is_leaf=lambda leaf: leaf is None,
     )
-    *moved, unique = _change(form, change, point)
+    *moved, unique = _change(form, change, outcome)
     # Of a failed solve there is no derivative.
-    ok = unique & (point.errors[0] <= 1)
+    ok = unique & (outcome.errors[0] <= 1)
     dx, dp, dz = (nan_tangent(d, ok) for d in moved)
-    return point, nothing._replace(x=dx, p=dp, z=dz)
+    return outcome, nothing._replace(x=dx, p=dp, z=dz)
 
 
-def _change(form: AbstractForm, change: AbstractForm, point: Point):
+def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
     """The change of `x`, `p` and `z`, and whether the solution is unique."""
     scaled, scaling = lax.stop_gradient(form.equilibrated())
     D, E, R, c = scaling
-    sides, at = form.sides(), point.iterate
-    x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in point[:3])
-    scaled_z, s = at.z / at.tau, at.s / at.tau
+    sides, own_sides = form.sides(), scaled.sides()
+    method = Method(form, scaled, scaling, sides, own_sides, None)
+    x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in outcome[:3])
+    at = outcome.iterate
+    _, _, scaled_z, s, t, m = method.apart(at.v / at.tau)
     pressed = sides.inequality & (scaled_z > s)
     clear = _are_unlike(scaled_z, s) | ~sides.inequality
     violated = jnp.zeros_like(pressed)
     if form.soft is not None:
-        t, m = at.t / at.tau, at.m / at.tau
         violated = pressed & sides.soft & ((t > m) | ~sides.hinge)
         clear = clear & (_are_unlike(t, m) | ~(pressed & sides.hinge))
     held = sides.equality | (pressed & ~violated)
@@ -149,7 +140,6 @@ def _change(form: AbstractForm, change: AbstractForm, point: Point):
     right = [-a * unit for a, unit in zip(right, (c * D, E, R), strict=True)]
     # A linear system like that of a step: held sides are its equations.
     none = jnp.zeros_like(scaled_z)
-    own_sides = scaled.sides()
     W = jnp.where(spring, own_sides.W, 1)
     system_sides = Sides(none, spring, held, spring, spring, none, W)
     compliance = jnp.where(spring, 1 / W, 0)

@@ -16,6 +16,7 @@ Source: Mehrotra, 1992; Andersen and Ye, 1999 (the embedding); Goulart and Chen,
 (with a quadratic cost).
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -36,32 +37,34 @@ _PATIENCE = 5
 
 
 class Iterate(NamedTuple):
-    """A point of the embedding; without soft sides `t` and `m` are `None`."""
+    """A point of the embedding, or a direction. All vectors stand in one, so that what
+    is done to each of their entries is one loop: `x, p, z, s`, and `t, m` if there are
+    soft sides."""
 
-    x: Array
-    p: Array
-    z: Array
-    s: Array
-    t: Array | None
-    m: Array | None
+    v: Array
     tau: Scalar
     kappa: Scalar
 
 
 class Residuals(NamedTuple):
-    """What is left of each line of the embedding, and sums that it has."""
+    """What is left of each line of the embedding, and how far it is from the ends."""
 
     x: Array
     p: Array
     z: Array
-    t: Array | None
+    t: Array
     tau: Scalar
     Hx: Array
     products: Scalar  # s'z + t'm + tau kappa
     linear: Scalar  # the worst of the lines `x` and `p`, over what is allowed, times tau
+    measured: Array
+    """Of the program in the units of the user: what is left of the primal and the dual,
+    the complementarity, and the gap."""
     errors: Array
-    """The worst residual over what is allowed: of the program, of the certificate that
-    it is infeasible, and of the one that it is unbounded."""
+    """The worst of them over what is allowed; that of the certificate that the program
+    is infeasible, and of the one that it is unbounded."""
+    gains: Array
+    """The support of the first certificate and the slope of the second, scaled."""
 
 
 class Tolerances(NamedTuple):
@@ -73,92 +76,147 @@ class Tolerances(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The best iterate, its errors, and the number of iterations."""
+    """The best point in the units of the user, and what is known of it."""
 
+    x: Array
+    p: Array
+    z: Array
     iterate: Iterate
+    measured: Array
     errors: Array
+    gains: Array
     iterations: Array
 
 
-def _sums(*arrays: Array) -> list[Scalar]:
-    """The sum of each of some arrays of one shape, in one loop."""
-    stacked = jnp.stack(arrays)
-    return list(jnp.sum(stacked, axis=range(1, stacked.ndim)))
+class Method(NamedTuple):
+    """A program, the same one scaled, and its sides."""
+
+    form: AbstractForm
+    scaled: AbstractForm
+    scaling: Scaling
+    own_sides: Sides
+    sides: Sides
+    tolerances: Tolerances
+
+    @property
+    def is_soft(self) -> bool:
+        """Whether a side may be violated."""
+        return self.form.soft is not None
+
+    def apart(self, v: Array) -> list[Array]:
+        """`x, p, z, s, t, m` of a vector; the last two are zero without soft sides."""
+        shapes = [self.form.q.shape, self.form.f.shape, *(4 * (self.sides.h.shape,))]
+        parts, end = [], 0
+        for shape in shapes if self.is_soft else shapes[:4]:
+            start, end = end, end + math.prod(shape)
+            parts.append(v[start:end].reshape(shape))
+        return parts if self.is_soft else [*parts, *(2 * (jnp.zeros((), v.dtype),))]
+
+    def joined(self, *parts: Array) -> Array:
+        """The vector of `x, p, z, s, t, m`."""
+        count = 6 if self.is_soft else 4
+        return jnp.concatenate([jnp.ravel(part) for part in parts[:count]])
+
+    def point(self, at: Iterate) -> tuple[Array, Array, Array]:
+        """`x`, `p` and `z` in the units of the user."""
+        D, E, R, c = self.scaling
+        x, p, z, *_ = self.apart(at.v / at.tau)
+        return x * D, p * E / c, z * R / c
 
 
 def _largest(*arrays: Array) -> list[Scalar]:
-    """The largest entry in magnitude of each of some arrays of one shape."""
+    """The largest entry in magnitude of each of some arrays of one shape, in one loop.
+    """
     stacked = jnp.abs(jnp.stack(arrays))
     return list(jnp.max(stacked, axis=range(1, stacked.ndim), initial=0))
 
 
-def evaluated(
-    form: AbstractForm,
-    sides: Sides,
-    scaling: Scaling,
-    tolerances: Tolerances,
-    at: Iterate,
-) -> Residuals:
-    """The residuals of an iterate, and how far it is from each of the three ends, in
-    the units of the user."""
-    atol, rtol, least = tolerances
-    D, E, R, c = scaling
-    tau, active = at.tau, sides.active
-    Hx = form.hessian(at.x)
-    pulled = form.equations_transposed(at.p) + form.rows_transposed(signed(at.z))
-    x = Hx + form.q * tau + pulled
-    reached = form.equations(at.x)
-    p = reached - form.f * tau
-    # What is violated is not what the slack does not match.
-    row = both(form.rows(at.x)) - (0 if at.t is None else at.t)
-    row = jnp.where(active, row, 0)
-    over = row - sides.h * tau
-    z = over + at.s
-    slope, square, x_size = _sums(form.q * at.x, Hx * at.x, jnp.abs(at.x) * D)
-    lift, p_size = _sums(form.f * at.p, jnp.abs(at.p) * E)
-    push, z_size, products = _sums(sides.h * at.z, jnp.abs(at.z) * R, at.s * at.z)
-    products = products + tau * at.kappa
+def _sums(*arrays: Array) -> list[Scalar]:
+    """The sum of each of some arrays of one shape."""
+    stacked = jnp.stack(arrays)
+    return list(jnp.sum(stacked, axis=range(1, stacked.ndim)))
+
+
+def evaluated(method: Method, at: Iterate) -> Residuals:
+    """The residuals of the program as the user gave it, from which those of the
+    embedding of the scaled one follow: all scales are powers of two."""
+    form, sides = method.form, method.own_sides
+    D, E, R, c = method.scaling
+    atol, rtol, least = method.tolerances
+    tau = at.tau
+    x, p, z = method.point(at)
+    _, _, scaled_z, s, t, m = method.apart(at.v)
+    t_own = t / (R * tau)
+    Hx, reached = form.hessian(x), form.equations(x)
+    pulled = form.equations_transposed(p) + form.rows_transposed(signed(z))
+    row = jnp.where(sides.active, both(form.rows(x)) - t_own, 0)
+    left_x, left_p, over = Hx + form.q + pulled, reached - form.f, row - sides.h
     violated = jnp.where(sides.equality, over, jnp.maximum(over, 0))
     # A direction of recession does not violate the bounds 0.
     outward = jnp.where(sides.equality, row, jnp.maximum(row, 0))
-    dual, *slopes, pulled_most, flat = _largest(x / D, Hx / D, pulled / D, pulled, Hx)
-    push_most = push
-    missed, drift = _largest(p / E, reached)
-    violated, row_scale, outward = _largest(violated / R, row / R, outward)
-    t = None
-    if at.t is not None:
-        Wt = sides.W * at.t
-        t = jnp.where(sides.soft, Wt + sides.v * tau - at.z - at.m, 0)
-        costs, squares, extra = _sums(sides.v * at.t, Wt * at.t, at.t * at.m)
-        spring, bent = _largest(t * R, Wt)
-        slope, square, products = slope + costs, square + squares, products + extra
-        dual, flat = jnp.maximum(dual, spring), jnp.maximum(flat, bent)
-        # A soft side has no part in a certificate.
-        yielding = jnp.where(sides.soft, at.z, 0)
-        resisted = pulled - form.rows_transposed(signed(yielding))
-        pulled_most = _largest(resisted)[0]
-        push_most = push - jnp.sum(sides.h * yielding)
-    gap = slope + lift + push + square / tau
+    slack = jnp.where(sides.inequality, z * jnp.maximum(-over, 0), 0)
 
-    # Each is compared with the terms that cancel in it. Those of the dual are divided
-    # by c D, those of the primal by E or R.
-    size = lambda data: _largest(data)[0]
-    terms = jnp.abs(jnp.stack([slope, square / tau, lift, push]))
-    found = jnp.stack([dual / c, violated, missed, jnp.abs(gap) / c])
-    scales = jnp.stack([jnp.maximum(*slopes) / c, row_scale, row_scale, jnp.max(terms) / c])
-    data = jnp.stack([size(form.q / (c * D)), size(sides.h / R), size(form.f / E), 0])
-    errors = found / tau / (atol + rtol * jnp.maximum(scales / tau, data))
+    square, slope, x_size = _sums(x * Hx, x * form.q, jnp.abs(x))
+    lift, p_size = _sums(form.f * p, jnp.abs(p))
+    products, push, z_size = _sums(s * scaled_z, sides.h * z, jnp.abs(z))
+    dual, *x_terms, pull, flat = _largest(
+        left_x, Hx, form.q, pulled, pulled * D, Hx * D
+    )
+    missed, p_term, drift = _largest(left_p, form.f, reached * E)
+    violated, *z_terms, outward, product = _largest(
+        violated, row, sides.h, outward * R, slack
+    )
+    left_t, support = t, push
+    if method.is_soft:
+        bent = sides.W * t_own
+        slack_t = jnp.where(sides.soft, bent + sides.v - z, 0)
+        left_t = jnp.where(sides.soft, slack_t * c * tau / R - m, 0)
+        # A soft side has no part in a certificate.
+        yielding = jnp.where(sides.soft, z, 0)
+        resisted = pulled - form.rows_transposed(signed(yielding))
+        (pull,) = _largest(resisted * D)
+        costs, squares, extra, given = _sums(
+            sides.v * t_own, bent * t_own, t * m, yielding * sides.h
+        )
+        spring, held, bend = _largest(
+            jnp.minimum(slack_t, 0), slack_t * t_own, bent / R
+        )
+        slope, square, products = slope + costs, square + squares, products + extra
+        dual, product = jnp.maximum(dual, spring), jnp.maximum(product, held)
+        flat, support = jnp.maximum(flat, bend), push - given
+    gap = square + slope + lift + push
+    products = products + tau * at.kappa
+
+    # Each is compared with the terms that cancel in it.
+    terms = jnp.max(jnp.abs(jnp.stack([square, slope, lift, push])))
+    found = jnp.stack([violated, missed, dual, product, jnp.abs(gap)])
+    rows, gradient = jnp.max(jnp.stack(z_terms)), jnp.max(jnp.stack(x_terms))
+    scales = jnp.stack([rows, jnp.maximum(rows, p_term), gradient, terms, terms])
+    errors = found / (atol + rtol * scales)
     # A certificate is judged in the scaled problem, whose units mean nothing. It must
     # hold with all data off by the tolerance too: what a tolerance away is feasible has
     # a solution.
-    relaxed = atol + rtol
-    gains = jnp.stack([lift + push_most, slope])
-    gains = gains + relaxed * jnp.stack([p_size + z_size, c * x_size])
-    failings = jnp.stack([pulled_most, jnp.maximum(jnp.maximum(flat, drift), outward)])
-    certificates = jnp.where(gains < 0, failings / (least * -gains), jnp.inf)
-    linear = tau * jnp.maximum(errors[0], errors[2])
-    errors = jnp.concatenate([jnp.max(errors)[None], certificates])
-    return Residuals(x, p, z, t, at.kappa + gap, Hx, products, linear, errors)
+    unit = c * tau
+    gains = jnp.stack([lift + support, slope])
+    relaxed = unit * (gains + (atol + rtol) * jnp.stack([p_size + z_size, x_size]))
+    worst = jnp.maximum(jnp.maximum(flat * c, drift), outward)
+    failings = tau * jnp.stack([pull * c, worst])
+    certificates = jnp.where(relaxed < 0, failings / (least * -relaxed), jnp.inf)
+    measured = jnp.concatenate([jnp.maximum(found[:1], found[1:2]), found[2:]])
+    z_left = jnp.where(method.sides.active, R * tau * over + s, 0)
+    return Residuals(
+        unit * D * left_x,
+        tau * E * left_p,
+        z_left,
+        left_t,
+        at.kappa + unit * gap,
+        unit * D * Hx,
+        products,
+        tau * jnp.maximum(errors[1], errors[2]),
+        measured,
+        jnp.concatenate([jnp.max(errors)[None], certificates]),
+        gains,
+    )
 
 
 class System(NamedTuple):
@@ -212,177 +270,164 @@ def solved(form, sides: Sides, system: System, right, passes: Array | int):
     return lax.fori_loop(0, passes, refine, start)[0]
 
 
-def stored(tree):
-    """The arrays behind a barrier: XLA would repeat what they are computed from in each
-    loop that reads them, and compile it as often."""
-    return lax.optimization_barrier(tree)
+def direction(method: Method, at: Iterate, left: Residuals, first, count, passes):
+    """Mehrotra's step: the direction, its length, the share of the residuals that it
+    aims to remove, and the direction of tau."""
+    form, sides, is_soft = method.scaled, method.sides, method.is_soft
+    inequality, hinge = sides.inequality, sides.hinge
+    x, _, z, s, t, m = method.apart(at.v)
+    z, s = (jnp.where(inequality & ~first, a, 1) for a in (z, s))
+    barrier = jnp.where(inequality, s / z, 0)
+    e = stay = jnp.zeros((), z.dtype)
+    if is_soft:
+        # Of the violation, which the multiplier m keeps at zero with stiffness m / t.
+        m, t_or_1 = jnp.where(hinge, m, 0), jnp.where(sides.soft, t, 1)
+        stay = m / t_or_1
+        stiffness = jnp.where(sides.soft, sides.W + stay, 1)
+        e = jnp.where(sides.soft & ~first, 1 / stiffness, 0)
+    system = assembled(form, sides, barrier + e)
+    tau, kappa = at.tau, at.kappa
+    weights = method.joined(
+        form.q + 2 * left.Hx / tau,
+        form.f,
+        sides.h,
+        jnp.zeros_like(s),
+        sides.v + 2 * sides.W * t / tau,
+        jnp.zeros_like(s),
+    )
+    on = method.joined(
+        *(jnp.zeros_like(a, bool) for a in (form.q, form.f)),
+        *(inequality, inequality, hinge, hinge),
+    )
+    values = method.joined(form.q, form.f, z, s, t, m)
+
+    def solve(lines, rt, rs, rm):
+        """The change of all vectors, for the right sides of the lines of `x, p, z`, of
+        `t`, and of the products `s z` and `t m`. The last three are eliminated."""
+        x, p, r = lines
+        r = r - rs / z
+        if is_soft:
+            rm = rm / t_or_1
+            r = r + e * (rt + rm)
+        lines = x, p, jnp.where(sides.active, r, 0)
+        dx, dp, dz = solved(form, sides, system, lines, passes)
+        ds = jnp.where(inequality, rs / z - barrier * dz, 0)
+        if not is_soft:
+            return method.joined(dx, dp, dz, ds)
+        dt = e * (dz + rt + rm)
+        dm = jnp.where(hinge, rm - stay * dt, 0)
+        return method.joined(dx, dp, dz, ds, dt, dm)
+
+    # Three right sides in turn, that of tau, the affine one, and the one with Mehrotra's
+    # correction: so all that follows stands in the program once.
+    def turn(k, carry):
+        along, d, sigma, _ = carry
+        is_tau = k == 0
+        share, aim = 1 - sigma, sigma * left.products / count
+        pick = lambda a, b: jnp.where(is_tau, a, b)
+        lines = (
+            pick(-form.q, -share * left.x),
+            pick(form.f, -share * left.p),
+            pick(sides.h, -share * left.z),
+        )
+        _, _, dz, ds, dt, dm = method.apart(d.v)
+        rs = jnp.where(inequality & ~is_tau, aim - s * z - ds * dz, 0)
+        rt = rm = jnp.zeros((), z.dtype)
+        if is_soft:
+            rt = pick(-sides.v, -share * left.t)
+            rm = jnp.where(hinge & ~is_tau, aim - t * m - dt * dm, 0)
+        change = solve(lines, rt, rs, rm)
+        along = pick(change, along)
+        # The curvature of the last line along tau is a sum of squares.
+        ax, _, az, _, a_t, _ = method.apart(along)
+        off = x / tau - ax
+        springs = barrier * az**2
+        if is_soft:
+            springs = springs + sides.W * (t / tau - a_t) ** 2 + stay * a_t**2
+        slope = kappa / tau + jnp.sum(off * form.hessian(off)) + jnp.sum(springs)
+        last = aim - tau * kappa - d.tau * d.kappa
+        total = share * left.tau + jnp.sum(weights * change) + last / tau
+        dtau = pick(0, total / slope)
+        dkappa = pick(0, (last - kappa * dtau) / tau)
+        d = Iterate(pick(0, change + dtau * along), dtau, dkappa)
+        # The largest step within the bounds, at most 1.
+        worst = jnp.max(jnp.where(on, -d.v / values, 0), initial=1)
+        length = 1 / jnp.maximum(worst, jnp.maximum(-dtau / tau, -dkappa / kappa))
+        return along, d, jnp.where(k == 1, (1 - length) ** 3, sigma), length
+
+    none = jnp.zeros_like(at.v)
+    nothing = jnp.zeros((), z.dtype)
+    start = none, Iterate(none, nothing, nothing), nothing, nothing
+    along, d, sigma, length = lax.fori_loop(0, 3, turn, start)
+    return d, jnp.minimum(_TO_BOUNDARY * length, 1), 1 - sigma, along
+
+
+def begun(method: Method, along: Array) -> Iterate:
+    """A start: with unit weights the direction of tau solves the problem with squares
+    for the inequalities, of which `s = -z`."""
+    sides = method.sides
+    x, p, z, *_ = method.apart(along)
+    s, one = interior(-z, sides.inequality), jnp.ones((), along.dtype)
+    z = jnp.where(sides.inequality, interior(z, sides.inequality), z)
+    t, m = (jnp.where(on, one, 0) for on in (sides.soft, sides.hinge))
+    return Iterate(method.joined(x, p, z, s, t, m), one, one)
 
 
 def minimise(
-    form: AbstractForm,
-    scaling: Scaling,
+    method: Method,
     start: tuple[Iterate, BoolScalar] | None,
-    tolerances: Tolerances,
     max_steps: int,
     refinements: int,
 ) -> Outcome:
-    """Run the method on a scaled form, from a start or from its own."""
-    sides = form.sides()
-    is_soft, inequality = form.soft is not None, sides.inequality
-    count = 1 + jnp.sum(inequality)
-    if is_soft:
-        count = count + jnp.sum(sides.hinge)
-    one = jnp.ones((), form.q.dtype)
-    none = jnp.zeros_like(sides.h)
-    rounding = jnp.finfo(one.dtype).eps
-
-    def step(at: Iterate, left: Residuals, first: BoolScalar, passes: Array):
-        """The next iterate, and the share of the linear residuals that it has."""
-        z = jnp.where(inequality & ~first, at.z, 1)
-        s = jnp.where(inequality & ~first, at.s, 1)
-        barrier = jnp.where(inequality, s / z, 0)
-        t = m = e = stay = 0
-        if is_soft:
-            # Of the violation: `t` stays at zero with stiffness `m / t`.
-            t, m = at.t, jnp.where(sides.hinge, at.m, 0)
-            stay = m / jnp.where(sides.soft, t, 1)
-            stiffness = jnp.where(sides.soft, sides.W + stay, 1)
-            e = jnp.where(sides.soft & ~first, 1 / stiffness, 0)
-        system = assembled(form, sides, barrier + e)
-        solve = lambda *right: solved(form, sides, system, right, passes)
-
-        def right_of(x, p, r, rt, rs, rm):
-            """The right side, of which the lines of `t`, `s z` and `t m` are
-            eliminated."""
-            r = r - rs / z
-            if is_soft:
-                r = r + e * (rt + rm / jnp.where(sides.soft, t, 1))
-            return x, p, jnp.where(sides.active, r, 0)
-
-        def expanded(solution, rt, rs, rm):
-            dx, dp, dz = solution
-            ds = jnp.where(inequality, rs / z - barrier * dz, 0)
-            if not is_soft:
-                return dx, dp, dz, ds, None, None
-            rm = rm / jnp.where(sides.soft, t, 1)
-            dt = e * (dz + rt + rm)
-            return dx, dp, dz, ds, dt, jnp.where(sides.hinge, rm - stay * dt, 0)
-
-        # The direction of tau, and the affine one: two columns.
-        unit = -sides.v if is_soft else 0, 0, 0
-        data = right_of(-form.q, form.f, sides.h, *unit)
-        targets = -left.t if is_soft else 0, jnp.where(inequality, -s * z, 0), -t * m
-        affine = right_of(-left.x, -left.p, -left.z, *targets)
-        pairs = zip(data, affine, strict=True)
-        columns = jax.vmap(solve)(*(jnp.stack(pair) for pair in pairs))
-        tau_column, affine = (
-            jax.tree.map(lambda a, k=k: a[k], columns) for k in range(2)
-        )
-        along = stored(expanded(tau_column, *unit))
-
-        # The curvature of the last line along tau is a sum of squares.
-        tau, kappa = at.tau, at.kappa
-        off = at.x / tau - along[0]
-        slope = kappa / tau + jnp.sum(off * form.hessian(off))
-        springs = barrier * along[2] ** 2
-        if is_soft:
-            off = at.t / tau - along[4]
-            springs = springs + sides.W * off**2 + stay * along[4] ** 2
-        slope = slope + jnp.sum(springs)
-        x_weight = form.q + 2 * left.Hx / tau
-        t_weight = sides.v + 2 * sides.W * t / tau if is_soft else 0
-
-        def combined(change, tau_right, tau_kappa) -> Iterate:
-            dx, dp, dz, _, dt, _ = change
-            sided = sides.h * dz + (t_weight * dt if is_soft else 0)
-            total = jnp.sum(x_weight * dx) + jnp.sum(form.f * dp) + jnp.sum(sided)
-            dtau = (tau_right + total + tau_kappa / tau) / slope
-            change = jax.tree.map(lambda a, b: a + dtau * b, change, along)
-            return stored(Iterate(*change, dtau, (tau_kappa - kappa * dtau) / tau))
-
-        def longest(d: Iterate):
-            """The largest step within the bounds, at most 1."""
-            ratios = [jnp.where(inequality, -d.z / z, 0)]
-            ratios = [*ratios, jnp.where(inequality, -d.s / s, 0)]
-            if is_soft:
-                moves = (d.t, t), (d.m, m)
-                ratios += [jnp.where(sides.hinge, -d / v, 0) for d, v in moves]
-            worst = jnp.max(jnp.stack(ratios), initial=1)
-            ends = jnp.maximum(-d.tau / tau, -d.kappa / kappa)
-            return 1 / jnp.maximum(worst, ends)
-
-        predictor = combined(expanded(affine, *targets), left.tau, -tau * kappa)
-        sigma = (1 - longest(predictor)) ** 3
-        aim, share = sigma * left.products / count, 1 - sigma
-        # The second-order correction of each product.
-        targets = (
-            -share * left.t if is_soft else 0,
-            jnp.where(inequality, aim - s * z - predictor.s * predictor.z, 0),
-            jnp.where(sides.hinge, aim - t * m - predictor.t * predictor.m, 0)
-            if is_soft
-            else 0,
-        )
-        lines = (-share * part for part in (left.x, left.p, left.z))
-        corrector = expanded(solve(*right_of(*lines, *targets)), *targets)
-        last = aim - tau * kappa - predictor.tau * predictor.kappa
-        change = combined(corrector, share * left.tau, last)
-        length = jnp.minimum(_TO_BOUNDARY * longest(change), 1)
-        moved = stored(jax.tree.map(lambda a, d: a + length * d, at, change))
-
-        # The first iteration finds a start: with unit weights the column of tau solves
-        # the problem with squares for the inequalities, of which z = -s.
-        x, p, z = tau_column
-        found = jnp.where(inequality, interior(z, inequality), z)
-        begun = (
-            (jnp.where(sides.soft, 1, none), jnp.where(sides.hinge, 1, none))
-            if is_soft
-            else (None, None)
-        )
-        start = Iterate(x, p, found, interior(-z, inequality), *begun, one, one)
-        after = jax.tree.map(lambda a, b: jnp.where(first, a, b), start, moved)
-        return stored(after), jnp.where(first, jnp.inf, 1 - length * share)
+    """Run the method, from a start or from its own."""
+    sides, dtype = method.sides, method.form.q.dtype
+    count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
+    rounding = jnp.finfo(dtype).eps
 
     def body(carry):
-        at, left, best, least, k, since, passes = carry
-        before = left.linear
-        at, share = step(at, left, k == 0, passes)
-        left = evaluated(form, sides, scaling, tolerances, at)
+        at, left, best, known, k, since, passes = carry
+        first, before = k == 0, left.linear
+        d, length, share, along = direction(method, at, left, first, count, passes)
+        moved = jax.tree.map(lambda a, d: a + length * d, at, d)
+        begin = begun(method, along)
+        at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, moved)
+        left = evaluated(method, at)
         # Where a residual is larger than it should be, rounding is: from now on the
         # linear systems are refined once more.
-        rounded = left.linear > 1.5 * share * before + _NEGLIGIBLE * at.tau
+        expected = jnp.where(first, jnp.inf, (1 - length * share) * before)
+        rounded = left.linear > 1.5 * expected + _NEGLIGIBLE * at.tau
         passes = jnp.minimum(passes + rounded, 1 + refinements)
         # NaN fails the comparison.
-        better = jnp.min(left.errors) < jnp.min(least)
-        best, least = jax.tree.map(
-            lambda a, b: jnp.where(better, a, b), (at, left.errors), (best, least)
+        better = jnp.min(left.errors) < jnp.min(known[1])
+        now = left.measured, left.errors, left.gains
+        best, known = jax.tree.map(
+            lambda a, b: jnp.where(better, a, b), (at, now), (best, known)
         )
         # While the products fall, an error may rise for a while.
         falls = left.products > count * rounding * at.tau**2
         since = jnp.where(better, 0, since + ~falls)
-        return at, left, best, least, k + 1, since, passes
+        return at, left, best, known, k + 1, since, passes
 
     def going(carry):
-        *_, least, k, since, _ = carry
-        return (jnp.min(least) > 1) & (k < max_steps) & (since < _PATIENCE)
+        _, _, _, known, k, since, _ = carry
+        return (jnp.min(known[1]) > 1) & (k < max_steps) & (since < _PATIENCE)
 
-    k = jnp.zeros((), int)
+    k, one = jnp.zeros((), int), jnp.ones((), dtype)
     if start is None:
-        nothing = (none, none) if is_soft else (None, None)
-        zero = jnp.zeros_like(form.q), jnp.zeros_like(form.f), none, none
-        start = Iterate(*zero, *nothing, one, one)
+        none = jnp.zeros_like(sides.h)
+        zeros = jnp.zeros_like(method.form.q), jnp.zeros_like(method.form.f)
+        at = Iterate(method.joined(*zeros, none, none, none, none), one, one)
         left = jax.tree.map(
-            lambda a: jnp.zeros(a.shape, a.dtype),
-            jax.eval_shape(evaluated, form, sides, scaling, tolerances, start),
+            lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(evaluated, method, at)
         )
     else:
         # The first iteration, which finds a start, is left out.
-        start, usable = start
-        left, k = evaluated(form, sides, scaling, tolerances, start), k + usable
-    least = jnp.full(3, jnp.inf, one.dtype)
-    zero = jnp.zeros((), int)
-    carry = start, left, start, least, k, zero, zero + 1
-    _, _, best, least, k, _, _ = lax.while_loop(going, body, carry)
-    return Outcome(best, least, k)
+        at, usable = start
+        left, k = evaluated(method, at), k + usable
+    known = left.measured, jnp.full(3, jnp.inf, dtype), left.gains
+    carry = at, left, at, known, k, jnp.zeros((), int), jnp.ones((), int)
+    _, _, best, known, k, _, _ = lax.while_loop(going, body, carry)
+    return Outcome(*method.point(best), best, *known, k)
 
 
 def interior(z: Array, on: Array) -> Array:

@@ -13,9 +13,9 @@ from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Array, RealScalar
 from ..math._linear_solve import full_precision
 from ._dense_problem import Dense
-from ._derivatives import optimum, Options, Point
-from ._form import AbstractForm, both, signed
-from ._interior_point import Tolerances
+from ._derivatives import optimum, Options
+from ._form import AbstractForm
+from ._interior_point import Outcome, Tolerances
 from ._solution import Solution
 from ._staged_problem import Staged
 
@@ -122,13 +122,11 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     atol, rtol = jnp.asarray(atol, dtype), jnp.asarray(rtol, dtype)
     if start is not None:
         start = problem.unknowns(*start)
-    # The iteration ends a little below the tolerance, by which the answer is judged.
-    inner = Tolerances(0.9 * atol, 0.9 * rtol, certificate)
-    options = lax.stop_gradient(Options(start, inner, max_steps, refinements))
+    tolerances = Tolerances(atol, rtol, certificate)
+    options = lax.stop_gradient(Options(start, tolerances, max_steps, refinements))
     point = optimum(form, options)
-    measured, error = _measured(lax.stop_gradient((form, point[:3])), atol, rtol)
     is_posed = _is_posed(problem, form)
-    result, is_certificate = _judged(point, error, is_posed)
+    result, is_certificate = _judged(point, is_posed)
     infeasible, unbounded = is_certificate
     x, p, z = _certified(form, point, infeasible, unbounded)
     cost = form.cost(x)
@@ -139,48 +137,12 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     upper = jnp.where(equality[0], jnp.maximum(z[0], 0), z[0])
     multipliers = problem.multipliers(p, jnp.stack([upper, lower]))
     answer = *problem.primal(x), multipliers, cost
-    return Solution(*answer, *measured, point.iterations, result)
+    return Solution(*answer, *point.measured, point.iterations, result)
 
 
-def _measured(given: Any, atol: Array, rtol: Array):
-    """The four residuals, and the worst over what is allowed."""
-    form, (x, p, z) = given
-    sides = form.sides()
-    # Those of one shape at once, in one loop.
-    along = lambda arrays: range(1, arrays[0].ndim + 1)
-    largest = lambda *a: jnp.max(jnp.abs(jnp.stack(a)), axis=along(a), initial=0)
-    sums = lambda *a: jnp.sum(jnp.stack(a), axis=along(a))
-    Hx, reached = form.hessian(x), form.equations(x)
-    pulled = form.equations_transposed(p) + form.rows_transposed(signed(z))
-    row = jnp.where(sides.active, both(form.rows(x)), 0)
-    over = row - sides.h
-    hard = jnp.where(sides.equality, over, jnp.maximum(over, 0) * ~sides.soft)
-    products = jnp.where(sides.inequality, z * jnp.maximum(-over, 0), 0)
-    dual, *slopes = largest(Hx + form.q + pulled, Hx, form.q, pulled)
-    square, slope = sums(x * Hx, x * form.q)
-    (lift,) = sums(form.f * p)
-    t = bent = pressed = 0 * over
-    if form.soft is not None:
-        t = jnp.where(sides.soft, jnp.maximum(over, 0), 0)
-        most = sides.v + sides.W * t
-        products = products + t * jnp.maximum(most - z, 0)
-        bent, pressed = t * most, jnp.where(sides.soft, jnp.maximum(z - most, 0), 0)
-    push, bent = sums(sides.h * z, bent)
-    violated, product, *rows, excess = largest(hard, products, row, sides.h, pressed)
-    missed, reach = largest(reached - form.f, form.f)
-    # Each is compared with the terms that cancel in it.
-    gap = square + slope + lift + push + bent
-    values = jnp.stack([square, slope, lift, push, bent])
-    found = [jnp.maximum(violated, missed), jnp.maximum(dual, excess), product]
-    found = jnp.stack([*found, jnp.abs(gap)])
-    terms = jnp.max(jnp.abs(values))
-    scales = [jnp.maximum(*rows), jnp.max(jnp.stack(slopes)), terms, terms]
-    scales = jnp.maximum(jnp.stack(scales), jnp.stack([reach, 0, 0, 0]))
-    return found, jnp.max(found / (atol + rtol * scales))
-
-
-def _judged(point: Point, error: Array, is_posed: Array) -> tuple[Result, Any]:
+def _judged(point: Outcome, is_posed: Array) -> tuple[Result, Any]:
     """The status, and whether the point is one of the two certificates."""
+    error = point.errors[0]
     solved = error <= 1
     infeasible = ~solved & (point.errors[1] <= 1)
     unbounded = ~solved & ~infeasible & (point.errors[2] <= 1)
@@ -205,13 +167,12 @@ def _is_posed(problem: Dense | Staged, form: AbstractForm) -> Array:
     return posed
 
 
-def _certified(form: AbstractForm, point: Point, infeasible: Array, unbounded: Array):
+def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded: Array):
     """The point, or the normalised certificate with NaN for what is none."""
     sides = form.sides()
     at = lax.stop_gradient(point)
     p, z = at.p, jnp.where(sides.soft, 0, at.z)
-    support = jnp.sum(form.f * p) + jnp.sum(sides.h * z)
-    slope = jnp.sum(form.q * at.x)
+    support, slope = at.gains
     unit = lambda fails, size: jnp.where(fails, jnp.abs(size), 1)
     dual, primal = unit(infeasible, support), unit(unbounded, slope)
 
