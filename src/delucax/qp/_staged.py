@@ -40,13 +40,13 @@ class Factors(NamedTuple):
 class StagedForm(AbstractForm):
     """A program in stages; the first rows of each are some of its variables."""
 
-    H: Float[Array, "T+1 N N"]
-    q: Float[Array, "T+1 N"]
-    F: Float[Array, "T n N"]
-    f: Float[Array, "T+1 n"]
-    G: Float[Array, "T+1 p N"]
-    lower: Float[Array, "T+1 rows"]
-    upper: Float[Array, "T+1 rows"]
+    H: Float[Array, "steps N N"]
+    q: Float[Array, "steps N"]
+    F: Float[Array, "stages n N"]
+    f: Float[Array, "steps n"]
+    G: Float[Array, "steps p N"]
+    lower: Float[Array, "steps rows"]
+    upper: Float[Array, "steps rows"]
     soft: tuple[Array, Array] | None
     bounded: tuple[int, int] = eqx.field(static=True)
     is_free: bool = eqx.field(static=True)
