@@ -35,7 +35,7 @@ def program(seed, kind):
     q = rng.standard_normal(N) * scale
     x = rng.standard_normal(N) / scale
     b, upper = A @ x, G @ x + rng.exponential(size=P)
-    lower = np.where(rng.random(P) < 0.3, upper - 3 - rng.exponential(size=P), -np.inf)
+    lower = np.where(rng.random(P) < 0.3, G @ x - rng.exponential(size=P), -np.inf)
     if kind == "feasible":
         # Dual feasible, so that the cost is bounded.
         z = rng.exponential(size=P)

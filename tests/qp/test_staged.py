@@ -140,7 +140,7 @@ def dense(given, soft, free):
 @pytest.mark.parametrize("free", [False, True])
 def test_stages_are_the_same_program(soft, free):
     """Hard and soft, with the start given and free."""
-    given = data(3)
+    given = data(5)
     ours, other = staged(given, soft, free), dense(given, soft, free)
     assert ours.result == other.result == dlx.RESULTS.successful
     z = np.concatenate([np.hstack([ours.x[:-1], ours.u]).ravel(), ours.x[-1]])
@@ -163,7 +163,7 @@ def test_without_bounds_it_is_the_riccati_recursion():
 
 
 def test_the_costates_are_derivatives_of_the_cost():
-    given = data(3)
+    given = data(5)
     s = staged(given, True, False)
     value = lambda d: staged(given | dict(d=d), True, False).cost
     gradient = jax.grad(value)(jnp.asarray(given["d"]))
@@ -172,7 +172,7 @@ def test_the_costates_are_derivatives_of_the_cost():
 
 @once
 def test_a_batch_is_its_members():
-    given = data(3)
+    given = data(5)
     starts = given["start"] + 0.1 * np.random.default_rng(1).standard_normal((3, N))
     starts = starts.astype(dtype())
     one = lambda start: staged(given | dict(start=start), True, False)
@@ -182,7 +182,7 @@ def test_a_batch_is_its_members():
 
 
 def test_a_solution_starts_the_next_problem_warm():
-    given = data(3)
+    given = data(5)
     problem = lambda start: dlx.qp.Staged(
         **{k: v for k, v in given.items() if k not in ("C", "D", "low", "start")},
         **constraints(given, False),

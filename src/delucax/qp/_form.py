@@ -100,7 +100,7 @@ class AbstractForm(eqx.Module):
         # An equation stands once, at the upper side.
         equality = jnp.stack([equal, jnp.zeros_like(equal)])
         inequality = finite & ~equal
-        h = jnp.where(finite, bounds, 0)
+        h = jnp.where(inequality | equality, bounds, 0)
         if self.soft is None:
             none = jnp.zeros_like(finite)
             return Sides(h, inequality, equality, none, none, *(2 * (0 * h,)))

@@ -281,7 +281,7 @@ def direction(method: Method, at: Iterate, left: Residuals, first, count, passes
     e = stay = jnp.zeros((), z.dtype)
     if is_soft:
         # Of the violation, which the multiplier m keeps at zero with stiffness m / t.
-        m, t_or_1 = jnp.where(hinge, m, 0), jnp.where(sides.soft, t, 1)
+        m, t_or_1 = jnp.where(hinge, m, 0), jnp.where(sides.soft & ~first, t, 1)
         stay = m / t_or_1
         stiffness = jnp.where(sides.soft, sides.W + stay, 1)
         e = jnp.where(sides.soft & ~first, 1 / stiffness, 0)
