@@ -24,7 +24,6 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._typing import Array, BoolScalar, Scalar
-from ._dense import regularisation
 from ._form import AbstractForm, both, Scaling, Sides, signed
 
 
@@ -230,8 +229,9 @@ class System(NamedTuple):
 
 def assembled(form: AbstractForm, sides: Sides, compliance: Array) -> System:
     """Factorise `[[H, F', G'], [F, 0, 0], [G, 0, -compliance]]`."""
-    # An equation has no compliance, which refinement restores.
-    soft = jnp.asarray(regularisation(form.q.dtype), form.q.dtype)
+    # An equation has no compliance, which refinement restores. Its rate is the sum of
+    # this and of rounding over this, in the scaled problem.
+    soft = jnp.asarray(jnp.finfo(form.q.dtype).eps ** 0.5, form.q.dtype)
     compliance = jnp.where(sides.equality, 0, compliance)
     regularised = jnp.where(sides.equality, soft, compliance)
     regularised = jnp.where(sides.active, regularised, 1)
