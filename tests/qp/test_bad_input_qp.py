@@ -44,7 +44,10 @@ def crossed():
         (lambda: Soft(0, 1, linear=-1), "Soft: linear must be at least 0"),
         (lambda: Staged(A, B, Q, R), "Staged: give the horizon"),
         (lambda: Staged(A, B, stages(Q), R, horizon=4), "differ in their stages"),
-        (lambda: Staged(A, np.ones((3, 1)), Q, R, horizon=3), "A must have shape (3, 3)"),
+        (
+            lambda: Staged(A, np.ones((3, 1)), Q, R, horizon=3),
+            "A must have shape (3, 3)",
+        ),
         (lambda: Staged(A, B, bent(), R), "at stage 1 its least eigenvalue is -0.5"),
         (
             lambda: Staged(A, B, Q, R, horizon=3, states=crossed()),

@@ -5,15 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, central_difference, needs_x64
+from jax.flatten_util import ravel_pytree
 
 import delucax as dlx
-from jax.flatten_util import ravel_pytree
 
 
 def staged(parts):
     """A number of a staged solution, with active, soft and equal bounds."""
     p = parts
-    rows = dlx.qp.Rows(p["C"], lower=p["lower"], upper=p["upper"], linear=p["v"], quadratic=p["W"])
+    rows = dlx.qp.Rows(
+        p["C"], lower=p["lower"], upper=p["upper"], linear=p["v"], quadratic=p["W"]
+    )
     problem = dlx.qp.Staged(
         p["A"],
         p["B"],
@@ -30,7 +32,9 @@ def staged(parts):
         final_rows=dlx.qp.Rows(p["C"], lower=p["end"], upper=p["end"]),
     )
     s = dlx.qp.solve(problem, rtol=1e-10, atol=1e-10, throw=False)
-    weigh = lambda a: jnp.sum(a * jnp.cos(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape))
+    weigh = lambda a: jnp.sum(
+        a * jnp.cos(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape)
+    )
     y = s.multipliers
     found = s.x, s.u, y.costates, *y.controls, *y.rows
     return sum(map(weigh, found)) + s.cost
@@ -66,7 +70,9 @@ def test_gradients_are_central_differences_in_every_array():
     _, gradient = value(flat)
     expected = central_difference(lambda x: value(x)[0], flat, 1e-5)
     assert_close(gradient, expected, rtol=1e-5, atol=1e-5)
-    forward = jax.jit(lambda t: jax.jvp(lambda flat: staged(apart(flat)), (flat,), (t,)))
+    forward = jax.jit(
+        lambda t: jax.jvp(lambda flat: staged(apart(flat)), (flat,), (t,))
+    )
     direction = np.cos(np.arange(len(flat)))
     assert_close(forward(direction)[1], gradient @ direction, rtol=1e-8)
 
@@ -125,4 +131,6 @@ def test_a_failed_solve_has_nan_and_infinite_bounds_have_none():
     f = lambda high: dense(np.eye(2), np.zeros(2), bounds=(1.0, high))
     assert np.isnan(jax.jit(jax.jacrev(f))(jnp.array([0.0, 2.0]))).any()
     g = lambda q: dense(np.eye(2), q, bounds=(-np.inf, np.array([np.inf, 1.0])))
-    assert_close(jax.jacrev(g)(jnp.array([-2.0, -2.0])), np.diag([-1.0, 0.0]), atol=1e-3)
+    assert_close(
+        jax.jacrev(g)(jnp.array([-2.0, -2.0])), np.diag([-1.0, 0.0]), atol=1e-3
+    )

@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,7 +93,9 @@ def dense(given, soft, free):
         E.append(row(pairs, N)), b.append(g["d"][k])
         G.append(row([(control(k), jnp.eye(M))], M))
         lower.append(-jnp.ones(M)), upper.append(jnp.ones(M))
-        soft_rows.append((row([(state(k), g["C"]), (control(k), g["D"])], 2), (1.0, 2.0)))
+        soft_rows.append(
+            (row([(state(k), g["C"]), (control(k), g["D"])], 2), (1.0, 2.0))
+        )
         lower_upper = jnp.array([-jnp.inf, -1.5]), jnp.array([1.0, 1.5])
         soft_rows[-1] += lower_upper
     for k in range(0 if free else 1, T + 1):
@@ -194,6 +197,6 @@ def test_a_solution_starts_the_next_problem_warm():
     assert_close(warm.u, cold.u, atol=tolerance(1e-2, 1e-6))
     lost = jax.tree.map(lambda a: a * np.nan, cold.x)
     ignored = dlx.qp.solve(
-        problem(given["start"]), start=dlx.replace(cold, x=lost)
+        problem(given["start"]), start=eqx.tree_at(lambda s: s.x, cold, lost)
     )
     assert_close(ignored.u, cold.u, atol=tolerance(1e-2, 1e-6))

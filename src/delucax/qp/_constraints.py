@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._check import as_float_array, check_real, is_concrete
+from .._check import as_float_array, check_count, check_real, is_concrete
 from .._typing import Array
 
 
@@ -44,7 +44,10 @@ class Soft(eqx.Module):
     quadratic: Array
 
     def __init__(self, low: Any, high: Any, linear: Any = 0.0, quadratic: Any = 0.0):
-        self.low, self.high = _as_array(low, "low", "Soft"), _as_array(high, "high", "Soft")
+        self.low, self.high = (
+            _as_array(low, "low", "Soft"),
+            _as_array(high, "high", "Soft"),
+        )
         self.linear = _as_weight(linear, "linear", "Soft")
         self.quadratic = _as_weight(quadratic, "quadratic", "Soft")
 
@@ -105,7 +108,9 @@ class Rows(eqx.Module):
         is_soft = linear is not None or quadratic is not None
         weights = (0.0 if w is None else w for w in (linear, quadratic))
         names = "linear", "quadratic"
-        weights = (_as_weight(w, n, "Rows") for w, n in zip(weights, names, strict=True))
+        weights = (
+            _as_weight(w, n, "Rows") for w, n in zip(weights, names, strict=True)
+        )
         self.linear, self.quadratic = weights if is_soft else (None, None)
 
 
@@ -238,7 +243,9 @@ def symmetric_part(matrix: Array, name: str, where: str) -> Array:
     if is_concrete(matrix):
         array = np.asarray(matrix)
         off = np.abs(array - np.swapaxes(array, -1, -2))
-        if np.any(off > 100 * np.finfo(array.dtype).eps * np.max(np.abs(array), initial=0)):
+        if np.any(
+            off > 100 * np.finfo(array.dtype).eps * np.max(np.abs(array), initial=0)
+        ):
             raise ValueError(f"{where}: {name} must be symmetric.")
         if not off.any():
             return matrix
@@ -247,8 +254,7 @@ def symmetric_part(matrix: Array, name: str, where: str) -> Array:
 
 
 def stacked_weights(parts: list[Limits], axis: int) -> tuple[Array, Array] | None:
-    """The weights of both sides of several bounds side by side; `None` if all are hard.
-    """
+    """The weights of both sides of several bounds, in a row; `None` if all are hard."""
     if all(part.weights is None for part in parts):
         return None
 
@@ -260,3 +266,57 @@ def stacked_weights(parts: list[Limits], axis: int) -> tuple[Array, Array] | Non
     joined = [jnp.concatenate([of(p, k) for p in parts], axis=axis) for k in range(2)]
     # A side is hard if either weight is infinite.
     return jax.tree.map(lambda w: jnp.stack([w, w]), tuple(joined))
+
+
+_ONCE = "final_q", "start", "final"
+
+
+def common_horizon(
+    given: dict[str, Array],
+    sizes: dict[str, tuple[int, ...]],
+    horizon: Any,
+    states: Any,
+    controls: Any,
+    where: str,
+) -> int:
+    """The number of stages, on which all arrays with a time axis agree."""
+    lengths: dict[str, int] = {}
+    for name, array in given.items():
+        size = sizes[name]
+        varies = array.ndim == len(size) + 1 and name not in _ONCE
+        if array.shape[varies:] != size:
+            rule = f"{size}"
+            if name not in _ONCE:
+                rule += f" or {('T', *size)}".replace("'", "")
+            raise ValueError(
+                f"{where}: {name} must have shape {rule}, got shape {array.shape}."
+            )
+        if varies:
+            lengths[name] = len(array)
+    if horizon is not None:
+        lengths["horizon"] = check_count(horizon, "horizon", where)
+    for name, value, extra in (("states", states, 1), ("controls", controls, 0)):
+        for array in jax.tree.leaves(value):
+            if np.ndim(array) == 2:
+                lengths[name] = np.shape(array)[0] - extra
+    if not lengths:
+        raise ValueError(f"{where}: give the horizon, as no argument has a time axis.")
+    if len(set(lengths.values())) > 1:
+        words = ", ".join(f"{name}: {length}" for name, length in lengths.items())
+        raise ValueError(f"{where}: the arguments differ in their stages ({words}).")
+    return next(iter(lengths.values()))
+
+
+def check_stage_weights(given: dict[str, Array], where: str) -> None:
+    """Raise unless the cost is convex, with the stage."""
+    parts = [given[name] for name in ("Q", "R", "S") if name in given]
+    if all(map(is_concrete, parts)):
+        Q, R, *cross = map(np.asarray, parts)
+        S = cross[0] if cross else np.zeros((Q.shape[-1], R.shape[-1]))
+        stages = np.broadcast_shapes(Q.shape[:-2], R.shape[:-2], S.shape[:-2])
+        Q, S, R = (np.broadcast_to(M, (*stages, *M.shape[-2:])) for M in (Q, S, R))
+        check_convex(
+            np.block([[Q, S], [np.swapaxes(S, -1, -2), R]]), "[[Q, S], [S', R]]", where
+        )
+    if "final" in given:
+        check_convex(given["final"], "final", where)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+from jax import lax
 from jaxtyping import Float
 
 from .._typing import Array
@@ -93,7 +94,8 @@ class DenseForm(AbstractForm):
     def equilibrated(self):
         n, dtype = self.q.shape[0], self.q.dtype
         D, E, R = (jnp.ones(size, dtype) for size in (n, *map(len, (self.F, self.G))))
-        H, F, G = self.H, self.F, self.G
+        # The solution does not depend on the scales, so they need no derivative.
+        H, F, G = lax.stop_gradient((self.H, self.F, self.G))
         largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
         unit = lambda size: power_of_two(jnp.where(size > 0, size, 1) ** -0.5)
         for _ in range(_PASSES):
@@ -103,7 +105,9 @@ class DenseForm(AbstractForm):
             H, F, G = d[:, None] * H * d, e[:, None] * F * d, r[:, None] * G * d
             D, E, R = D * d, E * e, R * r
         q = D * self.q
-        c = cost_unit(H, q)
+        c = cost_unit(H, lax.stop_gradient(q))
+        H = D[:, None] * self.H * D
+        F, G = E[:, None] * self.F * D, R[:, None] * self.G * D
         form = without_empty_rows(self, largest(self.rows_matrix(), 1) == 0)
         # A bound of a variable is scaled as the variable is.
         rows = jnp.concatenate([1 / D, R]) if self.bounded else R

@@ -150,7 +150,9 @@ class Dense(eqx.Module):
         rows = None if self.rows is None else (lower[n:], upper[n:])
         return DenseMultipliers(p, bounds, rows)
 
-    def unknowns(self, x: Array, u: None, multipliers: Any) -> tuple[Array, Array, Array]:
+    def unknowns(
+        self, x: Array, u: None, multipliers: Any
+    ) -> tuple[Array, Array, Array]:
         """The unknowns of the form, its multipliers and those of its sides."""
         del u
         parts = [p for p in (multipliers.bounds, multipliers.rows) if p is not None]

@@ -18,23 +18,16 @@ from jax.flatten_util import ravel_pytree
 from .._jax import by_lanes, nan_tangent
 from .._typing import Array, BoolScalar
 from ..math._linear_solve import full_precision
+from ._embedding import Iterate, Method, Outcome, Tolerances
 from ._form import AbstractForm, both, Sides, signed
-from ._interior_point import (
-    assembled,
-    Iterate,
-    Method,
-    minimise,
-    Outcome,
-    solved,
-    Tolerances,
-)
+from ._interior_point import assembled, minimise, solved
 
 
 _CLEAR = 1e3
 """Of a multiplier and its slack, one is this many times the other where it is clear
 whether the side is active, in the scaled problem; both are alike where it is not."""
 _PASSES = 4
-_OFF = 1e-2
+_OFF = 1e-1
 """How far a start is moved off its bounds, in the scaled problem."""
 
 
@@ -107,7 +100,7 @@ def _optimum_jvp(primals: Any, tangents: Any) -> Any:
 
 def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
     """The change of `x`, `p` and `z`, and whether the solution is unique."""
-    scaled, scaling = lax.stop_gradient(form.equilibrated())
+    scaled, scaling = form.equilibrated()
     D, E, R, c = scaling
     sides, own_sides = form.sides(), scaled.sides()
     method = Method(form, scaled, scaling, sides, own_sides, None)
@@ -134,7 +127,12 @@ def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
         rows = rows - jnp.where(spring, (z - sides.v) / W, 0)
         own = jnp.where(violated & ~spring, sides.v, 0)
         gradient = form.hessian(x) + form.q + act
-        return gradient, form.equations(x) - form.f, jnp.where(held | spring, rows, 0), own
+        return (
+            gradient,
+            form.equations(x) - form.f,
+            jnp.where(held | spring, rows, 0),
+            own,
+        )
 
     *right, own = jax.jvp(conditions, (form,), (change,))[1]
     right = [-a * unit for a, unit in zip(right, (c * D, E, R), strict=True)]
@@ -158,10 +156,15 @@ def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
         return x, p, jnp.where(on, z, right[2])
 
     # A singular system does not return a vector that it was multiplied with.
-    probe = jax.tree.map(lambda a: jnp.cos(1.0 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape), (x, p, z))
+    probe = jax.tree.map(
+        lambda a: jnp.cos(1.0 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape),
+        (x, p, z),
+    )
     probe = scaled.admissible(*probe[:2]) + (jnp.where(on, probe[2], 0),)
     returned = solve(None, product(probe))
-    off = [jnp.max(jnp.abs(a - b), initial=0) for a, b in zip(probe, returned, strict=True)]
+    off = [
+        jnp.max(jnp.abs(a - b), initial=0) for a, b in zip(probe, returned, strict=True)
+    ]
     unique = jnp.all(clear) & (jnp.max(jnp.stack(off)) < 1e-2)
     # As one vector: all of a right side must be linear in the tangents.
     flat, apart = ravel_pytree(tuple(right))

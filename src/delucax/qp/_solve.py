@@ -14,14 +14,15 @@ from .._typing import Array, RealScalar
 from ..math._linear_solve import full_precision
 from ._dense_problem import Dense
 from ._derivatives import optimum, Options
+from ._embedding import Outcome, Tolerances
 from ._form import AbstractForm
-from ._interior_point import Outcome, Tolerances
 from ._solution import Solution
 from ._staged_problem import Staged
 
 
 _LOOSE = 1e2
-"""A failed solve whose residuals are within so many times the tolerance is inaccurate."""
+"""Where rounding ends the iteration within so many times the tolerance, it is
+inaccurate."""
 
 
 def solve(
@@ -49,16 +50,17 @@ def solve(
 
     - `problem`: a [`delucax.qp.Dense`][] or a [`delucax.qp.Staged`][].
     - `start`: the solution of a problem of the same shapes, to start near; one that is
-        not finite is ignored. By default the method finds its own.
+        not finite is ignored. It saves iterations if the problem changed little. By
+        default the method finds its own.
     - `rtol`, `atol`: each residual is at most `atol + rtol` times the size of the terms
-        that cancel in it. By default both are `1e-8`, in single precision `1e-4`.
+        that cancel in it. Both are `1e-8` by default, in single precision `1e-4`.
     - `max_steps`: the most iterations.
     - `refinements`: at most so many of each linear system, as rounding asks for.
     - `throw`: raise unless there is a solution (default); if false, check `result`.
 
     **Returns:** a [`delucax.qp.Solution`][], whose residuals are those of the problem
     as it was given. `result` is `RESULTS.successful` if they meet the tolerance;
-    `RESULTS.no_feasible_point` or `RESULTS.unbounded` with a certificate that was checked;
+    `RESULTS.no_feasible_point` or `RESULTS.unbounded` with a certificate, checked;
     `RESULTS.inaccurate` if rounding ended the iteration near the tolerance;
     `RESULTS.ill_posed` if the data are not finite or the cost is not convex;
     else `RESULTS.not_converged`.
@@ -177,8 +179,10 @@ def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded:
     dual, primal = unit(infeasible, support), unit(unbounded, slope)
 
     def either(value, certificate, is_certificate, has_none):
-        value = jnp.where(is_certificate, certificate, value)
-        return jnp.where(has_none, jnp.nan, value)
+        # Zero, whose derivative is that of the failed solve: NaN.
+        zero = 0 * jnp.where(jnp.isfinite(value), value, 0)
+        value = jnp.where(is_certificate, certificate + zero, value)
+        return jnp.where(has_none, jnp.nan + zero, value)
 
     x = either(point.x, at.x / primal, unbounded, infeasible)
     p = either(point.p, p / dual, infeasible, unbounded)

@@ -79,7 +79,7 @@ class StagedForm(AbstractForm):
 
     def factorise(self, weight):
         first, last = self.bounded
-        (T, n, N), dtype = self.F.shape, self.q.dtype
+        (_, n, N), dtype = self.F.shape, self.q.dtype
         own, general = weight[:, : last - first], weight[:, last - first :]
         diagonal = jnp.pad(own, ((0, 0), (first, N - last))) + regularisation(dtype)
         M = self.H + diagonal[:, :, None] * jnp.eye(N, dtype=dtype)
@@ -96,7 +96,9 @@ class StagedForm(AbstractForm):
             before = M[:n, :n] - _across(M[n:, :n], K)
             return (before + before.T) / 2, (V, K, solved[:, n:])
 
-        V, (after, K, pivots) = lax.scan(back, M[-1, :n, :n], (self.F, M[:-1]), reverse=True)
+        V, (after, K, pivots) = lax.scan(
+            back, M[-1, :n, :n], (self.F, M[:-1]), reverse=True
+        )
         closed = self.F[:, :, :n] - jnp.einsum("tij,tjk->tik", self.F[:, :, n:], K)
         return Factors(jnp.concatenate([V[None], after]), K, pivots, closed)
 
@@ -140,18 +142,20 @@ class StagedForm(AbstractForm):
         unit = lambda size: power_of_two(jnp.where(size > 0, size, 1) ** -0.5)
         D, R = jnp.ones(N, self.q.dtype), jnp.ones(self.G.shape[:2], self.q.dtype)
         # One scale for each component at all times, so that the equations keep theirs.
-        H = largest(self.H, 0)
+        H, general = lax.stop_gradient((largest(self.H, 0), self.G))
         for _ in range(_PASSES):
-            d = unit(jnp.maximum(largest(H, 0), largest(R[..., None] * self.G, (0, 1)) * D))
+            d = unit(
+                jnp.maximum(largest(H, 0), largest(R[..., None] * general, (0, 1)) * D)
+            )
             H, D = d[:, None] * H * d, D * d
             if self.G.shape[1]:
-                R = 1 / largest(self.G * D, 2)
+                R = 1 / largest(general * D, 2)
                 R = power_of_two(jnp.where(jnp.isfinite(R), R, 1))
         first, last = self.bounded
         E = 1 / D[:n]
         H = D[:, None] * self.H * D
         q = D * self.q
-        c = cost_unit(H, q)
+        c = cost_unit(*lax.stop_gradient((H, q)))
         G = R[..., None] * self.G * D
         rows = jnp.broadcast_to(1 / D[first:last], (len(R), last - first))
         scaling = Scaling(

@@ -5,15 +5,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from .._check import check_count, check_instance, is_concrete
+from .._check import check_instance
 from .._typing import Array
 from ._constraints import (
     as_finite_array,
     as_limits,
     as_matrices,
-    check_convex,
+    check_stage_weights,
+    common_horizon,
     Limits,
     Rows,
     Soft,
@@ -181,13 +181,15 @@ class Staged(eqx.Module):
         sizes |= dict(r=(m,), final_q=(n,), start=(n,), final=(n, n))
         if rows is not None:
             sizes |= dict(C=(p, n), D=(p, m))
-        self.horizon = T = _horizon(given, sizes, horizon, states, controls, rows, where)
+        self.horizon = T = common_horizon(
+            given, sizes, horizon, states, controls, where
+        )
         for name in ("Q", "R", "final"):
             if name in given:
                 given[name] = symmetric_part(given[name], name, where)
         for name in (*matrices, *vectors, "final", "C", "D"):
             setattr(self, name, given.get(name))
-        _check_weights(given, where)
+        check_stage_weights(given, where)
         of = lambda value, shape, name: (
             None if value is None else as_limits(value, shape, name, where)
         )
@@ -304,7 +306,9 @@ class Staged(eqx.Module):
         pairs = zip(lower, upper, strict=True)
         return StagedMultipliers(p, *(None if a is None else (a, b) for a, b in pairs))
 
-    def unknowns(self, x: Array, u: Array, multipliers: Any) -> tuple[Array, Array, Array]:
+    def unknowns(
+        self, x: Array, u: Array, multipliers: Any
+    ) -> tuple[Array, Array, Array]:
         """The unknowns of the form, its multipliers and those of its sides."""
         y = multipliers
         x = jnp.concatenate([x, jnp.pad(u, ((0, 1), (0, 0)))], axis=1)
@@ -360,47 +364,3 @@ def _beside(first: Limits, second: Limits) -> Limits:
 
 def _cut(limits: Limits, stages: slice) -> Limits:
     return jax.tree.map(lambda a: a[stages], limits)
-
-
-def _horizon(given, sizes, horizon, states, controls, rows, where) -> int:
-    """The number of stages, on which all arrays with a time axis agree."""
-    lengths: dict[str, int] = {}
-    for name, array in given.items():
-        size = sizes[name]
-        varies = array.ndim == len(size) + 1 and name not in ("final_q", "start", "final")
-        if array.shape[varies:] != size:
-            rule = f"{size}"
-            if name not in ("final_q", "start", "final"):
-                rule += f" or {('T', *size)}".replace("'", "")
-            raise ValueError(
-                f"{where}: {name} must have shape {rule}, got shape {array.shape}."
-            )
-        if varies:
-            lengths[name] = len(array)
-    if horizon is not None:
-        lengths["horizon"] = check_count(horizon, "horizon", where)
-    for name, value, extra in (("states", states, 1), ("controls", controls, 0), ("rows", rows, 0)):
-        for array in jax.tree.leaves(value):
-            if np.ndim(array) == 2 and name != "rows":
-                lengths[name] = np.shape(array)[0] - extra
-    if not lengths:
-        raise ValueError(
-            f"{where}: give the horizon, as no argument has a time axis."
-        )
-    if len(set(lengths.values())) > 1:
-        words = ", ".join(f"{name}: {length}" for name, length in lengths.items())
-        raise ValueError(f"{where}: the arguments differ in their stages ({words}).")
-    return next(iter(lengths.values()))
-
-
-def _check_weights(given: dict[str, Array], where: str) -> None:
-    """Raise unless the cost is convex, with the stage."""
-    parts = [given[name] for name in ("Q", "R", "S") if name in given]
-    if all(map(is_concrete, parts)):
-        Q, R, *cross = map(np.asarray, parts)
-        S = cross[0] if cross else np.zeros((Q.shape[-1], R.shape[-1]))
-        stages = np.broadcast_shapes(Q.shape[:-2], R.shape[:-2], S.shape[:-2])
-        Q, S, R = (np.broadcast_to(M, (*stages, *M.shape[-2:])) for M in (Q, S, R))
-        check_convex(np.block([[Q, S], [np.swapaxes(S, -1, -2), R]]), "[[Q, S], [S', R]]", where)
-    if "final" in given:
-        check_convex(given["final"], "final", where)
