@@ -180,7 +180,8 @@ def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded:
 
     def either(value, certificate, is_certificate, has_none):
         # Zero, whose derivative is that of the failed solve: NaN.
-        zero = 0 * jnp.where(jnp.isfinite(value), value, 0)
+        zero = jnp.where(jnp.isfinite(value), value, 0)
+        zero = zero - lax.stop_gradient(zero)
         value = jnp.where(is_certificate, certificate + zero, value)
         return jnp.where(has_none, jnp.nan + zero, value)
 
