@@ -38,7 +38,6 @@ def crossed():
         (lambda: Dense(Q, [np.nan, 1]), "Dense: q must not be NaN, but its entry (0,)"),
         (lambda: Dense(Q, [1, 2], bounds=(1.0, 0.0)), "those are 1.0 and 0.0"),
         (lambda: Dense(Q, [1, 2], bounds=([0, 1], 0.5)), "those of entry 1 are 1.0"),
-        (lambda: Dense(Q, [1, 2], rows=(Q, 1)), "rows must be a Rows"),
         (lambda: Dense(Q, [1, 2], rows=Rows(np.eye(3))), "C of rows must have shape"),
         (lambda: Dense(Q, [1, 2], equalities=(Q, [1.0])), "b must have shape (2,)"),
         (lambda: Soft(0, 1, linear=-1), "Soft: linear must be at least 0"),
@@ -54,14 +53,9 @@ def crossed():
             "those of entry 1 of stage 2 are 5.0 and 1.0",
         ),
         (
-            lambda: Staged(A, B, Q, R, horizon=3, controls=np.ones(2)),
-            "controls must be a pair (low, high)",
-        ),
-        (
             lambda: Staged(A, B, Q, R, horizon=3, d=np.ones(3)),
             "d must have shape (2,) or (T, 2), got shape (3,)",
         ),
-        (lambda: dlx.qp.solve(3), "problem must be a `delucax.qp.Dense`"),
         (lambda: dlx.qp.solve(Dense(Q, [1, 2]), rtol=-1.0), "solve: rtol must be"),
     ],
 )

@@ -32,6 +32,16 @@ class DenseMultipliers(eqx.Module):
     - `bounds`: a pair `(lower, upper)` of non-negative arrays of shape `(n,)`; `None`
         if there are no bounds.
     - `rows`: likewise, of shape `(p,)`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        problem = dlx.qp.Dense(jnp.eye(2), jnp.ones(2), bounds=(0.0, 1.0))
+        lower, upper = dlx.qp.solve(problem).multipliers.bounds
+        ```
     """
 
     equalities: Array
@@ -139,11 +149,12 @@ class Dense(eqx.Module):
         return [self.P]
 
     def primal(self, x: Array) -> tuple[Array, None]:
-        """`x` and `u` of the unknowns of the form."""
+        """The variables and the controls of the unknowns `x` of the form."""
         return x, None
 
     def multipliers(self, p: Array, sides: Array) -> DenseMultipliers:
-        """Of the equations and of the upper and lower sides of the form."""
+        """The multipliers `p` of the equations and those of the `sides` of the form, the
+        upper ones first, by name."""
         upper, lower = sides
         n = 0 if self.bounds is None else self.q.shape[0]
         bounds = None if self.bounds is None else (lower[:n], upper[:n])
@@ -153,7 +164,8 @@ class Dense(eqx.Module):
     def unknowns(
         self, x: Array, u: None, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns of the form, its multipliers and those of its sides."""
+        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers` as
+        a solution has them."""
         del u
         parts = [p for p in (multipliers.bounds, multipliers.rows) if p is not None]
         empty = jnp.zeros(0, self.q.dtype)
@@ -162,14 +174,10 @@ class Dense(eqx.Module):
         return x, multipliers.equalities, jnp.stack([upper, lower])
 
     def place(self, side: int, row: int) -> str:
-        """The name of a side of a row of the form, for messages."""
+        """The words for a `side` (1 is the lower one) of a `row` of the form."""
         n = 0 if self.bounds is None else self.q.shape[0]
         end = "lower" if side else "upper"
         return f"the {end} bound of " + (f"x[{row}]" if row < n else f"row {row - n}")
-
-    def place_of_equation(self, row: int) -> str:
-        """The name of an equation of the form."""
-        return f"equality {row}"
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], name: str, where: str) -> None:

@@ -40,6 +40,21 @@ class StagedMultipliers(eqx.Module):
     - `controls`: likewise, of shape `(T, m)`.
     - `rows`: likewise, of shape `(T, p)`.
     - `final_rows`: likewise, of shape `(p,)`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A, B, start = jnp.eye(1), jnp.ones((1, 1)), jnp.ones(1)
+        limits = -0.1, 0.1
+        problem = dlx.qp.Staged(
+            A, B, A, A, start=start, horizon=5, controls=limits
+        )
+        multipliers = dlx.qp.solve(problem).multipliers
+        multipliers.costates, multipliers.controls
+        ```
     """
 
     costates: Array
@@ -282,7 +297,7 @@ class Staged(eqx.Module):
         return [stage] if self.final is None else [stage, self.final]
 
     def primal(self, x: Array) -> tuple[Array, Array]:
-        """`x` and `u` of the unknowns of the form."""
+        """The variables and the controls of the unknowns `x` of the form."""
         n = self.B.shape[-2]
         return x[:, :n], x[:-1, n:]
 
@@ -301,7 +316,8 @@ class Staged(eqx.Module):
         return [*parts, along, end]
 
     def multipliers(self, p: Array, sides: Array) -> StagedMultipliers:
-        """Of the equations and of the upper and lower sides of the form."""
+        """The multipliers `p` of the equations and those of the `sides` of the form, the
+        upper ones first, by name."""
         upper, lower = map(self._parts, sides)
         pairs = zip(lower, upper, strict=True)
         return StagedMultipliers(p, *(None if a is None else (a, b) for a, b in pairs))
@@ -309,7 +325,8 @@ class Staged(eqx.Module):
     def unknowns(
         self, x: Array, u: Array, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns of the form, its multipliers and those of its sides."""
+        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers` as
+        a solution has them."""
         y = multipliers
         x = jnp.concatenate([x, jnp.pad(u, ((0, 1), (0, 0)))], axis=1)
 
@@ -329,7 +346,7 @@ class Staged(eqx.Module):
         return x, y.costates, jnp.stack([side(1), side(0)])
 
     def place(self, side: int, stage: int, row: int) -> str:
-        """The name of a side of a row of the form, for messages."""
+        """The words for a `side` (1 is the lower one) of a `row` of the form at a `stage`."""
         n, m = self.B.shape[-2:]
         end = "lower" if side else "upper"
         for name, limits, size in (("x", self.states, n), ("u", self.controls, m)):
@@ -339,10 +356,6 @@ class Staged(eqx.Module):
                 row -= size
         kind = "final row" if stage == self.horizon else "row"
         return f"the {end} bound of {kind} {row} at stage {stage}"
-
-    def place_of_equation(self, stage: int, row: int) -> str:
-        """The name of an equation of the form."""
-        return f"the equation of x[{row}] at stage {stage}"
 
 
 def _unlimited(steps: int, size: int, dtype: Any) -> Limits:
