@@ -153,8 +153,8 @@ class Dense(eqx.Module):
         return x, None
 
     def multipliers(self, p: Array, sides: Array) -> DenseMultipliers:
-        """The multipliers `p` of the equations and those of the `sides` of the form, the
-        upper ones first, by name."""
+        """The multipliers `p` of the equations and those of the `sides` of the form,
+        the upper ones first, by name."""
         upper, lower = sides
         n = 0 if self.bounds is None else self.q.shape[0]
         bounds = None if self.bounds is None else (lower[:n], upper[:n])
@@ -164,8 +164,8 @@ class Dense(eqx.Module):
     def unknowns(
         self, x: Array, u: None, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers` as
-        a solution has them."""
+        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers`
+        as a solution has them."""
         del u
         parts = [p for p in (multipliers.bounds, multipliers.rows) if p is not None]
         empty = jnp.zeros(0, self.q.dtype)

@@ -316,8 +316,8 @@ class Staged(eqx.Module):
         return [*parts, along, end]
 
     def multipliers(self, p: Array, sides: Array) -> StagedMultipliers:
-        """The multipliers `p` of the equations and those of the `sides` of the form, the
-        upper ones first, by name."""
+        """The multipliers `p` of the equations and those of the `sides` of the form,
+        the upper ones first, by name."""
         upper, lower = map(self._parts, sides)
         pairs = zip(lower, upper, strict=True)
         return StagedMultipliers(p, *(None if a is None else (a, b) for a, b in pairs))
@@ -325,8 +325,8 @@ class Staged(eqx.Module):
     def unknowns(
         self, x: Array, u: Array, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers` as
-        a solution has them."""
+        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers`
+        as a solution has them."""
         y = multipliers
         x = jnp.concatenate([x, jnp.pad(u, ((0, 1), (0, 0)))], axis=1)
 
@@ -346,7 +346,7 @@ class Staged(eqx.Module):
         return x, y.costates, jnp.stack([side(1), side(0)])
 
     def place(self, side: int, stage: int, row: int) -> str:
-        """The words for a `side` (1 is the lower one) of a `row` of the form at a `stage`."""
+        """The words for a `side` (1 is the lower one) of a `row` of a `stage`."""
         n, m = self.B.shape[-2:]
         end = "lower" if side else "upper"
         for name, limits, size in (("x", self.states, n), ("u", self.controls, m)):
