@@ -140,10 +140,10 @@ def as_limits(value: Any, shape: tuple[int, ...], name: str, where: str) -> Limi
     _check_order(low, high, name, where)
     if not weights or weights[0] is None:
         return Limits(low, high, None)
-    return Limits(low, high, tuple(weights))
+    return Limits(low, high, (weights[0], weights[1]))
 
 
-def _parts(value: Any, name: str, where: str) -> tuple[Array | None, ...]:
+def _parts(value: Any, name: str, where: str) -> tuple[Any, ...]:
     if isinstance(value, Soft):
         return value.low, value.high, value.linear, value.quadratic
     if isinstance(value, Rows):
@@ -160,15 +160,15 @@ def _check_order(low: Array, high: Array, name: str, where: str) -> None:
     """Raise if no number is between two bounds, with the stage and the entry."""
     if not (is_concrete(low) and is_concrete(high)):
         return
-    low, high = np.broadcast_arrays(np.asarray(low), np.asarray(high))
-    bad = (low > high) | (low == np.inf) | (high == -np.inf)
+    least, most = np.broadcast_arrays(np.asarray(low), np.asarray(high))
+    bad = (least > most) | (least == np.inf) | (most == -np.inf)
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         at = f" of entry {index[-1]}" if index else ""
         at += f" of stage {index[0]}" if len(index) > 1 else ""
         raise ValueError(
             f"{where}: {name} must have a finite number between the bounds, but those"
-            f"{at} are {low[index]} and {high[index]}."
+            f"{at} are {least[index]} and {most[index]}."
         )
 
 

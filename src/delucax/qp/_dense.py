@@ -1,6 +1,6 @@
 """The dense form: any program of up to some hundreds of variables."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -97,7 +97,7 @@ class DenseForm(AbstractForm):
         # The solution does not depend on the scales, so they need no derivative.
         H, F, G = lax.stop_gradient((self.H, self.F, self.G))
         largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
-        unit = lambda size: power_of_two(jnp.where(size > 0, size, 1) ** -0.5)
+        unit = lambda size: power_of_two(lax.rsqrt(jnp.where(size > 0, size, 1)))
         for _ in range(_PASSES):
             across = jnp.maximum(largest(H, 0), largest(F, 0))
             d = unit(jnp.maximum(across, largest(G, 0)))
@@ -113,7 +113,7 @@ class DenseForm(AbstractForm):
         rows = jnp.concatenate([1 / D, R]) if self.bounded else R
         scaling = Scaling(D, E, rows, c)
         bounds, soft = scaled_sides(form, scaling)
-        parts = (c * H, c * q, F, E * self.f, G, *bounds, soft)
+        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft)
         return DenseForm(*parts, self.bounded), scaling
 
 

@@ -137,7 +137,7 @@ class Dense(eqx.Module):
         lower = jnp.concatenate([empty[:, 0], *(part.low for part in parts)])
         upper = jnp.concatenate([empty[:, 0], *(part.high for part in parts)])
         P, q, E, b, G = (jnp.asarray(a, dtype) for a in (self.P, self.q, E, b, G))
-        sides = lower, upper, stacked_weights(parts, 0), self.bounds is not None
+        sides: Any = lower, upper, stacked_weights(parts, 0), self.bounds is not None
         return DenseForm(P, q, E, b, G, *sides)
 
     def data(self) -> list[Array]:

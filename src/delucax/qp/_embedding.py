@@ -81,7 +81,7 @@ class Method(NamedTuple):
     scaling: Scaling
     own_sides: Sides
     sides: Sides
-    tolerances: Tolerances
+    tolerances: Tolerances | None
 
     @property
     def is_soft(self) -> bool:
@@ -126,6 +126,7 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
     embedding of the scaled one follow: all scales are powers of two."""
     form, sides = method.form, method.own_sides
     D, E, R, c = method.scaling
+    assert method.tolerances is not None
     atol, rtol, least = method.tolerances
     tau = at.tau
     x, p, z = method.point(at)

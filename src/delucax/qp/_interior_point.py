@@ -87,6 +87,7 @@ def direction(method: Method, at: Iterate, left: Residuals, first, count, passes
     z, s = (jnp.where(inequality & ~first, a, 1) for a in (z, s))
     barrier = jnp.where(inequality, s / z, 0)
     e = stay = jnp.zeros((), z.dtype)
+    t_or_1 = jnp.ones((), z.dtype)
     if is_soft:
         # Of the violation, which the multiplier m keeps at zero with stiffness m / t.
         m, t_or_1 = jnp.where(hinge, m, 0), jnp.where(sides.soft & ~first, t, 1)

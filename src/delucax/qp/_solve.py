@@ -91,7 +91,7 @@ def solve(
         )
     if start is not None:
         check_instance(start, Solution, "start", where, "")
-        start = start.x, start.u, start.multipliers
+    near = None if start is None else (start.x, start.u, start.multipliers)
     dtype = jnp.result_type(*jax.tree.leaves(problem))
     usual = 1e-8 if dtype == jnp.float64 else 1e-4
     for name, value in (("rtol", rtol), ("atol", atol)):
@@ -102,7 +102,7 @@ def solve(
     max_steps = check_count(max_steps, "max_steps", where)
     refinements = check_count(refinements, "refinements", where, 0)
     check_bool(throw, "throw", where)
-    given = problem, start, atol, rtol
+    given = problem, near, atol, rtol
     solution = _solved(*given, max_steps, refinements)
     facts = lambda: _facts(problem, solution)
     return raise_on_failure(solution, where, throw, facts=facts)
@@ -138,8 +138,8 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     lower = jnp.where(equality[0], jnp.maximum(-z[0], 0), z[1])
     upper = jnp.where(equality[0], jnp.maximum(z[0], 0), z[0])
     multipliers = problem.multipliers(p, jnp.stack([upper, lower]))
-    answer = *problem.primal(x), multipliers, cost
-    return Solution(*answer, *point.measured, point.iterations, result)
+    answer: Any = *problem.primal(x), multipliers, cost, *point.measured
+    return Solution(*answer, point.iterations, result)
 
 
 def _judged(point: Outcome, is_posed: Array) -> tuple[Result, Any]:
@@ -194,7 +194,7 @@ def _facts(problem: Dense | Staged, solution: Solution) -> str:
     """Which constraint weighs most in a certificate, where it is known."""
     if not (solution.result == RESULTS.no_feasible_point):
         return ""
-    given = solution.x, solution.u, solution.multipliers
+    given: Any = solution.x, solution.u, solution.multipliers
     _, p, z = problem.unknowns(*given)
     sides = problem.form().sides()
     heights = np.abs(np.asarray(sides.h * z))

@@ -6,7 +6,7 @@ equations are `x_0 = f_0` and `x_{k+1} - A_k x_k - B_k u_k = f_{k+1}`, and their
 multipliers the costates. A start that is free has no equation.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -139,7 +139,7 @@ class StagedForm(AbstractForm):
     def equilibrated(self):
         n, N = self.f.shape[1], self.q.shape[1]
         largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
-        unit = lambda size: power_of_two(jnp.where(size > 0, size, 1) ** -0.5)
+        unit = lambda size: power_of_two(lax.rsqrt(jnp.where(size > 0, size, 1)))
         D, R = jnp.ones(N, self.q.dtype), jnp.ones(self.G.shape[:2], self.q.dtype)
         # One scale for each component at all times, so that the equations keep theirs.
         H, general = lax.stop_gradient((largest(self.H, 0), self.G))
@@ -166,7 +166,7 @@ class StagedForm(AbstractForm):
         )
         bounds, soft = scaled_sides(self, scaling)
         F = E[:, None] * self.F * D
-        parts = (c * H, c * q, F, E * self.f, G, *bounds, soft)
+        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft)
         return StagedForm(*parts, self.bounded, self.is_free), scaling
 
     def admissible(self, x, p):

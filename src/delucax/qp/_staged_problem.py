@@ -187,6 +187,7 @@ class Staged(eqx.Module):
         for kind, value in (("rows", rows), ("final_rows", final_rows)):
             if value is not None:
                 check_instance(value, Rows, kind, where)
+        p = 0
         if rows is not None:
             given["C"], p = rows.C, rows.C.shape[-2]
             if rows.D is not None:
@@ -250,7 +251,7 @@ class Staged(eqx.Module):
         upper = jnp.concatenate([part.high for part in limits], axis=1)
         first = 0 if self.states is not None else n
         bounded = first, n if self.controls is None else n + m
-        sides = lower, upper, stacked_weights(limits, 1), bounded
+        sides: Any = lower, upper, stacked_weights(limits, 1), bounded
         return StagedForm(H, q, F, f, G, *sides, self.start is None)
 
     def _sides(self, stages: Any) -> tuple[Array, list[Limits]]:
@@ -319,7 +320,7 @@ class Staged(eqx.Module):
         """The multipliers `p` of the equations and those of the `sides` of the form,
         the upper ones first, by name."""
         upper, lower = map(self._parts, sides)
-        pairs = zip(lower, upper, strict=True)
+        pairs: Any = zip(lower, upper, strict=True)
         return StagedMultipliers(p, *(None if a is None else (a, b) for a, b in pairs))
 
     def unknowns(
@@ -368,7 +369,9 @@ def _joined(parts: list[Limits], axis: int = 0) -> Limits:
     low = jnp.concatenate([part.low for part in parts], axis)
     high = jnp.concatenate([part.high for part in parts], axis)
     weights = stacked_weights(parts, axis)
-    return Limits(low, high, None if weights is None else tuple(w[0] for w in weights))
+    return Limits(
+        low, high, None if weights is None else (weights[0][0], weights[1][0])
+    )
 
 
 def _beside(first: Limits, second: Limits) -> Limits:
