@@ -113,8 +113,8 @@ class DenseForm(AbstractForm):
         rows = jnp.concatenate([1 / D, R]) if self.bounded else R
         scaling = Scaling(D, E, rows, c)
         bounds, soft = scaled_sides(form, scaling)
-        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft)
-        return DenseForm(*parts, self.bounded), scaling
+        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft, self.bounded)
+        return DenseForm(*parts), scaling
 
 
 def regularisation(dtype) -> float:

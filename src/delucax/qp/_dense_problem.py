@@ -136,9 +136,9 @@ class Dense(eqx.Module):
         parts = [part.broadcast((k,), dtype) for part, k in both if part is not None]
         lower = jnp.concatenate([empty[:, 0], *(part.low for part in parts)])
         upper = jnp.concatenate([empty[:, 0], *(part.high for part in parts)])
-        P, q, E, b, G = (jnp.asarray(a, dtype) for a in (self.P, self.q, E, b, G))
-        sides: Any = lower, upper, stacked_weights(parts, 0), self.bounds is not None
-        return DenseForm(P, q, E, b, G, *sides)
+        given: Any = [jnp.asarray(a, dtype) for a in (self.P, self.q, E, b, G)]
+        given += [lower, upper, stacked_weights(parts, 0), self.bounds is not None]
+        return DenseForm(*given)
 
     def data(self) -> list[Array]:
         """The arrays that must be finite."""

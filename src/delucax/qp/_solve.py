@@ -139,7 +139,8 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     upper = jnp.where(equality[0], jnp.maximum(z[0], 0), z[0])
     multipliers = problem.multipliers(p, jnp.stack([upper, lower]))
     answer: Any = *problem.primal(x), multipliers, cost, *point.measured
-    return Solution(*answer, point.iterations, result)
+    answers: Any = *answer, point.iterations, result
+    return Solution(*answers)
 
 
 def _judged(point: Outcome, is_posed: Array) -> tuple[Result, Any]:

@@ -166,8 +166,9 @@ class StagedForm(AbstractForm):
         )
         bounds, soft = scaled_sides(self, scaling)
         F = E[:, None] * self.F * D
-        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft)
-        return StagedForm(*parts, self.bounded, self.is_free), scaling
+        own: Any = self.bounded, self.is_free
+        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft, *own)
+        return StagedForm(*parts), scaling
 
     def admissible(self, x, p):
         n = self.f.shape[1]

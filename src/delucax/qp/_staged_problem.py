@@ -251,8 +251,9 @@ class Staged(eqx.Module):
         upper = jnp.concatenate([part.high for part in limits], axis=1)
         first = 0 if self.states is not None else n
         bounded = first, n if self.controls is None else n + m
-        sides: Any = lower, upper, stacked_weights(limits, 1), bounded
-        return StagedForm(H, q, F, f, G, *sides, self.start is None)
+        soft = stacked_weights(limits, 1)
+        sides: Any = lower, upper, soft, bounded, self.start is None
+        return StagedForm(H, q, F, f, G, *sides)
 
     def _sides(self, stages: Any) -> tuple[Array, list[Limits]]:
         """The matrix of the general rows, and the bounds of all."""
