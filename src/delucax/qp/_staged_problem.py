@@ -252,8 +252,9 @@ class Staged(eqx.Module):
         first = 0 if self.states is not None else n
         bounded = first, n if self.controls is None else n + m
         soft = stacked_weights(limits, 1)
-        sides: Any = lower, upper, soft, bounded, self.start is None
-        return StagedForm(H, q, F, f, G, *sides)
+        sides = lower, upper, soft, bounded
+        parts: Any = H, q, F, f, G, *sides, self.start is None
+        return StagedForm(*parts)
 
     def _sides(self, stages: Any) -> tuple[Array, list[Limits]]:
         """The matrix of the general rows, and the bounds of all."""
