@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         math as math,
         planning as planning,
         plotting as plotting,
+        qp as qp,
         references as references,
         riccati as riccati,
         simulation as simulation,
@@ -78,7 +79,7 @@ del TYPE_CHECKING
 
 _PACKAGES = """
     analysis controllers costs disturbances dynamics environments estimators experiments
-    interop lung math planning plotting references riccati simulation studies systems
+    interop lung math planning plotting qp references riccati simulation studies systems
     training
 """.split()
 _name, _names = _lazily(

@@ -85,6 +85,15 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "the constraints cannot all hold, or gamma is below the least level that any "
         "controller attains."
     )
+    no_feasible_point = "No point satisfies all constraints."
+    unbounded = (
+        "The cost is unbounded below: it falls without end along a direction that "
+        "keeps within the constraints."
+    )
+    inaccurate = (
+        "Rounding ended the iteration near the tolerance, but not within it: take a "
+        "larger one, or scale the data, or compute in float64."
+    )
 
 
 if TYPE_CHECKING:

@@ -1,0 +1,150 @@
+"""The dense form: any program of up to some hundreds of variables."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jax import lax
+from jaxtyping import Float
+
+from .._typing import Array
+from ..math._norms import power_of_two
+from ._form import AbstractForm, Scaling
+
+
+_PASSES = 4
+"""Of the equilibration; each takes the square root of what is left."""
+
+
+class Factors(NamedTuple):
+    """`M = H + G'W G + F'F` and the Schur complement `F M^-1 F'`."""
+
+    L: Array
+    solved: Array  # M^-1 F', shape (n, e)
+    S: Array
+
+
+class DenseForm(AbstractForm):
+    """A program with dense matrices.
+
+    With `bounded`, the first rows are the variables themselves.
+    """
+
+    H: Float[Array, "n n"]
+    q: Float[Array, " n"]
+    F: Float[Array, "e n"]
+    f: Float[Array, " e"]
+    G: Float[Array, "p n"]
+    lower: Float[Array, " rows"]
+    upper: Float[Array, " rows"]
+    soft: tuple[Array, Array] | None
+    bounded: bool = eqx.field(static=True)
+
+    def hessian(self, x):
+        return self.H @ x
+
+    def rows(self, x):
+        general = self.G @ x
+        return jnp.concatenate([x, general]) if self.bounded else general
+
+    def rows_transposed(self, y):
+        if not self.bounded:
+            return self.G.T @ y
+        n = self.q.shape[0]
+        return y[:n] + self.G.T @ y[n:]
+
+    def equations(self, x):
+        return self.F @ x
+
+    def equations_transposed(self, p):
+        return self.F.T @ p
+
+    def factorise(self, weight):
+        n, e = self.q.shape[0], self.f.shape[0]
+        M, general = self.H, weight
+        eye = jnp.eye(n, dtype=self.q.dtype)
+        shift = jnp.full(n, regularisation(self.q.dtype))
+        if self.bounded:
+            shift, general = shift + weight[:n], weight[n:]
+        M = M + eye * shift
+        if self.G.shape[0]:
+            M = M + (self.G.T * general) @ self.G
+        if e:
+            # It changes nothing on F x = f, and makes M definite where only F is.
+            M = M + self.F.T @ self.F
+        L = jnp.linalg.cholesky(M, symmetrize_input=False)
+        solved = jsl.cho_solve((L, True), self.F.T) if e else self.F.T
+        S = self.F @ solved + regularisation(self.q.dtype) * jnp.eye(e, dtype=L.dtype)
+        return Factors(L, solved, jnp.linalg.cholesky(S) if e else S)
+
+    def solve(self, factors, x, p):
+        if not self.f.shape[0]:
+            return jsl.cho_solve((factors.L, True), x), p
+        free = jsl.cho_solve((factors.L, True), x + self.F.T @ p)
+        # The equations hold for the multipliers dp = S^-1 (F free - p).
+        dp = jsl.cho_solve((factors.S, True), self.F @ free - p)
+        return free - factors.solved @ dp, dp
+
+    def rows_matrix(self):
+        """`G`, the variables included."""
+        eye = jnp.eye(self.q.shape[0], dtype=self.q.dtype)
+        return jnp.concatenate([eye, self.G]) if self.bounded else self.G
+
+    def equilibrated(self):
+        n, dtype = self.q.shape[0], self.q.dtype
+        D, E, R = (jnp.ones(size, dtype) for size in (n, *map(len, (self.F, self.G))))
+        # The solution does not depend on the scales, so they need no derivative.
+        H, F, G = lax.stop_gradient((self.H, self.F, self.G))
+        largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
+        unit = lambda size: power_of_two(lax.rsqrt(jnp.where(size > 0, size, 1)))
+        for _ in range(_PASSES):
+            across = jnp.maximum(largest(H, 0), largest(F, 0))
+            d = unit(jnp.maximum(across, largest(G, 0)))
+            e, r = unit(largest(F, 1)), unit(largest(G, 1))
+            H, F, G = d[:, None] * H * d, e[:, None] * F * d, r[:, None] * G * d
+            D, E, R = D * d, E * e, R * r
+        q = D * self.q
+        c = cost_unit(H, lax.stop_gradient(q))
+        H = D[:, None] * self.H * D
+        F, G = E[:, None] * self.F * D, R[:, None] * self.G * D
+        form = without_empty_rows(self, largest(self.rows_matrix(), 1) == 0)
+        # A bound of a variable is scaled as the variable is.
+        rows = jnp.concatenate([1 / D, R]) if self.bounded else R
+        scaling = Scaling(D, E, rows, c)
+        bounds, soft = scaled_sides(form, scaling)
+        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft, self.bounded)
+        return DenseForm(*parts), scaling
+
+
+def regularisation(dtype) -> float:
+    """What is added to the diagonal of a scaled problem, and taken out of the solution
+    by refinement."""
+    return float(jnp.finfo(dtype).eps) ** 0.75
+
+
+def cost_unit(H: Array, q: Array) -> Array:
+    """A power of two that makes the scaled cost of size 1."""
+    size = jnp.maximum(jnp.mean(jnp.max(jnp.abs(H), axis=-1)), jnp.max(jnp.abs(q)))
+    return power_of_two(1 / jnp.where(size > 0, size, 1))
+
+
+def without_empty_rows(form: AbstractForm, empty: Array) -> AbstractForm:
+    """Without the bounds of rows of zeros that hold, up to rounding: such a row has no
+    interior if its bound is zero, and the method would not converge."""
+    slack = 10 * jnp.finfo(form.q.dtype).eps
+    size = lambda b: jnp.max(jnp.where(jnp.isfinite(b), jnp.abs(b), 0), initial=0)
+    slack = slack * jnp.maximum(size(form.lower), size(form.upper))
+    upper = jnp.where(empty & (form.upper >= -slack), jnp.inf, form.upper)
+    lower = jnp.where(empty & (form.lower <= slack), -jnp.inf, form.lower)
+    return eqx.tree_at(lambda form: (form.lower, form.upper), form, (lower, upper))
+
+
+def scaled_sides(form: AbstractForm, scaling: Scaling):
+    """The bounds and the weights of the scaled problem."""
+    R, c = scaling.rows, scaling.cost
+    bounds = R * form.lower, R * form.upper
+    if form.soft is None:
+        return bounds, None
+    v, W = form.soft
+    return bounds, (c * v / R, c * W / R**2)

@@ -1,0 +1,181 @@
+"""Derivatives of a solution, by the implicit function theorem at its active set.
+
+A side whose multiplier is positive is held as an equation, and one whose slack is
+positive is left out. So the conditions are linear equations in the change of the
+solution, with the matrix of one more step of the method. Where the solution is not
+unique, or a side has neither (it is about to become active or inactive), there is no
+derivative, and it is NaN.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from .._jax import by_lanes, nan_tangent
+from .._typing import Array, BoolScalar
+from ..math._linear_solve import full_precision
+from ._embedding import Iterate, Method, Outcome, Tolerances
+from ._form import AbstractForm, both, Sides, signed
+from ._interior_point import assembled, minimise, solved
+
+
+_CLEAR = 1e3
+"""Of a multiplier and its slack, one is this many times the other where it is clear
+whether the side is active, in the scaled problem; both are alike where it is not."""
+_PASSES = 4
+_OFF = 1e-1
+"""How far a start is moved off its bounds, in the scaled problem."""
+
+
+class Options(eqx.Module):
+    """What does not change the solution."""
+
+    start: Any
+    tolerances: Tolerances
+    max_steps: int = eqx.field(static=True)
+    refinements: int = eqx.field(static=True)
+
+
+def optimum(form: AbstractForm, options: Options) -> Outcome:
+    """The outcome of the method, differentiable with respect to the program."""
+    return _optimum(form, options)
+
+
+def _run(form: AbstractForm, options: Options) -> Outcome:
+    scaled, scaling = form.equilibrated()
+    sides = form.sides(), scaled.sides()
+    method = Method(form, scaled, scaling, *sides, options.tolerances)
+    start = None if options.start is None else warm(method, *options.start)
+    return minimise(method, start, options.max_steps, options.refinements)
+
+
+def warm(method: Method, x: Array, p: Array, z: Array) -> tuple[Iterate, BoolScalar]:
+    """A start near a point, moved off the bounds; and whether the point is of use."""
+    D, E, R, c = method.scaling
+    sides = method.sides
+    usable = jnp.stack([jnp.all(jnp.isfinite(a)) for a in (x, p, z)]).all()
+    x, p, z = (jnp.where(usable, a, 0) for a in (x / D, p * c / E, z * c / R))
+    slack = sides.h - both(method.scaled.rows(x))
+    # So far off the bounds the method can take long steps.
+    off = jnp.asarray(_OFF, x.dtype)
+    t = jnp.where(sides.soft, jnp.maximum(-slack, off), 0)
+    m = jnp.maximum(sides.v + sides.W * t - z, off)
+    m = jnp.where(sides.hinge, m, 0)
+    s = jnp.where(sides.inequality, jnp.maximum(slack + t, off), 0)
+    inside = jnp.maximum(z, off)
+    z = jnp.where(sides.inequality, inside, jnp.where(sides.equality, z, 0))
+    return Iterate(method.joined(x, p, z, s, t, m), jnp.ones_like(off), off), usable
+
+
+@eqx.filter_custom_jvp
+def _optimum(form: AbstractForm, options: Options) -> Outcome:
+    return by_lanes(_run, form, options)
+
+
+@_optimum.def_jvp
+@full_precision
+def _optimum_jvp(primals: Any, tangents: Any) -> Any:
+    change, _ = tangents
+    form, _ = primals
+    outcome = _optimum(*primals)
+    nothing = jax.tree.map(lambda _: None, outcome)
+    if not jax.tree.leaves(change):
+        return outcome, nothing
+    change = jax.tree.map(
+        lambda p, t: jnp.zeros_like(p) if t is None and eqx.is_inexact_array(p) else t,
+        form,
+        change,
+        is_leaf=lambda leaf: leaf is None,
+    )
+    *moved, unique = _change(form, change, outcome)
+    # Of a failed solve there is no derivative.
+    ok = unique & (outcome.errors[0] <= 1)
+    dx, dp, dz = (nan_tangent(d, ok) for d in moved)
+    return outcome, nothing._replace(x=dx, p=dp, z=dz)
+
+
+def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
+    """The change of `x`, `p` and `z`, and whether the solution is unique."""
+    scaled, scaling = form.equilibrated()
+    D, E, R, c = scaling
+    sides, own_sides = form.sides(), scaled.sides()
+    method = Method(form, scaled, scaling, sides, own_sides, None)
+    x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in outcome[:3])
+    at = outcome.iterate
+    _, _, scaled_z, s, t, m = method.apart(at.v / at.tau)
+    pressed = sides.inequality & (scaled_z > s)
+    clear = _are_unlike(scaled_z, s) | ~sides.inequality
+    violated = jnp.zeros_like(pressed)
+    if form.soft is not None:
+        violated = pressed & sides.soft & ((t > m) | ~sides.hinge)
+        clear = clear & (_are_unlike(t, m) | ~(pressed & sides.hinge))
+    held = sides.equality | (pressed & ~violated)
+    spring = violated & (sides.W > 0)
+
+    def conditions(form):
+        """The gradient of the Lagrangian, the equations, and the rows that are held.
+        With a linear weight alone, a violated side has that as its multiplier."""
+        sides = form.sides()
+        pushed = jnp.where(violated & ~spring, sides.v, z)
+        act = form.rows_transposed(signed(pushed)) + form.equations_transposed(p)
+        rows = both(form.rows(x)) - sides.h
+        W = jnp.where(spring, sides.W, 1)
+        rows = rows - jnp.where(spring, (z - sides.v) / W, 0)
+        own = jnp.where(violated & ~spring, sides.v, 0)
+        gradient = form.hessian(x) + form.q + act
+        return (
+            gradient,
+            form.equations(x) - form.f,
+            jnp.where(held | spring, rows, 0),
+            own,
+        )
+
+    *right, own = jax.jvp(conditions, (form,), (change,))[1]
+    right = [-a * unit for a, unit in zip(right, (c * D, E, R), strict=True)]
+    # A linear system like that of a step: held sides are its equations.
+    none = jnp.zeros_like(scaled_z)
+    W = jnp.where(spring, own_sides.W, 1)
+    system_sides = Sides(none, spring, held, spring, spring, none, W)
+    compliance = jnp.where(spring, 1 / W, 0)
+    system = assembled(scaled, system_sides, compliance)
+    on = system_sides.active
+
+    def product(vector):
+        x, p, z = vector
+        pull = scaled.equations_transposed(p) + scaled.rows_transposed(signed(z * on))
+        rows = both(scaled.rows(x)) - compliance * z
+        # The rows that do not take part are those of the identity.
+        return scaled.hessian(x) + pull, scaled.equations(x), jnp.where(on, rows, z)
+
+    def solve(_, right):
+        x, p, z = solved(scaled, system_sides, system, right, _PASSES)
+        return x, p, jnp.where(on, z, right[2])
+
+    # A singular system does not return a vector that it was multiplied with.
+    probe = jax.tree.map(
+        lambda a: jnp.cos(1.0 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape),
+        (x, p, z),
+    )
+    probe = scaled.admissible(*probe[:2]) + (jnp.where(on, probe[2], 0),)
+    returned = solve(None, product(probe))
+    off = [
+        jnp.max(jnp.abs(a - b), initial=0) for a, b in zip(probe, returned, strict=True)
+    ]
+    unique = jnp.all(clear) & (jnp.max(jnp.stack(off)) < 1e-2)
+    # As one vector: all of a right side must be linear in the tangents.
+    flat, apart = ravel_pytree(tuple(right))
+    flattened = lambda f: lambda *args: ravel_pytree(f(*args[:-1], apart(args[-1])))[0]
+    dx, dp, dz = apart(
+        lax.custom_linear_solve(
+            flattened(product), flat, flattened(solve), flattened(solve), symmetric=True
+        )
+    )
+    return dx * D, dp * E / c, dz * R / c + own, unique
+
+
+def _are_unlike(a: Array, b: Array) -> Array:
+    return jnp.maximum(a, b) > _CLEAR * jnp.minimum(a, b)

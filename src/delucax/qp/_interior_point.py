@@ -1,0 +1,246 @@
+"""The interior-point method: one loop for every form of a program.
+
+The violation `t` of a soft side and its multiplier `m` are eliminated, so that a soft
+side costs no more than a hard one: in a linear step it is a spring of compliance
+`1 / (W + m / t)`, in series with `s / z`, that of the barrier.
+
+Source: Mehrotra, 1992.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .._typing import Array, BoolScalar
+from ._embedding import evaluated, Iterate, Method, Outcome, Residuals
+from ._form import AbstractForm, both, Sides, signed
+
+
+_TO_BOUNDARY = 0.99
+"""The share of the step to the boundary that is taken."""
+_NEGLIGIBLE = 1e-2
+"""So much of the tolerance is no reason to refine a linear system."""
+_PATIENCE = 5
+"""It ends after so many steps without a better iterate: rounding is reached."""
+
+
+class System(NamedTuple):
+    """The linear system of a step: its factors, and the compliance of each side, as it
+    is and as it is factorised."""
+
+    factors: object
+    compliance: Array
+    regularised: Array
+
+
+def assembled(form: AbstractForm, sides: Sides, compliance: Array) -> System:
+    """Factorise `[[H, F', G'], [F, 0, 0], [G, 0, -compliance]]`."""
+    # An equation has no compliance, which refinement restores. Its rate is the sum of
+    # this and of rounding over this, in the scaled problem.
+    soft = jnp.asarray(jnp.finfo(form.q.dtype).eps ** 0.5, form.q.dtype)
+    compliance = jnp.where(sides.equality, 0, compliance)
+    regularised = jnp.where(sides.equality, soft, compliance)
+    regularised = jnp.where(sides.active, regularised, 1)
+    weight = jnp.sum(jnp.where(sides.active, 1 / regularised, 0), axis=0)
+    return System(form.factorise(weight), compliance, regularised)
+
+
+def solved(form, sides: Sides, system: System, right, passes: Array | int):
+    """The solution `(x, p, z)` of the linear system, in so many passes."""
+    active = sides.active
+
+    def once(right):
+        x, p, z = right
+        push = jnp.where(active, z / system.regularised, 0)
+        x = x + form.rows_transposed(signed(push))
+        x, p = form.solve(system.factors, x, p)
+        z = (both(form.rows(x)) - z) / system.regularised
+        return x, p, jnp.where(active, z, 0)
+
+    def error(solution):
+        x, p, z = solution
+        pulled = form.equations_transposed(p) + form.rows_transposed(signed(z))
+        stretched = both(form.rows(x)) - system.compliance * z
+        made = form.hessian(x) + pulled, form.equations(x), stretched
+        left = jax.tree.map(lambda a, b: a - b, right, made)
+        return *left[:2], jnp.where(active, left[2], 0)
+
+    # The solver stands in the program once, for the solution and its refinements.
+    def refine(k, carry):
+        solution, left = carry
+        solution = jax.tree.map(lambda a, b: a + b, solution, once(left))
+        # The error of the last solution is not of interest.
+        return solution, lax.cond(k + 1 < passes, error, lambda _: right, solution)
+
+    start = jax.tree.map(jnp.zeros_like, right), right
+    return lax.fori_loop(0, passes, refine, start)[0]
+
+
+def direction(method: Method, at: Iterate, left: Residuals, first, count, passes):
+    """Mehrotra's step: the direction, its length, the share of the residuals that it
+    aims to remove, and the direction of tau."""
+    form, sides, is_soft = method.scaled, method.sides, method.is_soft
+    inequality, hinge = sides.inequality, sides.hinge
+    x, _, z, s, t, m = method.apart(at.v)
+    z, s = (jnp.where(inequality & ~first, a, 1) for a in (z, s))
+    barrier = jnp.where(inequality, s / z, 0)
+    e = stay = jnp.zeros((), z.dtype)
+    t_or_1 = jnp.ones((), z.dtype)
+    if is_soft:
+        # Of the violation, which the multiplier m keeps at zero with stiffness m / t.
+        m, t_or_1 = jnp.where(hinge, m, 0), jnp.where(sides.soft & ~first, t, 1)
+        stay = m / t_or_1
+        stiffness = jnp.where(sides.soft, sides.W + stay, 1)
+        e = jnp.where(sides.soft & ~first, 1 / stiffness, 0)
+    system = assembled(form, sides, barrier + e)
+    tau, kappa = at.tau, at.kappa
+    weights = method.joined(
+        form.q + 2 * left.Hx / tau,
+        form.f,
+        sides.h,
+        jnp.zeros_like(s),
+        sides.v + 2 * sides.W * t / tau,
+        jnp.zeros_like(s),
+    )
+    on = method.joined(
+        *(jnp.zeros_like(a, bool) for a in (form.q, form.f)),
+        *(inequality, inequality, hinge, hinge),
+    )
+    values = method.joined(form.q, form.f, z, s, t, m)
+
+    def solve(lines, rt, rs, rm):
+        """The change of all vectors, for the right sides of the lines of `x, p, z`, of
+        `t`, and of the products `s z` and `t m`. The last three are eliminated."""
+        x, p, r = lines
+        r = r - rs / z
+        if is_soft:
+            rm = rm / t_or_1
+            r = r + e * (rt + rm)
+        lines = x, p, jnp.where(sides.active, r, 0)
+        dx, dp, dz = solved(form, sides, system, lines, passes)
+        ds = jnp.where(inequality, rs / z - barrier * dz, 0)
+        if not is_soft:
+            return method.joined(dx, dp, dz, ds)
+        dt = e * (dz + rt + rm)
+        dm = jnp.where(hinge, rm - stay * dt, 0)
+        return method.joined(dx, dp, dz, ds, dt, dm)
+
+    # Three right sides in turn, that of tau, the affine one, and the one with a
+    # second-order correction: so all that follows stands in the program once.
+    def turn(k, carry):
+        along, d, sigma, _ = carry
+        is_tau = k == 0
+        share, aim = 1 - sigma, sigma * left.products / count
+        pick = lambda a, b: jnp.where(is_tau, a, b)
+        lines = (
+            pick(-form.q, -share * left.x),
+            pick(form.f, -share * left.p),
+            pick(sides.h, -share * left.z),
+        )
+        _, _, dz, ds, dt, dm = method.apart(d.v)
+        rs = jnp.where(inequality & ~is_tau, aim - s * z - ds * dz, 0)
+        rt = rm = jnp.zeros((), z.dtype)
+        if is_soft:
+            rt = pick(-sides.v, -share * left.t)
+            rm = jnp.where(hinge & ~is_tau, aim - t * m - dt * dm, 0)
+        change = solve(lines, rt, rs, rm)
+        along = pick(change, along)
+        # The curvature of the last line along tau is a sum of squares.
+        ax, _, az, _, a_t, _ = method.apart(along)
+        off = x / tau - ax
+        springs = barrier * az**2
+        if is_soft:
+            springs = springs + sides.W * (t / tau - a_t) ** 2 + stay * a_t**2
+        slope = kappa / tau + jnp.sum(off * form.hessian(off)) + jnp.sum(springs)
+        last = aim - tau * kappa - d.tau * d.kappa
+        total = share * left.tau + jnp.sum(weights * change) + last / tau
+        dtau = pick(0, total / slope)
+        dkappa = pick(0, (last - kappa * dtau) / tau)
+        d = Iterate(pick(0, change + dtau * along), dtau, dkappa)
+        # The largest step within the bounds, at most 1.
+        worst = jnp.max(jnp.where(on, -d.v / values, 0), initial=1)
+        length = 1 / jnp.maximum(worst, jnp.maximum(-dtau / tau, -dkappa / kappa))
+        return along, d, jnp.where(k == 1, (1 - length) ** 3, sigma), length
+
+    none = jnp.zeros_like(at.v)
+    nothing = jnp.zeros((), z.dtype)
+    start = none, Iterate(none, nothing, nothing), nothing, nothing
+    along, d, sigma, length = lax.fori_loop(0, 3, turn, start)
+    return d, jnp.minimum(_TO_BOUNDARY * length, 1), 1 - sigma, along
+
+
+def begun(method: Method, along: Array) -> Iterate:
+    """A start: with unit weights the direction of tau solves the problem with squares
+    for the inequalities, of which `s = -z`."""
+    sides = method.sides
+    x, p, z, *_ = method.apart(along)
+    s, one = interior(-z, sides.inequality), jnp.ones((), along.dtype)
+    z = jnp.where(sides.inequality, interior(z, sides.inequality), z)
+    t, m = (jnp.where(on, one, 0) for on in (sides.soft, sides.hinge))
+    return Iterate(method.joined(x, p, z, s, t, m), one, one)
+
+
+def minimise(
+    method: Method,
+    start: tuple[Iterate, BoolScalar] | None,
+    max_steps: int,
+    refinements: int,
+) -> Outcome:
+    """Run the method, from a start or from its own."""
+    sides, dtype = method.sides, method.form.q.dtype
+    count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
+    rounding = jnp.finfo(dtype).eps
+
+    def body(carry):
+        at, left, best, known, k, since, passes = carry
+        first, before = k == 0, left.linear
+        d, length, share, along = direction(method, at, left, first, count, passes)
+        moved = jax.tree.map(lambda a, d: a + length * d, at, d)
+        begin = begun(method, along)
+        at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, moved)
+        left = evaluated(method, at)
+        # Where a residual is larger than it should be, rounding is: from now on the
+        # linear systems are refined once more.
+        expected = jnp.where(first, jnp.inf, (1 - length * share) * before)
+        rounded = left.linear > 1.5 * expected + _NEGLIGIBLE * at.tau
+        passes = jnp.minimum(passes + rounded, 1 + refinements)
+        # NaN fails the comparison.
+        better = jnp.min(left.errors) < jnp.min(known[1])
+        now = left.measured, left.errors, left.gains
+        best, known = jax.tree.map(
+            lambda a, b: jnp.where(better, a, b), (at, now), (best, known)
+        )
+        # While the products fall, an error may rise for a while.
+        falls = left.products > count * rounding * at.tau**2
+        since = jnp.where(better, 0, since + ~falls)
+        return at, left, best, known, k + 1, since, passes
+
+    def going(carry):
+        _, _, _, known, k, since, _ = carry
+        return (jnp.min(known[1]) > 1) & (k < max_steps) & (since < _PATIENCE)
+
+    k, one = jnp.zeros((), int), jnp.ones((), dtype)
+    if start is None:
+        none = jnp.zeros_like(sides.h)
+        zeros = jnp.zeros_like(method.form.q), jnp.zeros_like(method.form.f)
+        at = Iterate(method.joined(*zeros, none, none, none, none), one, one)
+        left = jax.tree.map(
+            lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(evaluated, method, at)
+        )
+    else:
+        # The first iteration, which finds a start, is left out.
+        at, usable = start
+        left, k = evaluated(method, at), k + usable
+    known = left.measured, jnp.full(3, jnp.inf, dtype), left.gains
+    carry = at, left, at, known, k, jnp.zeros((), int), jnp.ones((), int)
+    _, _, best, known, k, _, _ = lax.while_loop(going, body, carry)
+    return Outcome(*method.point(best), best, *known, k)
+
+
+def interior(z: Array, on: Array) -> Array:
+    """`z` where all entries are well positive, else moved until they are."""
+    least = jnp.min(jnp.where(on, z, jnp.inf), initial=jnp.inf)
+    shift = jnp.where(least > 0, 0, 1 - least)
+    return jnp.where(on, z + jnp.where(jnp.isfinite(shift), shift, 0), 0)

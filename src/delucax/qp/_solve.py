@@ -1,0 +1,203 @@
+"""The door of the solver of quadratic programs."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .._check import check_bool, check_count, check_instance, check_range, is_concrete
+from .._results import choose, raise_on_failure, Result, RESULTS
+from .._typing import Array, RealScalar
+from ..math._linear_solve import full_precision
+from ._dense_problem import Dense
+from ._derivatives import optimum, Options
+from ._embedding import Outcome, Tolerances
+from ._form import AbstractForm
+from ._solution import Solution
+from ._staged_problem import Staged
+
+
+_LOOSE = 1e2
+"""Where rounding ends the iteration within so many times the tolerance, it is
+inaccurate."""
+
+
+def solve(
+    problem: Dense | Staged,
+    *,
+    start: Solution | None = None,
+    rtol: RealScalar | None = None,
+    atol: RealScalar | None = None,
+    max_steps: int = 100,
+    refinements: int = 3,
+    throw: bool = True,
+) -> Solution:
+    r"""Solve a convex quadratic program, or show that it has no solution.
+
+    By a predictor-corrector interior-point method on the homogeneous embedding, which
+    ends at a solution or at a certificate, from any start.
+
+    The solution is differentiable in both modes with respect to every array of the
+    problem, by the implicit function theorem: sides with positive multipliers stay
+    active. The derivative is NaN where the solution is not unique, where a side is at
+    its bound with a multiplier of zero, and of a solve that failed. Residuals,
+    certificates and the start have none.
+
+    **Arguments:**
+
+    - `problem`: a [`delucax.qp.Dense`][] or a [`delucax.qp.Staged`][].
+    - `start`: the solution of a problem of the same shapes, to start near; one that is
+        not finite is ignored. It saves iterations if the problem changed little. By
+        default the method finds its own.
+    - `rtol`, `atol`: each residual is at most `atol + rtol` times the size of the terms
+        that cancel in it. Both are `1e-8` by default, in single precision `1e-4`.
+    - `max_steps`: the most iterations.
+    - `refinements`: at most so many of each linear system, as rounding asks for.
+    - `throw`: raise unless there is a solution (default); if false, check `result`.
+
+    **Returns:** a [`delucax.qp.Solution`][], whose residuals are those of the problem
+    as it was given. `result` is `RESULTS.successful` if they meet the tolerance;
+    `RESULTS.no_feasible_point` or `RESULTS.unbounded` with a certificate, checked;
+    `RESULTS.inaccurate` if rounding ended the iteration near the tolerance;
+    `RESULTS.ill_posed` if the data are not finite or the cost is not convex;
+    else `RESULTS.not_converged`.
+
+    **Raises:** `ValueError` on a wrong argument; an error at run time as `throw` says.
+
+    Source: Mehrotra, 1992; Andersen and Ye, 1999; Goulart and Chen, 2024.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        def least(q):
+            problem = dlx.qp.Dense(jnp.eye(2), q, bounds=(0.0, 1.0))
+            return dlx.qp.solve(problem).x
+
+        jax.jacobian(least)(jnp.array([-2.0, -0.5]))
+        ```
+    """
+    where = "solve"
+    if not isinstance(problem, Dense | Staged):
+        raise ValueError(
+            f"{where}: problem must be a `delucax.qp.Dense` or a `delucax.qp.Staged`, "
+            f"got {type(problem).__name__}."
+        )
+    if start is not None:
+        check_instance(start, Solution, "start", where, "")
+    near = None if start is None else (start.x, start.u, start.multipliers)
+    dtype = jnp.result_type(*jax.tree.leaves(problem))
+    usual = 1e-8 if dtype == jnp.float64 else 1e-4
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if value is not None:
+            check_range(value, name, where)
+    numbers = (usual if tol is None else tol for tol in (atol, rtol))
+    atol, rtol = (as_scalar(number, dtype) for number in numbers)
+    max_steps = check_count(max_steps, "max_steps", where)
+    refinements = check_count(refinements, "refinements", where, 0)
+    check_bool(throw, "throw", where)
+    given = problem, near, atol, rtol
+    solution = _solved(*given, max_steps, refinements)
+    facts = lambda: _facts(problem, solution)
+    return raise_on_failure(solution, where, throw, facts=facts)
+
+
+def as_scalar(number: Any, dtype: Any) -> Any:
+    """A number as an argument of a compiled program."""
+    if is_concrete(number):
+        return np.asarray(number, dtype)
+    return number.astype(dtype)
+
+
+@eqx.filter_jit
+@full_precision
+def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
+    form = problem.form()
+    dtype = form.q.dtype
+    certificate = jnp.asarray(1e-8 if dtype == jnp.float64 else 1e-4, dtype)
+    atol, rtol = jnp.asarray(atol, dtype), jnp.asarray(rtol, dtype)
+    if start is not None:
+        start = problem.unknowns(*start)
+    tolerances = Tolerances(atol, rtol, certificate)
+    options = lax.stop_gradient(Options(start, tolerances, max_steps, refinements))
+    point = optimum(form, options)
+    is_posed = _is_posed(problem, form)
+    result, is_certificate = _judged(point, is_posed)
+    infeasible, unbounded = is_certificate
+    x, p, z = _certified(form, point, infeasible, unbounded)
+    cost = form.cost(x)
+    cost = jnp.where(infeasible, jnp.inf, jnp.where(unbounded, -jnp.inf, cost))
+    # An equation has one multiplier of either sign; of its two sides one is pushed.
+    equality = form.sides().equality
+    lower = jnp.where(equality[0], jnp.maximum(-z[0], 0), z[1])
+    upper = jnp.where(equality[0], jnp.maximum(z[0], 0), z[0])
+    multipliers = problem.multipliers(p, jnp.stack([upper, lower]))
+    answer: Any = *problem.primal(x), multipliers, cost, *point.measured
+    answers: Any = *answer, point.iterations, result
+    return Solution(*answers)
+
+
+def _judged(point: Outcome, is_posed: Array) -> tuple[Result, Any]:
+    """The status, and whether the point is one of the two certificates."""
+    error = point.errors[0]
+    solved = error <= 1
+    infeasible = ~solved & (point.errors[1] <= 1)
+    unbounded = ~solved & ~infeasible & (point.errors[2] <= 1)
+    result = choose(error <= _LOOSE, RESULTS.inaccurate, RESULTS.not_converged)
+    result = choose(unbounded, RESULTS.unbounded, result)
+    result = choose(infeasible, RESULTS.no_feasible_point, result)
+    result = choose(solved, RESULTS.successful, result)
+    return choose(is_posed, result, RESULTS.ill_posed), (infeasible, unbounded)
+
+
+def _is_posed(problem: Dense | Staged, form: AbstractForm) -> Array:
+    """Whether the data are finite, and the cost convex up to rounding."""
+    bounds = (jnp.where(jnp.isinf(b), 0, b) for b in (form.lower, form.upper))
+    arrays = *problem.data(), form.q, form.f, *bounds
+    posed = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(a) for a in arrays])))
+    for hessian in problem.hessians():
+        n, size = hessian.shape[-1], jnp.max(jnp.abs(hessian), initial=0)
+        # A product C'C is semidefinite up to this.
+        slack = 100 * n * jnp.finfo(size.dtype).eps * jnp.where(size > 0, size, 1)
+        L = jnp.linalg.cholesky(hessian + slack * jnp.eye(n, dtype=size.dtype))
+        posed = posed & jnp.all(jnp.isfinite(L))
+    return posed
+
+
+def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded: Array):
+    """The point, or the normalised certificate with NaN for what is none."""
+    sides = form.sides()
+    at = lax.stop_gradient(point)
+    p, z = at.p, jnp.where(sides.soft, 0, at.z)
+    support, slope = at.gains
+    unit = lambda fails, size: jnp.where(fails, jnp.abs(size), 1)
+    dual, primal = unit(infeasible, support), unit(unbounded, slope)
+
+    def either(value, certificate, is_certificate, has_none):
+        # Zero, whose derivative is that of the failed solve: NaN.
+        zero = jnp.where(jnp.isfinite(value), value, 0)
+        zero = zero - lax.stop_gradient(zero)
+        value = jnp.where(is_certificate, certificate + zero, value)
+        return jnp.where(has_none, jnp.nan + zero, value)
+
+    x = either(point.x, at.x / primal, unbounded, infeasible)
+    p = either(point.p, p / dual, infeasible, unbounded)
+    return x, p, either(point.z, z / dual, infeasible, unbounded)
+
+
+def _facts(problem: Dense | Staged, solution: Solution) -> str:
+    """Which constraint weighs most in a certificate, where it is known."""
+    if not (solution.result == RESULTS.no_feasible_point):
+        return ""
+    given: Any = solution.x, solution.u, solution.multipliers
+    _, p, z = problem.unknowns(*given)
+    sides = problem.form().sides()
+    heights = np.abs(np.asarray(sides.h * z))
+    index = tuple(map(int, np.unravel_index(heights.argmax(), heights.shape)))
+    return f"{problem.place(*index).capitalize()} weighs most in the certificate."

@@ -1,0 +1,225 @@
+"""The staged form: a Riccati recursion solves the linear system in time linear in the
+horizon.
+
+The unknowns are `z_k = (x_k, u_k)`, shape `(T+1, n+m)`; the last control is zero. The
+equations are `x_0 = f_0` and `x_{k+1} - A_k x_k - B_k u_k = f_{k+1}`, and their
+multipliers the costates. A start that is free has no equation.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float
+
+from .._typing import Array
+from ..math._linear_solve import solve
+from ..math._norms import power_of_two
+from ._dense import cost_unit, regularisation, scaled_sides
+from ._form import AbstractForm, Scaling
+
+
+_ELIMINATED = 6
+"""So many controls are eliminated entry by entry; more of them by LAPACK."""
+_SUMMED = 16
+"""Products of matrices with an inner dimension up to this are sums."""
+_PASSES = 3
+
+
+class Factors(NamedTuple):
+    """Of the recursion: the cost-to-go, the gains, and what solves for the controls."""
+
+    V: Array  # (T+1, n, n)
+    K: Array  # (T, m, n)
+    pivots: Array  # (T, m, m), the inverse of the weight of the controls
+    closed: Array  # (T, n, n), A - B K
+
+
+class StagedForm(AbstractForm):
+    """A program in stages; the first rows of each are some of its variables."""
+
+    H: Float[Array, "steps N N"]
+    q: Float[Array, "steps N"]
+    F: Float[Array, "stages n N"]
+    f: Float[Array, "steps n"]
+    G: Float[Array, "steps p N"]
+    lower: Float[Array, "steps rows"]
+    upper: Float[Array, "steps rows"]
+    soft: tuple[Array, Array] | None
+    bounded: tuple[int, int] = eqx.field(static=True)
+    is_free: bool = eqx.field(static=True)
+
+    def hessian(self, x):
+        # Symmetric: this order of the sum runs along the rows.
+        return _each_transposed(self.H, x)
+
+    def rows(self, x):
+        first, last = self.bounded
+        return jnp.concatenate([x[:, first:last], _each(self.G, x)], axis=1)
+
+    def rows_transposed(self, y):
+        first, last = self.bounded
+        y, general = y[:, : last - first], y[:, last - first :]
+        pad = (0, 0), (first, self.q.shape[1] - last)
+        return jnp.pad(y, pad) + _each_transposed(self.G, general)
+
+    def equations(self, x):
+        n = self.f.shape[1]
+        at_start = jnp.zeros_like(x[0, :n]) if self.is_free else x[0, :n]
+        return jnp.concatenate([at_start[None], x[1:, :n] - _each(self.F, x[:-1])])
+
+    def equations_transposed(self, p):
+        n, N = self.f.shape[1], self.q.shape[1]
+        if self.is_free:
+            p = p.at[0].set(0)
+        pulled = jnp.pad(_each_transposed(self.F, p[1:]), ((0, 1), (0, 0)))
+        return jnp.pad(p, ((0, 0), (0, N - n))) - pulled
+
+    def factorise(self, weight):
+        first, last = self.bounded
+        (_, n, N), dtype = self.F.shape, self.q.dtype
+        own, general = weight[:, : last - first], weight[:, last - first :]
+        diagonal = jnp.pad(own, ((0, 0), (first, N - last))) + regularisation(dtype)
+        M = self.H + diagonal[:, :, None] * jnp.eye(N, dtype=dtype)
+        if self.G.shape[1]:
+            M = M + jnp.einsum("tpi,tp,tpj->tij", self.G, general, self.G)
+
+        def back(V, here):
+            F, M = here
+            M = lax.optimization_barrier(
+                M + _across(F, lax.optimization_barrier(_product(V, F)))
+            )
+            solved = _eliminated(M[n:, n:], M[n:, :n])
+            K = solved[:, :n]
+            before = M[:n, :n] - _across(M[n:, :n], K)
+            return (before + before.T) / 2, (V, K, solved[:, n:])
+
+        V, (after, K, pivots) = lax.scan(
+            back, M[-1, :n, :n], (self.F, M[:-1]), reverse=True
+        )
+        closed = self.F[:, :, :n] - jnp.einsum("tij,tjk->tik", self.F[:, :, n:], K)
+        return Factors(jnp.concatenate([V[None], after]), K, pivots, closed)
+
+    def solve(self, factors, x, p):
+        n = self.f.shape[1]
+        V, K, pivots, closed = factors
+        A_t = lambda v: _each_transposed(self.F, v)
+        # With the cost-to-go 1/2 x'V x + v'x of each state. What does not depend on the
+        # recursion is computed for all stages at once.
+        r, s = x[:, :n], x[:-1, n:]
+        pushed = _each(V, p)
+        added = _each_transposed(K, s) - r[:-1]
+
+        def back(v, here):
+            closed, pushed, added = here
+            return added + _applied_transposed(closed, v + pushed), v
+
+        v, after = lax.scan(back, -r[-1], (closed, pushed[1:], added), reverse=True)
+        k = _each(pivots, A_t(after + pushed[1:])[:, n:] - s)
+        at_start = p[0]
+        if self.is_free:
+            at_start = -solve(V[0], v[:, None])[:, 0]
+        reached = p[1:] - _each(self.F[:, :, n:], k)
+
+        def forward(x, here):
+            closed, reached = here
+            return _applied(closed, x) + reached, x
+
+        last, states = lax.scan(forward, at_start, (closed, reached))
+        controls = -_each(K, states) - k
+        states = jnp.concatenate([states, last[None]])
+        costates = -_each(V, states) - jnp.concatenate([v[None], after])
+        if self.is_free:
+            costates = costates.at[0].set(0)
+        controls = jnp.pad(controls, ((0, 1), (0, 0)))
+        return jnp.concatenate([states, controls], axis=1), costates
+
+    def equilibrated(self):
+        n, N = self.f.shape[1], self.q.shape[1]
+        largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
+        unit = lambda size: power_of_two(lax.rsqrt(jnp.where(size > 0, size, 1)))
+        D, R = jnp.ones(N, self.q.dtype), jnp.ones(self.G.shape[:2], self.q.dtype)
+        # One scale for each component at all times, so that the equations keep theirs.
+        H, general = lax.stop_gradient((largest(self.H, 0), self.G))
+        for _ in range(_PASSES):
+            d = unit(
+                jnp.maximum(largest(H, 0), largest(R[..., None] * general, (0, 1)) * D)
+            )
+            H, D = d[:, None] * H * d, D * d
+            if self.G.shape[1]:
+                R = 1 / largest(general * D, 2)
+                R = power_of_two(jnp.where(jnp.isfinite(R), R, 1))
+        first, last = self.bounded
+        E = 1 / D[:n]
+        H = D[:, None] * self.H * D
+        q = D * self.q
+        c = cost_unit(*lax.stop_gradient((H, q)))
+        G = R[..., None] * self.G * D
+        rows = jnp.broadcast_to(1 / D[first:last], (len(R), last - first))
+        scaling = Scaling(
+            jnp.broadcast_to(D, self.q.shape),
+            jnp.broadcast_to(E, self.f.shape),
+            jnp.concatenate([rows, R], axis=1),
+            c,
+        )
+        bounds, soft = scaled_sides(self, scaling)
+        F = E[:, None] * self.F * D
+        own: Any = self.bounded, self.is_free
+        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft, *own)
+        return StagedForm(*parts), scaling
+
+    def admissible(self, x, p):
+        n = self.f.shape[1]
+        return x.at[-1, n:].set(0), p.at[0].set(0) if self.is_free else p
+
+
+def _eliminated(matrix: Array, right: Array) -> Array:
+    """`matrix^-1 [right, I]` of a definite matrix."""
+    m = matrix.shape[0]
+    eye = jnp.eye(m, dtype=matrix.dtype)
+    right = jnp.concatenate([right, eye], axis=1)
+    if m > _ELIMINATED:
+        L = jnp.linalg.cholesky(matrix, symmetrize_input=False)
+        return jax.scipy.linalg.cho_solve((L, True), right)
+    # Entry by entry the loop over the stages is one compiled loop, ten times as fast as
+    # with a call of LAPACK in it. A definite matrix needs no pivoting.
+    rows = list(jnp.concatenate([matrix, right], axis=1))
+    for i in range(m):
+        rows[i] = rows[i] / rows[i][i]
+        for j in range(m):
+            if j != i:
+                rows[j] = rows[j] - rows[j][i] * rows[i]
+    return lax.optimization_barrier(jnp.stack(rows)[:, m:])
+
+
+def _product(a, b):
+    """`a @ b`, as a sum where it is small: the loop over stages calls no library."""
+    if a.shape[1] > _SUMMED:
+        return a @ b
+    return jnp.sum(a[:, :, None] * b, axis=1)
+
+
+def _across(a, b):
+    """`a.T @ b`."""
+    if a.shape[0] > _SUMMED:
+        return a.T @ b
+    return jnp.sum(a[:, :, None] * b[:, None, :], axis=0)
+
+
+def _applied(a, x):
+    return jnp.sum(a * x, axis=1)
+
+
+def _applied_transposed(a, x):
+    return jnp.sum(a * x[:, None], axis=0)
+
+
+def _each(a, x):
+    """The product of each matrix with its vector."""
+    return jnp.sum(a * x[:, None, :], axis=2)
+
+
+def _each_transposed(a, x):
+    return jnp.sum(a * x[:, :, None], axis=1)
