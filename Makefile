@@ -67,7 +67,8 @@ test-float32: $(VENV)/.tests ## the tests in single precision
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting $(PYTEST_ARGS)
+	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
+		$(PYTEST_ARGS)
 
 .PHONY: thorough
 thorough: $(VENV)/.tests ## the few tests that take minutes by their nature
