@@ -32,9 +32,11 @@ kept := JAX_COMPILATION_CACHE_DIR="$${JAX_COMPILATION_CACHE_DIR:-$(CURDIR)/.cach
 # The same in both precisions: the examples of docs and docstrings.
 examples := --ignore tests/contracts/test_public.py --ignore tests/test_docs.py
 # What meets other packages, and the spine: what all else is made of.
-spine := tests/contracts tests/simulation tests/planning/test_ilqr.py \
-	tests/riccati/test_dare.py tests/riccati/test_care.py tests/training/test_fit.py
-outward := tests/dynamics/test_integration.py tests/experiments tests/interop tests/plotting
+spine := tests/contracts/test_controllers.py tests/contracts/test_systems.py tests/simulation \
+	tests/planning/test_ilqr.py tests/riccati/test_dare.py tests/riccati/test_care.py \
+	tests/training/test_fit.py
+outward := tests/dynamics/test_integration.py tests/experiments tests/interop \
+	tests/plotting/test_plot.py tests/plotting/test_animate.py
 
 # The oldest dependencies are tested for what they lack, not for what they compile to.
 lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
@@ -79,7 +81,7 @@ thorough: $(VENV)/.tests ## the few tests that take minutes by their nature
 test-oldest: $(VENV)-oldest/.tests ## the spine, with the oldest Python and dependencies allowed
 	$(lightly) JAX_ENABLE_X64=0 $(one_thread) $(VENV)-oldest/bin/python -m pytest \
 		-n logical --maxprocesses=8 --dist worksteal -W default \
-		$(spine) $(outward) $(examples) $(PYTEST_ARGS)
+		$(spine) $(outward) $(PYTEST_ARGS)
 
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom, with little of everything

@@ -114,6 +114,7 @@ def test_second_derivatives():
     assert_close(hessian, np.array(expected), atol=1e-3)
 
 
+@needs_x64
 @pytest.mark.parametrize(
     "P, q",
     [
@@ -127,6 +128,7 @@ def test_no_derivative_is_nan(P, q):
     assert np.isnan(jax.jacfwd(f)(jnp.asarray(q))).any()
 
 
+@needs_x64
 def test_a_failed_solve_has_nan_and_infinite_bounds_have_none():
     f = lambda high: dense(np.eye(2), np.zeros(2), bounds=(1.0, high))
     assert np.isnan(jax.jit(jax.jacrev(f))(jnp.array([0.0, 2.0]))).any()
