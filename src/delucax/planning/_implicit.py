@@ -15,6 +15,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._check import is_concrete
 from .._jax import by_lanes, deferred, hoisted, nan_tangent
 from .._results import RESULTS
 from ..math import matvec
@@ -48,14 +49,13 @@ def solution(problem: Problem, start: Start, options: Options) -> Outcome:
     iteration = hoisted(with_constraints, problem, start, options)
     closed_over = jax.tree.leaves(iteration)
     # The derivative, traced elsewhere, would meet it as a tracer that has escaped.
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in closed_over)
+    traced = not all(map(is_concrete, closed_over))
     return _solution(iteration, problem, start, options, traced)
 
 
 @eqx.filter_custom_jvp
 def _solution(iteration: Any, *given: Any) -> Outcome:
-    *given, _ = given
-    return by_lanes(iteration, *given)
+    return by_lanes(iteration, *given[:-1])
 
 
 @_solution.def_jvp
