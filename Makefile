@@ -38,7 +38,7 @@ spine := tests/contracts/test_controllers.py tests/contracts/test_systems.py tes
 outward := tests/dynamics/test_integration.py tests/experiments tests/interop \
 	tests/plotting/test_plot.py tests/plotting/test_animate.py
 
-# The oldest dependencies are tested for what they lack, not for what they compile to.
+# LLVM's optimiser takes a fifth of the time, for programs that run for milliseconds.
 lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
 	--xla_llvm_disable_expensive_passes=true $$XLA_FLAGS"; export XLA_FLAGS;
 
@@ -85,7 +85,7 @@ test-oldest: $(VENV)-oldest/.tests ## the spine, with the oldest Python and depe
 
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom, with little of everything
-	$(kept) CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
+	$(lightly) $(kept) CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
 		--nbmake --nbmake-timeout=600 notebooks
 
 .PHONY: notebooks-full
