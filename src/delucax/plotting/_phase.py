@@ -2,6 +2,7 @@
 
 from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,15 +134,26 @@ def _field(
     system: AbstractSystem, control: Any, states: Float[Array, "n 2"], where: str
 ) -> Float[Array, "n 2"]:
     """dx/dt at each row of `states`."""
+    if not callable(control):
+        given = np.zeros(system.control_size) if control is None else control
+        control = as_vector(given, system.control_size, "control", where)
+    return _compiled_field(system, control, states, where)
+
+
+@eqx.filter_jit
+def _compiled_field(
+    system: AbstractSystem, control: Any, states: Float[Array, "n 2"], where: str
+) -> Float[Array, "n 2"]:
     size = system.control_size
-    if callable(control):
-        law = lambda x: as_vector(control(x), size, "what control returns", where)
-    else:
-        given = np.zeros(size) if control is None else control
-        constant = as_vector(given, size, "control", where)
-        law = lambda x: constant
     w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
-    return jax.jit(jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w)))(states)
+
+    def at(x):
+        u = control
+        if callable(control):
+            u = as_vector(control(x), size, "what control returns", where)
+        return system.vector_field(0.0, x, u, w)
+
+    return jax.vmap(at)(states)
 
 
 def _turns(

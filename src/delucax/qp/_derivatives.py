@@ -102,8 +102,8 @@ def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
     """The change of `x`, `p` and `z`, and whether the solution is unique."""
     scaled, scaling = form.equilibrated()
     D, E, R, c = scaling
-    sides, own_sides = form.sides(), scaled.sides()
-    method = Method(form, scaled, scaling, sides, own_sides, None)
+    method = Method(form, scaled, scaling, form.sides(), scaled.sides(), None)
+    sides = method.sides
     x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in outcome[:3])
     at = outcome.iterate
     _, _, scaled_z, s, t, m = method.apart(at.v / at.tau)
@@ -138,7 +138,7 @@ def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
     right = [-a * unit for a, unit in zip(right, (c * D, E, R), strict=True)]
     # A linear system like that of a step: held sides are its equations.
     none = jnp.zeros_like(scaled_z)
-    W = jnp.where(spring, own_sides.W, 1)
+    W = jnp.where(spring, sides.W, 1)
     system_sides = Sides(none, spring, held, spring, spring, none, W)
     compliance = jnp.where(spring, 1 / W, 0)
     system = assembled(scaled, system_sides, compliance)

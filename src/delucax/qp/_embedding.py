@@ -39,9 +39,8 @@ class Residuals(NamedTuple):
     tau: Scalar
     Hx: Array
     products: Scalar  # s'z + t'm + tau kappa
-    linear: (
-        Scalar  # the worst of the lines `x` and `p`, over what is allowed, times tau
-    )
+    linear: Scalar
+    """The worst of the lines `x` and `p` over what is allowed, times tau."""
     measured: Array
     """Of the program in the units of the user: what is left of the primal and the dual,
     the complementarity, and the gap."""
@@ -153,31 +152,31 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
     )
     left_t, support = t, push
     if method.is_soft:
-        bent = sides.W * t_own
-        slack_t = jnp.where(sides.soft, bent + sides.v - z, 0)
+        resistance = sides.W * t_own
+        slack_t = jnp.where(sides.soft, resistance + sides.v - z, 0)
         left_t = jnp.where(sides.soft, slack_t * c * tau / R - m, 0)
         # A soft side has no part in a certificate.
         yielding = jnp.where(sides.soft, z, 0)
         resisted = pulled - form.rows_transposed(signed(yielding))
         (pull,) = _largest(resisted * D)
         costs, squares, extra, given = _sums(
-            sides.v * t_own, bent * t_own, t * m, yielding * sides.h
+            sides.v * t_own, resistance * t_own, t * m, yielding * sides.h
         )
-        spring, held, bend = _largest(
-            jnp.minimum(slack_t, 0), slack_t * t_own, bent / R
+        negative, product_t, flat_t = _largest(
+            jnp.minimum(slack_t, 0), slack_t * t_own, resistance / R
         )
         slope, square, products = slope + costs, square + squares, products + extra
-        dual, product = jnp.maximum(dual, spring), jnp.maximum(product, held)
-        flat, support = jnp.maximum(flat, bend), push - given
+        dual, product = jnp.maximum(dual, negative), jnp.maximum(product, product_t)
+        flat, support = jnp.maximum(flat, flat_t), push - given
     gap = square + slope + lift + push
     products = products + tau * at.kappa
 
     # Each is compared with the terms that cancel in it.
     terms = jnp.max(jnp.abs(jnp.stack([square, slope, lift, push])))
-    found = jnp.stack([violated, missed, dual, product, jnp.abs(gap)])
+    left = jnp.stack([violated, missed, dual, product, jnp.abs(gap)])
     rows, gradient = jnp.max(jnp.stack(z_terms)), jnp.max(jnp.stack(x_terms))
     scales = jnp.stack([rows, jnp.maximum(rows, p_term), gradient, terms, terms])
-    errors = found / (atol + rtol * scales)
+    errors = left / (atol + rtol * scales)
     # A certificate is judged in the scaled problem, whose units mean nothing. It must
     # hold with all data off by the tolerance too: what a tolerance away is feasible has
     # a solution.
@@ -187,7 +186,7 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
     worst = jnp.maximum(jnp.maximum(flat * c, drift), outward)
     failings = tau * jnp.stack([pull * c, worst])
     certificates = jnp.where(relaxed < 0, failings / (least * -relaxed), jnp.inf)
-    measured = jnp.concatenate([jnp.maximum(found[:1], found[1:2]), found[2:]])
+    measured = jnp.concatenate([jnp.maximum(left[:1], left[1:2]), left[2:]])
     z_left = jnp.where(method.sides.active, R * tau * over + s, 0)
     return Residuals(
         unit * D * left_x,

@@ -45,7 +45,7 @@ class Sides(NamedTuple):
 class AbstractForm(eqx.Module):
     """The arrays of a program, and what is linear algebra of its own structure.
 
-    All methods take one vector; the two columns of the method are a batch.
+    All methods take one vector.
     """
 
     q: eqx.AbstractVar[Array]

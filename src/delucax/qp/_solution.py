@@ -9,7 +9,7 @@ from ._staged_problem import StagedMultipliers
 
 
 class Solution(eqx.Module):
-    """The solution of a quadratic program, or the certificate that there is none.
+    """What the method found: a solution, or a proof that there is none.
 
     Where `result` is `RESULTS.no_feasible_point`, the multipliers are the certificate:
     those of inequalities are not negative, `E'equalities + G'(upper - lower)` is zero,
