@@ -1,3 +1,5 @@
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -93,6 +95,12 @@ def exact_cost(weights):
     return total + np.trace(FINAL @ moments[:2, :2])
 
 
+@functools.cache
+def episodes():
+    """One loss for all tests of it: another one would compile again."""
+    return scored_cost(environment())
+
+
 @eqx.filter_jit
 def _estimates(estimator, loss, model, keys):
     def one(key):
@@ -132,14 +140,14 @@ def test_the_gradient_of_a_random_closed_loop_is_unbiased(estimator):
     estimator, count = estimator
     weights = np.array([0.8, 0.4, -1.0])
     exact = central_difference(exact_cost, weights)
-    loss = scored_cost(environment())
+    loss = episodes()
     costs, gradients = estimates(estimator, loss, Recalling(), count)
     assert_mean(costs, exact_cost(weights))
     assert_mean(gradients, exact, power=0.25)
 
 
 def test_a_baseline_lowers_the_variance():
-    loss = scored_cost(environment())
+    loss = episodes()
     _, scored = estimates(SCORED[0], loss, Recalling(), SCORED[1])
     _, plain = estimates(NO_BASELINE[0], loss, Recalling(), NO_BASELINE[1])
     assert np.all(scored.var(0) < 0.5 * plain.var(0))

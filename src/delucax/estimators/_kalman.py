@@ -78,13 +78,14 @@ class KalmanFilter(AbstractGaussianFilter):
 
         ```python
         import delucax as dlx
+        import equinox as eqx
         import jax.numpy as jnp
 
         A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
         dynamics = dlx.LinearDynamics(A, B, C=jnp.array([[1.0, 0.0]]))
         kalman = dlx.estimators.KalmanFilter(dynamics, 0.1 * jnp.eye(2), jnp.eye(1))
-        belief = kalman.update(0.0, jnp.array([0.5]), kalman.init())
-        belief = kalman.predict(0.0, jnp.zeros(1), belief)
+        belief = eqx.filter_jit(kalman.update)(0.0, jnp.array([0.5]), kalman.init())
+        belief = eqx.filter_jit(kalman.predict)(0.0, jnp.zeros(1), belief)
         ```
     """
 
@@ -344,12 +345,13 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
 
         ```python
         import delucax as dlx
+        import equinox as eqx
         import jax.numpy as jnp
 
         dynamics = dlx.make("pendulum").dynamics
         noise, tilted = 1e-3 * jnp.eye(2), jnp.array([0.1, 0.0])
         ukf = dlx.estimators.UnscentedKalmanFilter(dynamics, noise, noise, kappa=1.0)
-        ukf.update(0.0, tilted, ukf.init()).mean
+        eqx.filter_jit(ukf.update)(0.0, tilted, ukf.init()).mean
         ```
     """
 

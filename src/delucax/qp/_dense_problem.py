@@ -39,8 +39,11 @@ class DenseMultipliers(eqx.Module):
         import delucax as dlx
         import jax.numpy as jnp
 
-        problem = dlx.qp.Dense(jnp.eye(2), jnp.ones(2), bounds=(0.0, 1.0))
-        lower, upper = dlx.qp.solve(problem).multipliers.bounds
+        rows = dlx.qp.Rows(jnp.array([[1.0, 1.0]]), upper=1.0)
+        P, q = jnp.eye(2), jnp.array([1.0, -2.0])
+        problem = dlx.qp.Dense(P, q, bounds=(0.0, 1.0), rows=rows)
+        multipliers = dlx.qp.solve(problem).multipliers
+        multipliers.bounds, multipliers.rows
         ```
     """
 

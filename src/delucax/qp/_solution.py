@@ -39,7 +39,9 @@ class Solution(eqx.Module):
         import delucax as dlx
         import jax.numpy as jnp
 
-        problem = dlx.qp.Dense(jnp.eye(2), jnp.ones(2), bounds=(2.0, 3.0))
+        rows = dlx.qp.Rows(jnp.array([[1.0, 1.0]]), upper=5.0)
+        bounds = 2.0, 3.0
+        problem = dlx.qp.Dense(jnp.eye(2), jnp.ones(2), bounds=bounds, rows=rows)
         solution = dlx.qp.solve(problem)
         solution.x, solution.multipliers.bounds, solution.gap
         ```

@@ -47,10 +47,17 @@ class StagedMultipliers(eqx.Module):
         import delucax as dlx
         import jax.numpy as jnp
 
-        A, B, start = jnp.eye(1), jnp.ones((1, 1)), jnp.ones(1)
-        limits = -0.1, 0.1
+        A = jnp.array([[1.0, 0.1], [0.0, 1.0]])
+        B = jnp.array([[0.0], [0.1]])
         problem = dlx.qp.Staged(
-            A, B, A, A, start=start, horizon=5, controls=limits
+            A,
+            B,
+            jnp.eye(2),
+            0.1 * jnp.eye(1),
+            start=jnp.array([1.0, 0.0]),
+            horizon=20,
+            controls=(-1.0, 1.0),
+            states=(jnp.array([-jnp.inf, -0.3]), jnp.inf),
         )
         multipliers = dlx.qp.solve(problem).multipliers
         multipliers.costates, multipliers.controls
