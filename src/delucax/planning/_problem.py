@@ -334,9 +334,6 @@ def roll_out(
     size = problem.x0.shape[0]
     split = functools.partial(split_state, most=_SPLIT_UP_TO)
 
-    # The state is carried by its components, as in `delucax.rollout`: most of the time
-    # of a planner is spent here.
-    @by_components
     def body(parts, inputs):
         t, planned, u, K, k, defect, w = inputs
         x = join_state(parts)
@@ -356,6 +353,10 @@ def roll_out(
 
     times = problem.times(controls.shape[0])[:-1]
     inputs = (times, states[:-1], controls, K, k, defects, problem.w)
+    # The state is carried by its components, as in `delucax.rollout`: most of the time
+    # of a planner is spent here. A larger one is carried whole, with its products.
+    whole = size > _SPLIT_UP_TO
+    body = products_whole()(body) if whole else by_components(body)
     last, (parts, controls, results) = lax.scan(body, split(problem.x0), inputs)
     states = stack_steps(parts, size, last)
     # All states are checked, because a cost may ignore some of them, or clip them.
