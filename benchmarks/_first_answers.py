@@ -315,7 +315,9 @@ def simulate(adaptive: bool) -> Callable[[], tuple[Thunk, ...]]:
         x0, ts = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 5.0, 101)
         steps = diffrax.PIDController(rtol=1e-6, atol=1e-9) if adaptive else None
         options = dict(dt=0.05, ts=ts, stepsize_controller=steps)
-        run = lambda: dlx.simulate(system, controls, 0.0, 5.0, x0, **options)
+        # Its module is imported at first use, and imports are another figure.
+        simulate = dlx.simulate
+        run = lambda: simulate(system, controls, 0.0, 5.0, x0, **options)
         return (lambda: run().states,)
 
     return prepare
