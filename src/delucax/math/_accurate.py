@@ -16,6 +16,8 @@ _SMALL = 2**15
 time, is as fast as several matrix products."""
 _PARTS = 8
 _LONG = 64
+_LONGEST = 512
+"""Up to so many terms one slice of the factors is enough in double precision."""
 
 
 def product(
@@ -68,7 +70,8 @@ def _by_slices(left, right, *added):
     """
     (n, k), m, dtype = left.shape, right.shape[1], left.dtype
     eps, digits = xp.finfo(dtype).eps, xp.finfo(dtype).nmant + 1
-    count = 1 if digits > 50 else 2
+    # A long sum leaves few bits to a slice.
+    count = 1 if digits > 50 and k <= _LONGEST else 2
     bits = int((digits - math.log2(count * k)) / 2)
     # k products of two slices of so many bits sum up without rounding.
     both = xp.concatenate([left, right.T])
