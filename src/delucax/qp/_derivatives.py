@@ -18,9 +18,10 @@ from jax.flatten_util import ravel_pytree
 from .._jax import by_lanes, nan_tangent
 from .._typing import Array
 from ..math._linear_solve import full_precision
+from ._active_set import Guess, GUESSES
 from ._embedding import Method, Outcome, Tolerances
 from ._form import AbstractForm, both, Sides, signed
-from ._interior_point import assembled, Guess, GUESSES, minimise, solved
+from ._interior_point import assembled, minimise, solved
 
 
 _CLEAR = 1e3
@@ -47,7 +48,8 @@ def _run(form: AbstractForm, options: Options) -> Outcome:
     scaled, scaling = form.equilibrated()
     sides = form.sides(), scaled.sides()
     method = Method(form, scaled, scaling, *sides, options.tolerances)
-    guess = None
+    none = jnp.zeros_like(method.sides.h, bool)
+    guess = Guess(none, none, jnp.asarray(GUESSES))
     if options.start is not None:
         x, _, z = options.start
         guess = warm(method, x, z)
@@ -55,7 +57,7 @@ def _run(form: AbstractForm, options: Options) -> Outcome:
 
 
 def warm(method: Method, x: Array, z: Array) -> Guess:
-    """The sides that are active at a point; none is guessed where it is not finite."""
+    """The sides that are active at a point; none where it is not finite."""
     D, _, R, c = method.scaling
     sides = method.sides
     usable = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(z))
@@ -63,7 +65,7 @@ def warm(method: Method, x: Array, z: Array) -> Guess:
     slack = sides.h - both(method.scaled.rows(x))
     active = sides.inequality & (z > slack)
     over = active & sides.soft & (-slack > sides.v - z) & (slack < 0)
-    return Guess(active & ~over, over, jnp.where(usable, GUESSES, 0))
+    return Guess(active & ~over, over, jnp.asarray(GUESSES))
 
 
 @eqx.filter_custom_jvp

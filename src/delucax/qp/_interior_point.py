@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._typing import Array
+from ._active_set import Guess, PASSES, tried
 from ._embedding import evaluated, Iterate, Method, Outcome, Residuals
 from ._form import AbstractForm, both, Sides, signed
 
@@ -22,30 +23,8 @@ _TO_BOUNDARY = 0.99
 """The share of the step to the boundary that is taken."""
 _NEGLIGIBLE = 1e-2
 """So much of the tolerance is no reason to refine a linear system."""
-GUESSES = 5
-"""So many sets of active sides are tried, each from what the last one found."""
 _PATIENCE = 5
 """It ends after so many steps without a better iterate: rounding is reached."""
-
-
-class Guess(NamedTuple):
-    """Which sides are taken to be active."""
-
-    held: Array  # with equality
-    over: Array  # violated, a soft side
-    left: Array  # so many guesses are left
-
-    def sides(self, sides: Sides) -> tuple[Sides, Array]:
-        """The sides of the equations that then hold, and the compliance of each: that
-        of the weight of a violation."""
-        spring = self.over & (sides.W > 0)
-        compliance = jnp.where(spring, 1 / jnp.where(spring, sides.W, 1), 0)
-        held = sides.equality | self.held
-        return sides._replace(inequality=spring, equality=held), compliance
-
-    def pushed(self, sides: Sides) -> Array:
-        """The multipliers of the sides whose violation has a linear weight alone."""
-        return jnp.where(self.over & (sides.W == 0), sides.v, 0)
 
 
 class System(NamedTuple):
@@ -201,7 +180,9 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
     none = jnp.zeros_like(at.v)
     nothing = jnp.zeros((), z.dtype)
     start = none, Iterate(none, nothing, nothing), nothing, nothing
-    along, d, sigma, length = lax.fori_loop(0, 3, turn, start)
+    # A start needs the first one alone.
+    turns = jnp.where(first, 1, 3)
+    along, d, sigma, length = lax.fori_loop(0, turns, turn, start)
     return d, jnp.minimum(_TO_BOUNDARY * length, 1), 1 - sigma, along
 
 
@@ -216,37 +197,9 @@ def begun(method: Method, along: Array) -> Iterate:
     return Iterate(method.joined(x, p, z, s, t, m), one, one)
 
 
-def tried(method: Method, along: Array, guess: Guess) -> tuple[Iterate, Guess]:
-    """The point at which the active sides are as guessed, and the next guess: the sides
-    that it violates, and those that push.
-
-    Source: Hintermueller, Ito and Kunisch, 2002 (primal-dual active sets).
-    """
-    sides = method.sides
-    x, p, z, *_ = method.apart(along)
-    z = z + guess.pushed(sides)
-    over = both(method.scaled.rows(x)) - sides.h
-    on, one = sides.inequality, jnp.ones((), along.dtype)
-    too_far = sides.soft & (z > sides.v) & guess.held
-    stays = jnp.where(guess.over, over > 0, False)
-    held = jnp.where(guess.held, (z > 0) & ~too_far, over > 0) & on
-    # A violated side that is met again is held.
-    held = jnp.where(guess.over, ~stays, held)
-    violated = too_far | stays
-    t = jnp.where(guess.over, jnp.maximum(over, 0), 0)
-    s = jnp.where(on, jnp.maximum(t - over, 0), 0)
-    z = jnp.where(on, jnp.maximum(z, 0), jnp.where(sides.equality, z, 0))
-    m = jnp.where(sides.hinge, jnp.maximum(sides.v + sides.W * t - z, 0), 0)
-    same = jnp.all(held == guess.held) & jnp.all(violated == guess.over)
-    left = jnp.where(same, 0, guess.left - 1)
-    at = Iterate(method.joined(x, p, z, s, t, m), one, one)
-    return at, Guess(held, violated, left)
-
-
-def minimise(
-    method: Method, guess: Guess | None, max_steps: int, refinements: int
-) -> Outcome:
-    """Run the method, from guesses of the active sides, or from its own start."""
+def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> Outcome:
+    """Try a guess of the active sides and what follows from it; then, if none of them
+    gives the solution, run the method from its own start."""
     sides, dtype = method.sides, method.form.q.dtype
     count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
     rounding = jnp.finfo(dtype).eps
@@ -255,8 +208,7 @@ def minimise(
         at, left, best, known, k, since, passes, begun_yet, guess = carry
         guessing = guess.left > 0
         first, before = ~begun_yet & ~guessing, left.linear
-        # An active set asks for more digits than a step.
-        now = jnp.where(guessing, 1 + refinements, passes)
+        now = jnp.where(guessing, PASSES, passes)
         steps = direction(method, at, left, first, guess, count, now)
         d, length, share, along = steps
         moved = jax.tree.map(lambda a, d: a + length * d, at, d)
@@ -293,8 +245,6 @@ def minimise(
     left = jax.tree.map(
         lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(evaluated, method, at)
     )
-    if guess is None:
-        guess = Guess(none > 0, none > 0, jnp.zeros((), int))
     known = left.measured, jnp.full(3, jnp.inf, dtype), left.gains
     no = jnp.asarray(False)
     passes = jnp.ones((), int)
