@@ -37,6 +37,7 @@ from ._sqp_model import (
 
 
 HALVINGS = 12
+WIDTH = float(__import__('os').environ.get('WIDTH','10000'))
 MEMORY = 4
 LEAST_SHARE = 1e-4
 FIRST_PRICE = 1e1
@@ -154,17 +155,19 @@ def iterate(problem: Problem, start: Iterate, options: Options) -> Progress:
     tolerances = Tolerances(tight, tight, jnp.asarray(1e-6, dtype))
 
     def program(now: Progress, model: Model):
-        level, convex = convex_cost(problem, shape, now.at, model, now.mu)
+        level, delta, convex = convex_cost(
+            problem, shape, now.at, model, now.mu, now.weights[1]
+        )
         form = form_of(problem, shape, now.at, model, convex, now.price)
         scaled, scaling = form.equilibrated()
         sides = form.sides(), scaled.sides()
         method = Method(form, scaled, scaling, *sides, tolerances)
         guess = warm(method, jnp.zeros_like(form.q), now.at.sides)
-        left = jnp.where(now.iterations > 0, 3, 0)
+        left = jnp.where(now.iterations > 0, 4, 2)
         out = minimise(method, guess._replace(left=left), 60, 2)
         dx = out.x
         p = out.p - jnp.einsum("tij,tj->ti", convex.P, dx[:, :n]) - convex.s
-        return dx, p, out.z, out.errors, out.iterations, convex, level
+        return dx, p, out.z, out.errors, out.iterations, convex, level, delta
 
     def body(now: Progress) -> Progress:
         at = now.at
@@ -196,28 +199,18 @@ def iterate(problem: Problem, start: Iterate, options: Options) -> Progress:
     def step(now: Progress, model: Model) -> Progress:
         at = now.at
         here = measures(shape, model.values)
-        dz, p, z, errors, inner, convex, level = program(now, model)
+        dz, p, z, errors, inner, convex, level, delta = program(now, model)
         dx, du = dz[:, :n], dz[:-1, n:]
         usable = jnp.all(jnp.isfinite(dz)) & (errors[0] <= 1e3)
-        # The weights of the merit function are above the multipliers.
-        size = shape.equal.shape[1]
-        rows = z.shape[2]
-        y = jnp.max(jnp.abs(z[..., rows - size :]), initial=0)
-        needed = jnp.stack([jnp.max(jnp.abs(p)), y])
-        weights = jnp.where(
-            usable & (now.weights < 1.1 * needed), 1.5 * needed, now.weights
-        )
         # How far the linearised constraints are from holding.
         c = model.values.c + jnp.einsum("tpi,ti->tp", model.G, dz)
         left = jnp.sum(broken(shape, model.values._replace(c=c)))
-        down = jnp.sum(model.h * dz) - weights[0] * here[1]
-        down = down + weights[1] * (left - here[2])
         # The funnel.
         infeasible = here[1] + here[2]
         width = jnp.where(
             jnp.isfinite(now.weights[0]) & (now.iterations > 0) & (now.weights[0] > 0),
             now.weights[0],
-            jnp.maximum(1.0, 15 * infeasible),
+            jnp.maximum(WIDTH, 15 * infeasible),
         )
         decrease = -jnp.sum(model.h * dz)
         slack = 10 * eps * jnp.abs(here[0])
@@ -270,11 +263,11 @@ def iterate(problem: Problem, start: Iterate, options: Options) -> Progress:
         count = now.iterations + 1
         result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
         if DEBUG:
-            jax.debug.print("{k} J {J:.6g} d {d:.2g} v {v:.2g} left {l:.2g} | its {i} err {e} | len {len} price {p:.2g} w {w} mu {mu:.1g} shift {sh:.1g} {lev}", lev=level, k=now.iterations, J=here[0], d=here[1], v=here[2], l=left, i=inner, e=errors, len=length, p=now.price, w=weights, mu=now.mu, sh=convex.shift)
+            jax.debug.print("{k} J {J:.6g} d {d:.2g} v {v:.2g} left {l:.2g} | its {i} err {e} | len {len} price {p:.2g} w {w} mu {mu:.1g} shift {sh:.1g} {lev}", lev=level, k=now.iterations, J=here[0], d=here[1], v=here[2], l=left, i=inner, e=errors, len=length, p=now.price, w=width, mu=now.mu, sh=convex.shift)
         return now._replace(
             at=after,
             price=price_next,
-            weights=jnp.stack([jnp.where(accepted, narrowed, width), y]),
+            weights=jnp.stack([jnp.where(accepted, narrowed, width), jnp.where(delta > 0, delta, now.weights[1])]),
             mu=mu,
             gains=convex.K,
             iterations=count,

@@ -193,45 +193,53 @@ class Convex(NamedTuple):
     shift: Array  # the largest that was added to a pivot
 
 
-def convex_cost(problem: Problem, shape: Shape, at: Iterate, model: Model, mu: Array):
+def convex_cost(
+    problem: Problem, shape: Shape, at: Iterate, model: Model, mu: Array, last: Array
+):
     """The convex cost of the Lagrangian; with the squares of the constraints that hold
-    with equality where it is not convex along the dynamics alone; that of the cost
-    where it is not convex along both."""
+    with equality where it is not convex along the dynamics alone; and with a multiple
+    of the identity where it is not convex along both.
+
+    Source: Waechter and Biegler, 2006 (how the multiple is found).
+    """
     held, target = _held(problem, shape, at, model)
+    N = model.h.shape[1]
+    eye = jnp.eye(N, dtype=model.h.dtype)
+    rows, size = held.shape[1], shape.equal.shape[1]
+    first, _ = shape.bounded
+    own, general = held[:, : rows - size], held[:, rows - size :]
+    norm = jnp.sum(model.G**2, axis=2)
+    general = general / jnp.where(norm > 0, norm, 1)
+    pad = (0, 0), (first, N - first - own.shape[1])
+    added = jnp.pad(own, pad)[:, :, None] * eye
+    added = added + jnp.einsum("tpi,tp,tpj->tij", model.G, general, model.G)
+    pulled = jnp.pad(own * target[:, : rows - size], pad)
+    pulled = pulled + jnp.einsum(
+        "tpi,tp->ti", model.G, general * target[:, rows - size :]
+    )
+    largest = jnp.max(jnp.abs(model.H))
+    least = 1e-4 * largest
 
     def again(carry):
-        k, _ = carry
-        H = lax.cond(k <= 1, lambda: model.H, lambda: _projected(model.H))
-        sigma = jnp.where(k == 1, _STIFF * jnp.max(jnp.abs(model.H)), 0)
-        rows, size = held.shape[1], shape.equal.shape[1]
-        first, last = shape.bounded
-        own, general = held[:, : rows - size], held[:, rows - size :]
-        norm = jnp.sum(model.G**2, axis=2)
-        general = general / jnp.where(norm > 0, norm, 1)
-        wanted = target[:, : rows - size], target[:, rows - size :]
-        pad = (0, 0), (first, model.h.shape[1] - last)
-        diagonal = jnp.pad(own, pad)
-        eye = jnp.eye(model.h.shape[1], dtype=H.dtype)
-        added = diagonal[:, :, None] * eye
-        added = added + jnp.einsum("tpi,tp,tpj->tij", model.G, general, model.G)
-        pulled = jnp.pad(own * wanted[0], pad)
-        pulled = pulled + jnp.einsum("tpi,tp->ti", model.G, general * wanted[1])
-        stiff = model._replace(H=H + sigma * added, h=model.h - sigma * pulled)
-        return k + 1, made_convex(stiff, mu)
+        k, delta, _ = carry
+        sigma = jnp.where(k > 0, _STIFF * largest, 0)
+        stiff = model._replace(
+            H=model.H + sigma * added + delta * eye, h=model.h - sigma * pulled
+        )
+        found = made_convex(stiff, mu)
+        wanted = jnp.where(last > 0, jnp.maximum(least, last / 3), least)
+        more = jnp.where(k == 0, 0, jnp.where(delta > 0, 8 * delta, wanted))
+        delta = jnp.where(found.shift > 0, more, delta)
+        return k + 1, delta, found
 
     def going(carry):
-        k, found = carry
-        return (k == 0) | ((k <= 2) & (found.shift > 0))
+        k, _, found = carry
+        return (k == 0) | ((k < 20) & (found.shift > 0))
 
     like = jax.eval_shape(made_convex, model, mu)
     nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), like)
-    return lax.while_loop(going, again, (jnp.zeros((), int), nothing))
-
-
-def _projected(H: Array) -> Array:
-    """The nearest semidefinite matrices."""
-    values, vectors = jnp.linalg.eigh(H)
-    return jnp.einsum("tik,tk,tjk->tij", vectors, jnp.maximum(values, 0), vectors)
+    begin = jnp.zeros((), int), jnp.zeros_like(mu), nothing
+    return lax.while_loop(going, again, begin)
 
 
 def _held(problem, shape: Shape, at: Iterate, model: Model):
