@@ -185,17 +185,29 @@ def test_a_batch_is_its_members():
 
 
 @needs_x64
-def test_a_solution_starts_the_next_problem_warm():
+@pytest.mark.parametrize("soft", [True, False])
+def test_a_solution_starts_the_next_problem_warm(soft):
     given = data(5)
     problem = lambda start: dlx.qp.Staged(
         **{k: v for k, v in given.items() if k not in ("C", "D", "low", "start")},
-        **constraints(given, False),
+        **constraints(given, soft),
         start=start,
     )
     cold = dlx.qp.solve(problem(given["start"]))
     warm = dlx.qp.solve(problem(given["start"]), start=cold)
-    assert warm.iterations < cold.iterations
+    # The sides that are active are known: one linear system.
+    assert warm.iterations == 1 < cold.iterations
     assert_close(warm.u, cold.u, atol=1e-6)
+    # A few of them change, near it and in the program without a start.
+    near = problem(1.05 * given["start"])
+    moved, anew = dlx.qp.solve(near, start=cold), dlx.qp.solve(near)
+    assert moved.iterations <= anew.iterations <= 5
+    assert_close(moved.u, anew.u, atol=1e-6)
+    # Where too many change, the method begins anew.
+    far = problem(-given["start"])
+    moved, anew = dlx.qp.solve(far, start=cold), dlx.qp.solve(far)
+    assert moved.result == anew.result == dlx.RESULTS.successful
+    assert_close(moved.u, anew.u, atol=1e-6)
     lost = jax.tree.map(lambda a: a * np.nan, cold.x)
     ignored = dlx.qp.solve(
         problem(given["start"]), start=eqx.tree_at(lambda s: s.x, cold, lost)

@@ -16,9 +16,10 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from .._jax import by_lanes, nan_tangent
-from .._typing import Array, BoolScalar
+from .._typing import Array
 from ..math._linear_solve import full_precision
-from ._embedding import Iterate, Method, Outcome, Tolerances
+from ._active_set import Guess, GUESSES
+from ._embedding import Method, Outcome, Tolerances
 from ._form import AbstractForm, both, Sides, signed
 from ._interior_point import assembled, minimise, solved
 
@@ -27,8 +28,6 @@ _CLEAR = 1e3
 """Of a multiplier and its slack, one is this many times the other where it is clear
 whether the side is active, in the scaled problem; both are alike where it is not."""
 _PASSES = 4
-_OFF = 1e-1
-"""How far a start is moved off its bounds, in the scaled problem."""
 
 
 class Options(eqx.Module):
@@ -49,26 +48,24 @@ def _run(form: AbstractForm, options: Options) -> Outcome:
     scaled, scaling = form.equilibrated()
     sides = form.sides(), scaled.sides()
     method = Method(form, scaled, scaling, *sides, options.tolerances)
-    start = None if options.start is None else warm(method, *options.start)
-    return minimise(method, start, options.max_steps, options.refinements)
+    none = jnp.zeros_like(method.sides.h, bool)
+    guess = Guess(none, none, jnp.asarray(GUESSES))
+    if options.start is not None:
+        x, _, z = options.start
+        guess = warm(method, x, z)
+    return minimise(method, guess, options.max_steps, options.refinements)
 
 
-def warm(method: Method, x: Array, p: Array, z: Array) -> tuple[Iterate, BoolScalar]:
-    """A start near a point, moved off the bounds; and whether the point is of use."""
-    D, E, R, c = method.scaling
+def warm(method: Method, x: Array, z: Array) -> Guess:
+    """The sides that are active at a point; none where it is not finite."""
+    D, _, R, c = method.scaling
     sides = method.sides
-    usable = jnp.stack([jnp.all(jnp.isfinite(a)) for a in (x, p, z)]).all()
-    x, p, z = (jnp.where(usable, a, 0) for a in (x / D, p * c / E, z * c / R))
+    usable = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(z))
+    x, z = (jnp.where(usable, a, 0) for a in (x / D, z * c / R))
     slack = sides.h - both(method.scaled.rows(x))
-    # So far off the bounds the method can take long steps.
-    off = jnp.asarray(_OFF, x.dtype)
-    t = jnp.where(sides.soft, jnp.maximum(-slack, off), 0)
-    m = jnp.maximum(sides.v + sides.W * t - z, off)
-    m = jnp.where(sides.hinge, m, 0)
-    s = jnp.where(sides.inequality, jnp.maximum(slack + t, off), 0)
-    inside = jnp.maximum(z, off)
-    z = jnp.where(sides.inequality, inside, jnp.where(sides.equality, z, 0))
-    return Iterate(method.joined(x, p, z, s, t, m), jnp.ones_like(off), off), usable
+    active = sides.inequality & (z > slack)
+    over = active & sides.soft & (-slack > sides.v - z) & (slack < 0)
+    return Guess(active & ~over, over, jnp.asarray(GUESSES))
 
 
 @eqx.filter_custom_jvp

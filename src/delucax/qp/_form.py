@@ -97,6 +97,9 @@ class AbstractForm(eqx.Module):
         bounds = jnp.stack([self.upper, -self.lower])
         finite = jnp.isfinite(bounds)
         equal = finite[0] & (self.lower == self.upper)
+        if self.soft is not None:
+            # A soft equation may be violated on either side, each with its price.
+            equal = equal & ~_are_soft(*self.soft)[0]
         # An equation stands once, at the upper side.
         equality = jnp.stack([equal, jnp.zeros_like(equal)])
         inequality = finite & ~equal
@@ -105,7 +108,7 @@ class AbstractForm(eqx.Module):
             none = jnp.zeros_like(finite)
             return Sides(h, inequality, equality, none, none, *(2 * (0 * h,)))
         v, W = self.soft
-        soft = jnp.isfinite(v) & jnp.isfinite(W) & inequality
+        soft = _are_soft(v, W) & inequality
         v, W = jnp.where(soft, v, 0), jnp.where(soft, W, 0)
         return Sides(h, inequality, equality, soft, soft & (v > 0), v, W)
 
@@ -117,6 +120,10 @@ class AbstractForm(eqx.Module):
         sides = self.sides()
         t = jnp.where(sides.soft, jnp.maximum(both(self.rows(x)) - sides.h, 0), 0)
         return cost + jnp.sum(t * (sides.v + sides.W * t / 2))
+
+
+def _are_soft(v: Array, W: Array) -> Array:
+    return jnp.isfinite(v) & jnp.isfinite(W)
 
 
 def both(row: Array) -> Array:

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._typing import Array, BoolScalar
+from .._typing import Array
+from ._active_set import Guess, PASSES, tried
 from ._embedding import evaluated, Iterate, Method, Outcome, Residuals
 from ._form import AbstractForm, both, Sides, signed
 
@@ -78,11 +79,13 @@ def solved(form, sides: Sides, system: System, right, passes: Array | int):
     return lax.fori_loop(0, passes, refine, start)[0]
 
 
-def direction(method: Method, at: Iterate, left: Residuals, first, count, passes):
+def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, passes):
     """Mehrotra's step: the direction, its length, the share of the residuals that it
     aims to remove, and the direction of tau."""
     form, sides, is_soft = method.scaled, method.sides, method.is_soft
     inequality, hinge = sides.inequality, sides.hinge
+    guessing = guess.left > 0
+    first = first | guessing
     x, _, z, s, t, m = method.apart(at.v)
     z, s = (jnp.where(inequality & ~first, a, 1) for a in (z, s))
     barrier = jnp.where(inequality, s / z, 0)
@@ -94,7 +97,17 @@ def direction(method: Method, at: Iterate, left: Residuals, first, count, passes
         stay = m / t_or_1
         stiffness = jnp.where(sides.soft, sides.W + stay, 1)
         e = jnp.where(sides.soft & ~first, 1 / stiffness, 0)
-    system = assembled(form, sides, barrier + e)
+    taken, compliance = guess.sides(sides)
+    either = lambda a, b: jnp.where(guessing, a, b)
+    now = sides._replace(
+        inequality=either(taken.inequality, sides.inequality),
+        equality=either(taken.equality, sides.equality),
+    )
+    compliance = either(compliance, barrier + e)
+    pushed = jnp.where(guessing, guess.pushed(sides), 0)
+    system = assembled(form, now, compliance)
+    begin_x = -form.q - form.rows_transposed(signed(pushed))
+    begin_z = sides.h - jnp.where(guessing, sides.v * compliance, 0)
     tau, kappa = at.tau, at.kappa
     weights = method.joined(
         form.q + 2 * left.Hx / tau,
@@ -117,9 +130,9 @@ def direction(method: Method, at: Iterate, left: Residuals, first, count, passes
         r = r - rs / z
         if is_soft:
             rm = rm / t_or_1
-            r = r + e * (rt + rm)
-        lines = x, p, jnp.where(sides.active, r, 0)
-        dx, dp, dz = solved(form, sides, system, lines, passes)
+            r = r + jnp.where(guessing, 0, e * (rt + rm))
+        lines = x, p, jnp.where(now.active, r, 0)
+        dx, dp, dz = solved(form, now, system, lines, passes)
         ds = jnp.where(inequality, rs / z - barrier * dz, 0)
         if not is_soft:
             return method.joined(dx, dp, dz, ds)
@@ -135,9 +148,9 @@ def direction(method: Method, at: Iterate, left: Residuals, first, count, passes
         share, aim = 1 - sigma, sigma * left.products / count
         pick = lambda a, b: jnp.where(is_tau, a, b)
         lines = (
-            pick(-form.q, -share * left.x),
+            pick(begin_x, -share * left.x),
             pick(form.f, -share * left.p),
-            pick(sides.h, -share * left.z),
+            pick(begin_z, -share * left.z),
         )
         _, _, dz, ds, dt, dm = method.apart(d.v)
         rs = jnp.where(inequality & ~is_tau, aim - s * z - ds * dz, 0)
@@ -167,7 +180,9 @@ def direction(method: Method, at: Iterate, left: Residuals, first, count, passes
     none = jnp.zeros_like(at.v)
     nothing = jnp.zeros((), z.dtype)
     start = none, Iterate(none, nothing, nothing), nothing, nothing
-    along, d, sigma, length = lax.fori_loop(0, 3, turn, start)
+    # A start needs the first one alone.
+    turns = jnp.where(first, 1, 3)
+    along, d, sigma, length = lax.fori_loop(0, turns, turn, start)
     return d, jnp.minimum(_TO_BOUNDARY * length, 1), 1 - sigma, along
 
 
@@ -182,28 +197,29 @@ def begun(method: Method, along: Array) -> Iterate:
     return Iterate(method.joined(x, p, z, s, t, m), one, one)
 
 
-def minimise(
-    method: Method,
-    start: tuple[Iterate, BoolScalar] | None,
-    max_steps: int,
-    refinements: int,
-) -> Outcome:
-    """Run the method, from a start or from its own."""
+def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> Outcome:
+    """Try a guess of the active sides and what follows from it; then, if none of them
+    gives the solution, run the method from its own start."""
     sides, dtype = method.sides, method.form.q.dtype
     count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
     rounding = jnp.finfo(dtype).eps
 
     def body(carry):
-        at, left, best, known, k, since, passes = carry
-        first, before = k == 0, left.linear
-        d, length, share, along = direction(method, at, left, first, count, passes)
+        at, left, best, known, k, since, passes, begun_yet, guess = carry
+        guessing = guess.left > 0
+        first, before = ~begun_yet & ~guessing, left.linear
+        now = jnp.where(guessing, PASSES, passes)
+        steps = direction(method, at, left, first, guess, count, now)
+        d, length, share, along = steps
         moved = jax.tree.map(lambda a, d: a + length * d, at, d)
-        begin = begun(method, along)
-        at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, moved)
+        begin, (point, next_guess) = begun(method, along), tried(method, along, guess)
+        pick = lambda a, b, c: jnp.where(guessing, a, jnp.where(first, b, c))
+        at = jax.tree.map(pick, point, begin, moved)
         left = evaluated(method, at)
         # Where a residual is larger than it should be, rounding is: from now on the
         # linear systems are refined once more.
-        expected = jnp.where(first, jnp.inf, (1 - length * share) * before)
+        fresh = first | guessing
+        expected = jnp.where(fresh, jnp.inf, (1 - length * share) * before)
         rounded = left.linear > 1.5 * expected + _NEGLIGIBLE * at.tau
         passes = jnp.minimum(passes + rounded, 1 + refinements)
         # NaN fails the comparison.
@@ -214,28 +230,27 @@ def minimise(
         )
         # While the products fall, an error may rise for a while.
         falls = left.products > count * rounding * at.tau**2
-        since = jnp.where(better, 0, since + ~falls)
-        return at, left, best, known, k + 1, since, passes
+        since = jnp.where(better | fresh, 0, since + ~falls)
+        guess = jax.tree.map(lambda a, b: jnp.where(guessing, a, b), next_guess, guess)
+        return at, left, best, known, k + 1, since, passes, begun_yet | first, guess
 
     def going(carry):
-        _, _, _, known, k, since, _ = carry
+        _, _, _, known, k, since, *_ = carry
         return (jnp.min(known[1]) > 1) & (k < max_steps) & (since < _PATIENCE)
 
     k, one = jnp.zeros((), int), jnp.ones((), dtype)
-    if start is None:
-        none = jnp.zeros_like(sides.h)
-        zeros = jnp.zeros_like(method.form.q), jnp.zeros_like(method.form.f)
-        at = Iterate(method.joined(*zeros, none, none, none, none), one, one)
-        left = jax.tree.map(
-            lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(evaluated, method, at)
-        )
-    else:
-        # The first iteration, which finds a start, is left out.
-        at, usable = start
-        left, k = evaluated(method, at), k + usable
+    none = jnp.zeros_like(sides.h)
+    zeros = jnp.zeros_like(method.form.q), jnp.zeros_like(method.form.f)
+    at = Iterate(method.joined(*zeros, none, none, none, none), one, one)
+    left = jax.tree.map(
+        lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(evaluated, method, at)
+    )
     known = left.measured, jnp.full(3, jnp.inf, dtype), left.gains
-    carry = at, left, at, known, k, jnp.zeros((), int), jnp.ones((), int)
-    _, _, best, known, k, _, _ = lax.while_loop(going, body, carry)
+    no = jnp.asarray(False)
+    passes = jnp.ones((), int)
+    carry = at, left, at, known, k, jnp.zeros((), int), passes, no, guess
+    out = lax.while_loop(going, body, carry)
+    _, _, best, known, k, *_ = out
     return Outcome(*method.point(best), best, *known, k)
 
 

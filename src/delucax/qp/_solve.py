@@ -37,8 +37,10 @@ def solve(
 ) -> Solution:
     r"""Solve a convex quadratic program, or show that it has no solution.
 
-    By a predictor-corrector interior-point method on the homogeneous embedding, which
-    ends at a solution or at a certificate, from any start.
+    First by guesses of the active sides, each a linear system that gives the next one,
+    which solves most programs of control in a few. Else by a predictor-corrector
+    interior-point method on the homogeneous embedding, which ends at a solution or at a
+    certificate.
 
     The solution is differentiable in both modes with respect to every array of the
     problem, by the implicit function theorem: sides with positive multipliers stay
@@ -49,9 +51,10 @@ def solve(
     **Arguments:**
 
     - `problem`: a [`delucax.qp.Dense`][] or a [`delucax.qp.Staged`][].
-    - `start`: the solution of a problem of the same shapes, to start near; one that is
-        not finite is ignored. It saves iterations if the problem changed little. By
-        default the method finds its own.
+    - `start`: the solution of a problem of the same shapes, whose active sides are the
+        first guess; one that is not finite is ignored. If the problem changed little,
+        one or two iterations solve it. By default the first guess is that none is
+        active.
     - `rtol`, `atol`: each residual is at most `atol + rtol` times the size of the terms
         that cancel in it. Both are `1e-8` by default, in single precision `1e-4`.
     - `max_steps`: the most iterations.
@@ -67,7 +70,8 @@ def solve(
 
     **Raises:** `ValueError` on a wrong argument; an error at run time as `throw` says.
 
-    Source: Mehrotra, 1992; Andersen and Ye, 1999; Goulart and Chen, 2024.
+    Source: Hintermueller, Ito and Kunisch, 2002 (active sides); Mehrotra, 1992;
+    Andersen and Ye, 1999; Goulart and Chen, 2024.
 
     !!! example
 
