@@ -38,4 +38,5 @@ from ._derivatives import (
     nan_tangent as nan_tangent,
     value_and_jacobians as value_and_jacobians,
 )
+from ._loops import in_parts as in_parts
 from ._normal import normal as normal

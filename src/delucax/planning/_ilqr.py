@@ -19,11 +19,12 @@ from .._module import parameter
 from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
+from ._constraints import Constraints
 from ._descent import Options, SEARCHES
 from ._implicit import solution
 from ._plan import Plan
 from ._planner import AbstractPlanner
-from ._problem import Constraints, Problem
+from ._problem import Problem
 from ._start import Start
 
 
@@ -151,6 +152,11 @@ class ILQR(AbstractPlanner):
         where, dtype = "ILQR", start.controls.dtype
         if self.parallel and problem.bounds is not None:
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
+        if problem.constraints is not None and not problem.constraints.is_hard:
+            raise ValueError(
+                f"{where}: soft constraints, and bounds as constraints, are those of "
+                "`delucax.planning.SQP`."
+            )
         states = self.states
         if states is not None:
             n, points = problem.dynamics.state_size, start.horizon + 1

@@ -29,17 +29,27 @@ from .._results import choose, raise_on_failure, RESULTS
 from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
+from ._constraints import Constraints, worst_of
 from ._plan import Plan
-from ._problem import Constraints, Problem
+from ._problem import Problem
 from ._start import operating_point, Start
 
 
-def checked_plan(plan: Plan, where: str, throw: bool = True) -> Plan:
+def checked_plan(
+    plan: Plan, where: str, throw: bool = True, problem: Problem | None = None
+) -> Plan:
     """The plan; if `throw`, raise unless it is a solution."""
-    facts = lambda: (
-        f"After {int(plan.iterations)} iterations the cost is {float(plan.cost):.6g} "
-        f"and the residual {float(plan.residual):.2g}."
-    )
+
+    def facts():
+        words = (
+            f"After {int(plan.iterations)} iterations the cost is "
+            f"{float(plan.cost):.6g} and the residual {float(plan.residual):.2g}."
+        )
+        if problem is None or problem.constraints is None:
+            return words
+        path = plan.states, plan.controls
+        return f"{words} {worst_of(problem.constraints, problem, *path)}".rstrip()
+
     return raise_on_failure(plan, where, throw, "the plan", facts)
 
 
@@ -212,7 +222,7 @@ class AbstractPlanner(eqx.Module):
         check_instance(plan, Plan, "what solve returns", where)
         if fallback is not None:
             plan = _with_fallback(plan, fallback)
-        return checked_plan(plan, where, throw)
+        return checked_plan(plan, where, throw, problem)
 
 
 def _cast(array: Array, dtype: Any, shape: tuple[int, ...] | None = None) -> Array:

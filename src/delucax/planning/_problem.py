@@ -3,84 +3,26 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from .._jax import by_components, join_state, split_state, stack_steps
-from .._module import check_parameters, function_field
 from .._results import choose, first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._small import products_whole
+from ._constraints import Constraints, Values, values_of
 from ._plan import Plan
 
 
 _SPLIT_UP_TO = 6
 """Trajectories of more components are as fast in one piece, and a shorter program."""
-
-
-class Constraints(eqx.Module):
-    """Constraints along a plan: `inequality(t, x, u) <= 0` and
-    `equality(t, x, u) = 0` at each step, `final_inequality(t, x) <= 0` and
-    `final_equality(t, x) = 0` at the end.
-
-    Each returns a number or a vector. The constraints of a step hold at the first one
-    too, where the state is given: one on the state alone must hold there anyway. Bounds
-    on the controls alone are cheaper as `bounds` of the planner.
-
-    **Arguments:**
-
-    - `inequality`: a function of time, state and control; none by default.
-    - `equality`: likewise; none by default.
-    - `final_inequality`: a function of time and the last state; none by default.
-    - `final_equality`: likewise; none by default.
-
-    A function that is a module with [`delucax.parameter`][] fields can be
-    differentiated with respect to them.
-
-    **Raises:** `ValueError` if one is not a function, or none is given.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        slow = lambda t, x, u: jnp.abs(x[1]) - 3.0
-        upright = lambda t, x: x
-        constraints = dlx.planning.Constraints(slow, final_equality=upright)
-        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
-        cost = dlx.costs.Quadratic([0.0, 0.0], [1.0])
-        plan = dlx.planning.ilqr(
-            dynamics,
-            cost,
-            jnp.array([1.0, 0.0]),
-            jnp.zeros((20, 1)),
-            constraints=constraints,
-        )
-        plan.states[-1], plan.violation
-        ```
-    """
-
-    inequality: Callable[[Array, Array, Array], Any] | None = function_field(None)
-    equality: Callable[[Array, Array, Array], Any] | None = function_field(None)
-    final_inequality: Callable[[Array, Array], Any] | None = function_field(None)
-    final_equality: Callable[[Array, Array], Any] | None = function_field(None)
-
-    def __check_init__(self):
-        check_parameters(self)
-        if all(function is None for function in vars(self).values()):
-            raise ValueError("Constraints: at least one function must be given.")
-
-
-Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
-"""The values of constraints, inequalities first, and which are of equalities."""
 
 
 class Multipliers(NamedTuple):
@@ -89,15 +31,6 @@ class Multipliers(NamedTuple):
     stage: Array  # (T, p)
     final: Array  # (q,)
     rho: Array
-
-
-def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Values:
-    """The values of an inequality and an equality, either of which may be `None`."""
-    # Each returns a number or a vector. The sizes are static, so no mask is needed.
-    given = (jnp.zeros(0) if f is None else f(*arguments) for f in functions)
-    inequality, equality = (jnp.ravel(jnp.asarray(c, dtype)) for c in given)
-    c = jnp.concatenate([inequality, equality])
-    return c, jnp.arange(c.size) >= inequality.size
 
 
 def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:
@@ -209,14 +142,12 @@ class Problem(eqx.Module):
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
         """The values of the constraints of a step, at `t`, `x`, `u`."""
         assert self.constraints is not None
-        functions = self.constraints.inequality, self.constraints.equality
-        return values_of(functions, (t, x, u), x.dtype)
+        return values_of(self.constraints, False, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
         """The values of the constraints at the end, at `t`, `x`."""
         assert self.constraints is not None
-        functions = self.constraints.final_inequality, self.constraints.final_equality
-        return values_of(functions, (t, x), x.dtype)
+        return values_of(self.constraints, True, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
         """The values of the constraints at each step of `states` under `controls`, and

@@ -1,12 +1,12 @@
 """Sequential quadratic programming.
 
 Each iteration solves the quadratic program about the present trajectory, and takes the
-longest step of sufficient decrease of the merit function, the cost plus the weighted sum
-of all that is violated. If the program has no feasible point, its constraints are
-relaxed at a price, which rises until they hold or no price makes them hold.
+longest step that a funnel accepts: all that is violated stays within its width, and
+either the cost falls enough or the width does. If the program has no feasible point,
+its constraints may be violated at a price, which rises until they hold or no price
+makes them hold.
 
-Source: Nocedal and Wright, 2006, chapter 18; Fletcher, 1985 (relaxed constraints);
-Grippo, Lampariello and Lucidi, 1986 (the merit need not fall at once).
+Source: Kiessling, Leyffer and Vanaret, 2024 (the funnel); Fletcher, 1985 (the price).
 """
 
 from typing import Any, NamedTuple
@@ -16,34 +16,43 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .._jax import in_parts
 from .._results import choose, Result, RESULTS
 from .._typing import Array
 from ..qp._derivatives import warm
-from ..qp._embedding import Method, Tolerances
+from ..qp._embedding import Method, Outcome as Solved, Tolerances
 from ..qp._interior_point import minimise
+from ..qp._staged import StagedForm
+from ._convex import Convex, convexified, Held, held_rows, made_convex, Weights
+from ._descent import first_accepted
 from ._problem import Problem
-from ._sqp_model import (
-    evaluated,
+from ._start import Start
+from ._transcription import (
+    empty_model,
     expanded,
-    form_of,
     Iterate,
+    Limits,
     limits_of,
-    convex_cost,
+    measured,
     Model,
-    Shape,
-    shape_of,
-    Values,
 )
 
 
 HALVINGS = 12
-WIDTH = float(__import__('os').environ.get('WIDTH','10000'))
-MEMORY = 4
 LEAST_SHARE = 1e-4
-FIRST_PRICE = 1e1
+"""Of the predicted decrease, the share that the cost falls by (Armijo)."""
+WIDTH, TIMES = 1e4, 15.0
+"""The first width of the funnel, or so many times what is violated at first."""
+SHRINK = 0.9
+NARROW = 0.9
+SWITCH = 1e-3
+"""Where the predicted decrease is so much of what is violated, the cost must fall."""
+FIRST_PRICE = 10.0
 MOST_PRICE = 1e9
-import os
-DEBUG = bool(os.environ.get('SQPDEBUG'))
+GUESSES = 4
+MAX_STEPS = 60
+FIRM = 1e6
+"""The weight of the held rows in the gains, over the largest entry of the Hessian."""
 
 
 class Options(eqx.Module):
@@ -51,230 +60,280 @@ class Options(eqx.Module):
 
     tolerance: Array
     constraint_tolerance: Array
+    states: Array | None
     second_order: bool = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
 
 
-class Progress(NamedTuple):
-    """The state of the loop."""
+class Outcome(NamedTuple):
+    """The last iterate with its status."""
 
     at: Iterate
-    price: Array  # of a violation in the program; infinite while none is allowed
-    weights: Array  # of the merit function: of defects, and of constraints
-    memory: Array  # (MEMORY, 3): cost, defects and violations of the last iterates
-    mu: Array
-    trace: Array
     gains: Array
+    trace: Array
     residual: Array
     violation: Array
-    iterations: Array
-    inner: Array
-    tried: Array
     result: Result
+    iterations: Array
+    rollouts: Array
+    regularisation: Array
+
+
+class _Progress(NamedTuple):
+    """The state of the loop."""
+
+    now: Outcome
+    model: Model
+    price: Array
+    """Of a violation in the program; infinite while there is none to pay."""
+    width: Array
+    """Of the funnel."""
+    shift: Array
+    """The multiple of the identity that was last added to a Hessian."""
     done: Array
 
 
-def broken(shape: Shape, values: Values) -> Array:
-    """By how much each constraint is violated, `(T+1, p)`."""
-    c = jnp.where(shape.equal, jnp.abs(values.c), jnp.maximum(values.c, 0))
-    return jnp.where(shape.given, c, 0)
+def rows_left(limits: Limits, rows: Array) -> tuple[Array, Array]:
+    """The bounds of a change of the rows."""
+    return limits.low - rows, limits.high - rows
 
 
-def measures(shape: Shape, values: Values) -> Array:
-    """The cost, the sum of the defects, and that of the violations."""
-    parts = (
-        values.cost,
-        jnp.sum(jnp.abs(values.defects)),
-        jnp.sum(broken(shape, values)),
-    )
-    return jnp.stack(parts)
+def form_of(
+    limits: Limits, model: Model, convex: Convex, low: Array, high: Array, price: Array
+) -> StagedForm:
+    """The program, whose hard constraints may be violated at a finite price; hard
+    bounds of controls may not."""
+    soft, (_, rows) = None, low.shape
+    index = jnp.arange(rows)
+    elastic = (index < limits.states) | (index >= limits.own)
+    if rows > limits.own or limits.states or limits.is_soft:
+        hard = limits.hard
+        v = jnp.where(hard & elastic, price, limits.linear)
+        W = jnp.where(hard & elastic & jnp.isfinite(price), 0, limits.quadratic)
+        soft = jnp.stack([v, v]), jnp.stack([W, W])
+    given: Any = convex.H, convex.h, model.F, model.values.defects, model.G
+    return StagedForm(*given, low, high, soft, limits.bounded, False)
 
 
-def conditions(problem, shape: Shape, at: Iterate, model: Model):
-    """The largest entry of the gradient of the Lagrangian, and of all that is violated
-    or not complementary; and each over what is allowed at a tolerance of one."""
-    n = at.states.shape[1]
-    low, high = limits_of(problem, shape, at, model.values.c)
+def infeasibility(limits: Limits, values: Any) -> Array:
+    """The sum of all that is violated."""
+    broken = jnp.sum(limits.broken(values.rows))
+    return jnp.sum(jnp.abs(values.defects)) + broken
+
+
+def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
+    """The largest entry of the gradient of the Lagrangian; the largest error of all
+    conditions but the constraints, over what is allowed at a tolerance of one; and the
+    largest violation."""
+    n, rows = at.states.shape[1], model.values.rows
     p, z = at.costates, at.sides[0] - at.sides[1]
-    size = shape.equal.shape[1]
-    rows = z.shape[1]
-    pulled = jnp.pad(
-        jnp.einsum("tij,ti->tj", model.F, p[1:]), ((0, 1), (0, 0))
-    )
-    first, last = shape.bounded
-    pushed = jnp.einsum("tpi,tp->ti", model.G, z[:, rows - size :])
-    pushed = pushed.at[:, first:last].add(z[:, : last - first])
-    gradient = model.h - pulled + pushed
-    gradient = gradient.at[:, :n].add(p)
+    first, last = limits.bounded
+    pulled = jnp.pad(jnp.einsum("tij,ti->tj", model.F, p[1:]), ((0, 1), (0, 0)))
+    pushed = jnp.einsum("tpi,tp->ti", model.G, z[:, limits.own :])
+    pushed = pushed.at[:, first:last].add(z[:, : limits.own])
+    gradient = (model.h - pulled + pushed).at[:, :n].add(p)
     # The last control stands for nothing.
-    gradient = gradient.at[-1, n:].set(0)
-    terms = jnp.maximum(jnp.max(jnp.abs(model.h)), jnp.max(jnp.abs(pulled)))
-    slope = jnp.max(jnp.abs(gradient))
-    slack = jnp.stack([high, -low])
-    finite = jnp.isfinite(slack)
-    slack = jnp.where(finite, slack, 0)
-    product = jnp.max(jnp.maximum(slack, 0) * at.sides, initial=0)
+    slope = jnp.max(jnp.abs(gradient.at[-1, n:].set(0)))
+    scale = 1 + jnp.maximum(jnp.max(jnp.abs(model.h)), jnp.max(jnp.abs(pulled)))
+    # A multiplier is zero where there is slack, and the price of what is violated.
+    slack = jnp.stack([limits.high - rows, rows - limits.low])
+    slack = jnp.where(jnp.isfinite(slack), slack, 0)
+    products = jnp.maximum(slack, 0) * at.sides
+    over = jnp.where(limits.hard, 0, jnp.maximum(-slack, 0))
+    price = jnp.where(limits.hard, 0, limits.linear + limits.quadratic * over)
+    unpaid = over * jnp.abs(price - at.sides)
+    product = jnp.max(jnp.maximum(products, unpaid), initial=0)
     missed = jnp.max(jnp.abs(model.values.defects))
-    violation = jnp.max(broken(shape, model.values), initial=0)
-    size_x = 1 + jnp.max(jnp.abs(at.states))
-    return slope, slope / (1 + terms), product / (1 + terms), missed / size_x, violation
+    missed = missed / (1 + jnp.max(jnp.abs(at.states)))
+    error = jnp.maximum(jnp.maximum(slope, product) / scale, missed)
+    return slope, error, jnp.max(limits.broken(rows), initial=0)
 
 
-def choose_(ok, a, b):
-    pick = lambda a, b: jnp.where(ok, a, b) if eqx.is_array(a) else a
-    result = choose(ok, a.result, b.result)
-    picked = jax.tree.map(pick, a._replace(result=None), b._replace(result=None))
-    return picked._replace(result=result)
+def solved(
+    form: StagedForm, at: Iterate, guesses: Array | int, tolerance: Array
+) -> Solved:
+    """The solution of the program; the first guess of its active sides is that of the
+    multipliers."""
+    scaled, scaling = form.equilibrated()
+    certificate = jnp.asarray(1e-6, form.q.dtype)
+    tolerances = Tolerances(tolerance, tolerance, certificate)
+    method = Method(form, scaled, scaling, form.sides(), scaled.sides(), tolerances)
+    guess = warm(method, jnp.zeros_like(form.q), at.sides)
+    left = jnp.asarray(guesses, guess.left.dtype)
+    return minimise(method, guess._replace(left=left), MAX_STEPS, 2)
 
 
-def iterate(problem: Problem, start: Iterate, options: Options) -> Progress:
+def curved(limits: Limits, at: Iterate, model: Model) -> Held:
+    """The rows that are held at an iterate."""
+    return held_rows(limits, at.sides, *rows_left(limits, model.values.rows))
+
+
+def gains_of(limits: Limits, at: Iterate, model: Model) -> Array:
+    """Feedback for small deviations, `u = u_planned - K (x - x_planned)`, that keeps
+    the rows that are held."""
+    zero = jnp.zeros((), model.h.dtype)
+    firm = FIRM * jnp.max(jnp.abs(model.H))
+    return made_convex(
+        limits, model, curved(limits, at, model), Weights(firm, zero, zero)
+    ).K
+
+
+def started(
+    problem: Problem, limits: Limits, start: Start, options: Options
+) -> Iterate:
+    """The trajectory to start from. That of the controls may run away, and then violate
+    the constraints by more than the steps miss each other where the first state is
+    held: of the two, the one that violates less."""
+    _, states, controls, cost = start.cheapest(problem)
+    T, n = controls.shape[0], problem.x0.shape[0]
+    controls = _clipped(limits, controls)
+    if options.states is not None:
+        states = options.states.at[0].set(problem.x0)
+    else:
+        still = jnp.broadcast_to(problem.x0, (T + 1, n))
+        bad = lax.map(
+            lambda x: infeasibility(limits, measured(problem, limits, x, controls)),
+            jnp.stack([states, still]),
+        )
+        lost = ~jnp.isfinite(cost) | ~(bad[0] <= bad[1])
+        states = jnp.where(lost, still, states)
+    sides = jnp.zeros((2, *limits.low.shape), controls.dtype)
+    return Iterate(states, controls, jnp.zeros_like(states), sides)
+
+
+def _clipped(limits: Limits, controls: Array) -> Array:
+    ends = limits.ends()
+    return controls if ends is None else jnp.clip(controls, *ends)
+
+
+def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
     """Iterate from a trajectory to a solution."""
-    T, m = start.controls.shape
-    n, dtype = start.states.shape[1], start.states.dtype
-    shape = shape_of(problem, T)
-    zero = jnp.zeros((), dtype)
-    infinite = jnp.full((), jnp.inf, dtype)
-    first = Progress(
-        at=start,
-        price=infinite,
-        weights=jnp.zeros(2, dtype),
-        memory=jnp.full((MEMORY, 3), -jnp.inf, dtype),
-        mu=zero,
-        trace=jnp.zeros(options.max_iterations + 1, dtype),
+    limits = limits_of(problem, start.horizon)
+    at = started(problem, limits, start, options)
+    (T, m), n, dtype = at.controls.shape, at.states.shape[1], at.states.dtype
+    eps = float(jnp.finfo(dtype).eps)
+    zero, infinite = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
+    nothing = empty_model(limits, at)
+    now = Outcome(
+        at=at,
         gains=jnp.zeros((T, m, n), dtype),
+        trace=jnp.zeros(options.max_iterations + 1, dtype),
         residual=infinite,
         violation=infinite,
-        iterations=jnp.zeros((), int),
-        inner=jnp.zeros((), int),
-        tried=jnp.zeros((), int),
         result=RESULTS.not_converged,
-        done=jnp.asarray(False),
+        iterations=jnp.zeros((), int),
+        rollouts=jnp.zeros((), int),
+        regularisation=zero,
     )
-    eps = jnp.finfo(dtype).eps
-    tight = jnp.asarray(eps**0.5 * 1e-1, dtype)
-    tolerances = Tolerances(tight, tight, jnp.asarray(1e-6, dtype))
+    first = _Progress(now, nothing, infinite, infinite, zero, jnp.asarray(False))
 
-    def program(now: Progress, model: Model):
-        level, delta, convex = convex_cost(
-            problem, shape, now.at, model, now.mu, now.weights[1]
-        )
-        form = form_of(problem, shape, now.at, model, convex, now.price)
-        scaled, scaling = form.equilibrated()
-        sides = form.sides(), scaled.sides()
-        method = Method(form, scaled, scaling, *sides, tolerances)
-        guess = warm(method, jnp.zeros_like(form.q), now.at.sides)
-        left = jnp.where(now.iterations > 0, 4, 2)
-        out = minimise(method, guess._replace(left=left), 60, 2)
-        dx = out.x
-        p = out.p - jnp.einsum("tij,tj->ti", convex.P, dx[:, :n]) - convex.s
-        return dx, p, out.z, out.errors, out.iterations, convex, level, delta
-
-    def body(now: Progress) -> Progress:
-        at = now.at
-        model = expanded(problem, shape, at, options.second_order)
-        slope, *errors, violation = conditions(problem, shape, at, model)
-        errors = jnp.max(jnp.stack(errors))
+    def body(before: _Progress) -> _Progress:
+        now = before.now
+        model = expanded(problem, limits, now.at, options.second_order)
+        slope, error, violation = optimality(limits, now.at, model)
         feasible = violation <= options.constraint_tolerance
-        settled = errors <= options.tolerance
-        converged = settled & feasible
-        # At a stationary point of the relaxed problem the price was too low.
-        scale = 1 + jnp.max(jnp.abs(model.h))
-        price = jnp.where(settled & ~feasible, 10 * now.price, now.price)
-        hopeless = jnp.isfinite(price) & (price > MOST_PRICE * scale)
-        trace = now.trace.at[now.iterations].set(model.values.cost)
-        now = now._replace(trace=trace, residual=slope, violation=violation)
-        now = now._replace(price=price, done=hopeless)
-        now = now._replace(result=choose(hopeless, RESULTS.infeasible, now.result))
-        finished = now._replace(
-            done=jnp.asarray(True), result=RESULTS.successful
+        settled = error <= options.tolerance
+        # At a stationary point that is not feasible the price was too low.
+        price = jnp.where(settled & ~feasible, 10 * before.price, before.price)
+        most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
+        hopeless = jnp.isfinite(price) & (price > most)
+        lost = ~jnp.isfinite(model.values.cost) | ~jnp.isfinite(slope)
+        result = choose(settled & feasible, RESULTS.successful, now.result)
+        result = choose(hopeless, RESULTS.infeasible, result)
+        result = choose(lost, RESULTS.diverged, result)
+        now = now._replace(
+            trace=now.trace.at[now.iterations].set(model.values.cost),
+            residual=slope,
+            violation=violation,
+            result=result,
         )
-        return lax.cond(
-            converged | hopeless,
-            lambda now, _: choose_(converged, finished, now),
-            step,
-            now,
-            model,
-        )
+        ended = (settled & feasible) | hopeless | lost
+        ended = ended | (now.iterations >= options.max_iterations)
+        after = before._replace(now=now, model=model, price=price, done=ended)
+        return lax.cond(ended, lambda progress: progress, step, after)
 
-    def step(now: Progress, model: Model) -> Progress:
-        at = now.at
-        here = measures(shape, model.values)
-        dz, p, z, errors, inner, convex, level, delta = program(now, model)
+    def step(before: _Progress) -> _Progress:
+        now, model, price = before.now, before.model, before.price
+        at, values = now.at, model.values
+        low, high = rows_left(limits, values.rows)
+        held = held_rows(limits, at.sides, low, high)
+        controls = now.regularisation
+        convex, weights = convexified(limits, model, held, before.shift, controls)
+        form = form_of(limits, model, convex, low, high, price)
+        # The first multipliers are a guess without a ground.
+        guesses = jnp.where(now.iterations > 0, GUESSES, 2)
+        found = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
+        dz = found.x
         dx, du = dz[:, :n], dz[:-1, n:]
-        usable = jnp.all(jnp.isfinite(dz)) & (errors[0] <= 1e3)
-        # How far the linearised constraints are from holding.
-        c = model.values.c + jnp.einsum("tpi,ti->tp", model.G, dz)
-        left = jnp.sum(broken(shape, model.values._replace(c=c)))
-        # The funnel.
-        infeasible = here[1] + here[2]
-        width = jnp.where(
-            jnp.isfinite(now.weights[0]) & (now.iterations > 0) & (now.weights[0] > 0),
-            now.weights[0],
-            jnp.maximum(WIDTH, 15 * infeasible),
+        p = found.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
+        usable = jnp.all(jnp.isfinite(dz)) & (found.errors[0] <= 1e3)
+        impossible = ~usable & (found.errors[1] <= 1) & jnp.isinf(price)
+        # The width of the funnel, and by how much the cost should fall.
+        missed = infeasibility(limits, values)
+        first = jnp.maximum(WIDTH, TIMES * missed)
+        width = jnp.where(jnp.isfinite(before.width), before.width, first)
+        change = jnp.concatenate(
+            [
+                dz[:, limits.bounded[0] : limits.bounded[1]],
+                jnp.einsum("tpi,ti->tp", model.G, dz),
+            ],
+            axis=1,
         )
-        decrease = -jnp.sum(model.h * dz)
-        slack = 10 * eps * jnp.abs(here[0])
+        falling = limits.penalty(values.rows) - limits.penalty(values.rows + change)
+        decrease = falling - jnp.sum(model.h * dz)
+        slack = 10 * eps * jnp.abs(values.cost)
 
         def trial(i):
             length = 0.5 ** i.astype(dtype)
-            states, controls = at.states + length * dx, at.controls + length * du
-            controls = jax.vmap(problem.clip)(controls)
-            values = evaluated(problem, shape, states, controls)
-            found = measures(shape, values)
-            missed = found[1] + found[2]
-            by_cost = length * decrease >= 1e-3 * infeasible
-            falls = found[0] <= here[0] - LEAST_SHARE * length * decrease + slack
-            closes = missed <= jnp.maximum(0.9 * width, 1e-14)
-            good = (missed <= width) & jnp.where(by_cost, falls, closes)
-            good = good & jnp.all(jnp.isfinite(found))
-            narrowed = jnp.where(by_cost, width, 0.1 * missed + 0.9 * width)
-            return states, controls, good, length, narrowed
+            states = at.states + length * dx
+            controls = _clipped(limits, at.controls + length * du)
+            there = measured(problem, limits, states, controls)
+            far = infeasibility(limits, there)
+            by_cost = length * decrease >= SWITCH * missed
+            enough = values.cost - LEAST_SHARE * length * decrease + slack
+            closer = jnp.maximum(SHRINK * width, 100 * eps)
+            good = jnp.where(by_cost, there.cost <= enough, far <= closer)
+            good = good & (far <= width) & jnp.isfinite(there.cost)
+            narrow = (1 - NARROW) * far + NARROW * width
+            narrowed = jnp.where(by_cost, width, narrow)
+            return (states, controls, length, narrowed), good
 
-        def search(carry):
-            i, *_ = carry
-            return i + 1, *trial(i)
-
-        zero_ = jnp.zeros((), dtype)
-        nothing = at.states, at.controls, jnp.asarray(False), zero_, zero_
+        otherwise = at.states, at.controls, zero, width
         count = jnp.where(usable, HALVINGS, 0)
-        tried, states, controls, accepted, length, narrowed = lax.while_loop(
-            lambda carry: ~carry[3] & (carry[0] < count),
-            search,
-            (jnp.zeros((), int), *nothing),
-        )
+        tried, candidate, accepted = first_accepted(trial, count, otherwise)
+        states, controls, length, narrowed = candidate
         moved = Iterate(
             states,
             controls,
             at.costates + length * (p - at.costates),
-            at.sides + length * (z - at.sides),
+            at.sides + length * (found.z - at.sides),
         )
-        after = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), moved, at)
-        # Without a feasible point the constraints get a price; where they still do not
-        # hold, a higher one.
-        impossible = ~usable & (errors[1] <= 1) & jnp.isinf(now.price)
-        scale = 1 + jnp.max(jnp.abs(model.h))
-        price_next = jnp.where(impossible, FIRST_PRICE * scale, now.price)
+        pick = lambda new, old: jnp.where(accepted, new, old)
+        scale = jnp.max(jnp.abs(model.H))
         failed = ~accepted & ~impossible
-        mu = jnp.where(
-            failed, jnp.maximum(10 * now.mu, 1e-4 * jnp.max(jnp.abs(model.H))), 0.1 * now.mu
+        mu = now.regularisation
+        mu = jnp.where(failed, jnp.maximum(10 * mu, 1e-4 * scale), mu / 10)
+        mu = jnp.where(mu < 1e-8 * scale, 0, mu)
+        stuck = mu > 1e10 * scale
+        after = now._replace(
+            at=jax.tree.map(pick, moved, at),
+            iterations=now.iterations + 1,
+            rollouts=now.rollouts + tried,
+            regularisation=mu,
+            result=choose(stuck, RESULTS.no_descent, now.result),
         )
-        mu = jnp.where(mu < 1e-8, 0, mu)
-        stuck = mu > 1e10
-        count = now.iterations + 1
-        result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
-        if DEBUG:
-            jax.debug.print("{k} J {J:.6g} d {d:.2g} v {v:.2g} left {l:.2g} | its {i} err {e} | len {len} price {p:.2g} w {w} mu {mu:.1g} shift {sh:.1g} {lev}", lev=level, k=now.iterations, J=here[0], d=here[1], v=here[2], l=left, i=inner, e=errors, len=length, p=now.price, w=width, mu=now.mu, sh=convex.shift)
-        return now._replace(
-            at=after,
-            price=price_next,
-            weights=jnp.stack([jnp.where(accepted, narrowed, width), jnp.where(delta > 0, delta, now.weights[1])]),
-            mu=mu,
-            gains=convex.K,
-            iterations=count,
-            inner=now.inner + inner,
-            tried=now.tried + tried,
-            result=result,
-            done=stuck | (count >= options.max_iterations),
+        start = FIRST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
+        return before._replace(
+            now=after,
+            price=jnp.where(impossible, start, price),
+            width=pick(narrowed, width),
+            shift=jnp.where(weights.variables > 0, weights.variables, before.shift),
+            done=stuck,
         )
 
-    return lax.while_loop(lambda now: ~now.done, body, first)
+    out = lax.while_loop(lambda progress: ~progress.done, in_parts(body), first)
+    now = out.now
+    counts = jnp.arange(options.max_iterations + 1)
+    last = now.trace[jnp.minimum(now.iterations, options.max_iterations)]
+    trace = jnp.where(counts <= now.iterations, now.trace, last)
+    return now._replace(gains=gains_of(limits, now.at, out.model), trace=trace)

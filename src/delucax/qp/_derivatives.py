@@ -88,22 +88,37 @@ def _optimum_jvp(primals: Any, tangents: Any) -> Any:
         change,
         is_leaf=lambda leaf: leaf is None,
     )
-    *moved, unique = _change(form, change, outcome)
+    parts = Method(form, form, None, None, form.sides(), None).apart
+    _, _, *at = parts(outcome.iterate.v / outcome.iterate.tau)
+    *moved, unique = _change(form, change, outcome[:3], at)
     # Of a failed solve there is no derivative.
     ok = unique & (outcome.errors[0] <= 1)
     dx, dp, dz = (nan_tangent(d, ok) for d in moved)
     return outcome, nothing._replace(x=dx, p=dp, z=dz)
 
 
-def _change(form: AbstractForm, change: AbstractForm, outcome: Outcome):
-    """The change of `x`, `p` and `z`, and whether the solution is unique."""
+def moved_with(form: AbstractForm, change: AbstractForm, x: Array, p: Array, z: Array):
+    """The change of a solution that is known, and whether it is unique."""
+    scaled, (D, _, R, c) = form.equilibrated()
+    sides = scaled.sides()
+    over = both(scaled.rows(x / D)) - sides.h
+    pushed = z * c / R
+    t = jnp.where(sides.soft, jnp.maximum(over, 0), 0)
+    s = jnp.where(sides.inequality, jnp.maximum(t - over, 0), 0)
+    m = jnp.where(sides.hinge, jnp.maximum(sides.v + sides.W * t - pushed, 0), 0)
+    return _change(form, change, (x, p, z), (pushed, s, t, m))
+
+
+def _change(form: AbstractForm, change: AbstractForm, point: Any, at: Any):
+    """The change of `x`, `p` and `z`, and whether the solution is unique. Of the scaled
+    problem `at` are the multipliers of the sides, their slacks, the violations of soft
+    ones, and the multipliers of these."""
     scaled, scaling = form.equilibrated()
     D, E, R, c = scaling
     method = Method(form, scaled, scaling, form.sides(), scaled.sides(), None)
     sides = method.sides
-    x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in outcome[:3])
-    at = outcome.iterate
-    _, _, scaled_z, s, t, m = method.apart(at.v / at.tau)
+    x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in point)
+    scaled_z, s, t, m = at
     pressed = sides.inequality & (scaled_z > s)
     clear = _are_unlike(scaled_z, s) | ~sides.inequality
     violated = jnp.zeros_like(pressed)

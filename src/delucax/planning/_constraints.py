@@ -1,0 +1,262 @@
+"""The constraints of a plan, as a user gives them."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._check import as_float_array, is_concrete
+from .._module import as_module, check_function, function_field, parameter
+from ..qp import Soft
+
+
+class SoftConstraint(eqx.Module):
+    """A constraint that may be violated, at a cost: each of its values costs
+    `linear t + 1/2 quadratic t^2`, where `t` is by how much it is violated.
+
+    A linear weight above the multiplier that the hard constraint has makes the solution
+    meet it where it can be met (an exact penalty).
+
+    **Arguments:**
+
+    - `function`: as one of [`delucax.planning.Constraints`][].
+    - `linear`: at least 0; a number, or one for each value of the function; 0 by
+        default.
+    - `quadratic`: likewise.
+
+    **Raises:** `ValueError` on what is no function, or on a weight that is negative or
+    not finite.
+
+    Source: Kerrigan and Maciejowski, 2000.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        warm = lambda t, x, u: x[1] - 350.0
+        limit = dlx.planning.SoftConstraint(warm, linear=10.0)
+        constraints = dlx.planning.Constraints({"temperature": limit})
+        ```
+    """
+
+    function: Callable[..., Any] = function_field()
+    linear: Array = parameter(0.0)
+    quadratic: Array = parameter(0.0)
+
+    def __check_init__(self):
+        check_function(self.function, "function", "SoftConstraint")
+        for name in ("linear", "quadratic"):
+            weight = as_float_array(getattr(self, name))
+            if not is_concrete(weight):
+                continue
+            if not np.all(np.isfinite(weight) & (np.asarray(weight) >= 0)):
+                raise ValueError(
+                    f"SoftConstraint: {name} must be finite and at least 0, got "
+                    f"{weight}."
+                )
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+
+def _as_functions(value: Any) -> Any:
+    """A function, or several by their names."""
+    if isinstance(value, Mapping):
+        return {str(name): as_module(function) for name, function in value.items()}
+    return as_module(value)
+
+
+_FUNCTIONS = "inequality", "equality", "final_inequality", "final_equality"
+
+
+class Constraints(eqx.Module):
+    """Constraints along a plan: `inequality(t, x, u) <= 0` and
+    `equality(t, x, u) = 0` at each step, `final_inequality(t, x) <= 0` and
+    `final_equality(t, x) = 0` at the end, and bounds.
+
+    Each function returns a number or a vector. Several are a dictionary, whose names
+    stand in messages. The constraints of a step hold at the first one too, where the
+    state is given: one on the state alone must hold there anyway. Bounds on the
+    controls alone are cheaper as `bounds` of the planner.
+
+    **Arguments:**
+
+    - `inequality`: a function of time, state and control, a
+        [`delucax.planning.SoftConstraint`][], or a dictionary of such; none by default.
+    - `equality`: likewise; none by default.
+    - `final_inequality`: likewise, of time and the last state; none by default.
+    - `final_equality`: likewise; none by default.
+    - `states`: `(low, high)`, each a number, or of shape `(n,)` or `(T+1, n)`; or a
+        [`delucax.qp.Soft`][] of them. The first state is given, so that the first row
+        has no part. None by default.
+    - `controls`: likewise, `(m,)` or `(T, m)`. Bounds that do not vary in time are
+        better `bounds` of the planner. None by default.
+
+    Soft constraints, and the bounds `states` and `controls`, are those of
+    [`delucax.planning.SQP`][].
+
+    A function that is a module with [`delucax.parameter`][] fields can be
+    differentiated with respect to them.
+
+    **Raises:** `ValueError` if one is not a function, or none is given.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        slow = lambda t, x, u: jnp.abs(x[1]) - 3.0
+        upright = lambda t, x: x
+        constraints = dlx.planning.Constraints(slow, final_equality=upright)
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+        cost = dlx.costs.Quadratic([0.0, 0.0], [1.0])
+        plan = dlx.planning.ilqr(
+            dynamics,
+            cost,
+            jnp.array([1.0, 0.0]),
+            jnp.zeros((20, 1)),
+            constraints=constraints,
+        )
+        plan.states[-1], plan.violation
+        ```
+    """
+
+    inequality: Any = eqx.field(default=None, converter=_as_functions)
+    equality: Any = eqx.field(default=None, converter=_as_functions)
+    final_inequality: Any = eqx.field(default=None, converter=_as_functions)
+    final_equality: Any = eqx.field(default=None, converter=_as_functions)
+    states: Any = None
+    controls: Any = None
+
+    def __check_init__(self):
+        where = "Constraints"
+        if all(value is None for value in vars(self).values()):
+            raise ValueError("Constraints: at least one function must be given.")
+        for field in _FUNCTIONS:
+            for name, function in self.named(field).items():
+                check_function(function, name, where)
+        for field in ("states", "controls"):
+            value = getattr(self, field)
+            if value is None or isinstance(value, Soft):
+                continue
+            if not isinstance(value, tuple | list) or len(value) != 2:
+                raise ValueError(
+                    f"{where}: {field} must be a pair (low, high) or a "
+                    f"`delucax.qp.Soft`, got {type(value).__name__}."
+                )
+
+    def named(self, field: str) -> dict[str, Callable[..., Any]]:
+        """The functions of one field by their names.
+
+        **Arguments:** `field`: such as `"inequality"`.
+        """
+        value = getattr(self, field)
+        if value is None:
+            return {}
+        return value if isinstance(value, dict) else {field: value}
+
+    @property
+    def is_hard(self) -> bool:
+        """Whether all are hard constraints by functions."""
+        functions = [f for field in _FUNCTIONS for f in self.named(field).values()]
+        soft = any(isinstance(f, SoftConstraint) for f in functions)
+        return not soft and self.states is None and self.controls is None
+
+
+Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
+"""The values of constraints, inequalities first, and which are of equalities."""
+
+
+class Row(NamedTuple):
+    """What the values of one function have in common."""
+
+    name: str
+    size: int
+    is_equality: bool
+    weights: tuple[Any, Any] | None  # of a soft constraint
+
+
+def values_of(
+    constraints: Constraints, final: bool, arguments: tuple, dtype: Any
+) -> Values:
+    """The values of all constraints of a step, or of the end, one after the other."""
+    parts, equal = [jnp.zeros(0, dtype)], [np.zeros(0, bool)]
+    for _, function, is_equality in _each(constraints, final):
+        c = jnp.ravel(jnp.asarray(function(*arguments), dtype))
+        parts.append(c)
+        equal.append(np.full(c.size, is_equality))
+    # The sizes are static, so no mask is needed.
+    return jnp.concatenate(parts), jnp.asarray(np.concatenate(equal))
+
+
+def rows_of(constraints: Constraints, final: bool, arguments: tuple) -> list[Row]:
+    """What those values are, in their order."""
+    rows = []
+    for name, function, equal in _each(constraints, final):
+        # Sizes are static: nothing is computed.
+        like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *arguments)
+        leaves = jax.tree.leaves(like)
+        if len(leaves) != 1 or not hasattr(leaves[0], "shape"):
+            raise ValueError(
+                f"Constraints: {name} must return a number or a vector, got {like}."
+            )
+        soft = isinstance(function, SoftConstraint)
+        weights = (function.linear, function.quadratic) if soft else None
+        rows.append(Row(name, int(np.prod(leaves[0].shape)), equal, weights))
+    return rows
+
+
+def _each(constraints: Constraints, final: bool):
+    """The name of each function, the function, and whether it is an equality."""
+    start = "final_" if final else ""
+    for kind in ("inequality", "equality"):
+        for name, function in constraints.named(start + kind).items():
+            yield name, function, kind == "equality"
+
+
+def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any) -> str:
+    """In words, which constraint is violated most, by how much, and where."""
+    T, found = len(controls), []
+    times = problem.times(T)
+    stage = jax.vmap(lambda t, x, u: problem.stage_constraints(t, x, u)[0])
+    each = stage(times[:-1], states[:-1], controls)
+    last = problem.final_constraints(times[-1], states[-1])[0][None]
+    args = times[0], states[0], controls[0]
+    for final, values in ((False, each), (True, last)):
+        start = 0
+        for row in rows_of(constraints, final, args[:2] if final else args):
+            c = np.asarray(values[:, start : start + row.size])
+            start += row.size
+            if row.weights is None and row.size:
+                over = np.abs(c) if row.is_equality else np.maximum(c, 0)
+                found.append((np.nan_to_num(over, nan=np.inf), row.name, final))
+    for name, value, shown in (
+        ("states", constraints.states, states[1:]),
+        ("controls", constraints.controls, controls),
+    ):
+        if value is None or isinstance(value, Soft):
+            continue
+        low, high = (
+            np.asarray(end)[1:]
+            if name == "states" and np.ndim(end) == 2
+            else np.asarray(end)
+            for end in value
+        )
+        over = np.maximum(np.maximum(low - shown, shown - high), 0)
+        found.append((over, f"bound of {name}", False))
+    if not found:
+        return ""
+    over, name, final = max(found, key=lambda entry: entry[0].max())
+    if not over.max() > 0:
+        return ""
+    k, i = (int(j) for j in np.unravel_index(over.argmax(), over.shape))
+    k += name == "bound of states"
+    entry = f" (entry {i})" if over.shape[1] > 1 else ""
+    at = "at the end" if final else f"at stage {k}"
+    return f"The constraint `{name}`{entry} is violated most, by {over.max():.2g} {at}."

@@ -1,0 +1,169 @@
+"""A convex cost with the same minimum along linear dynamics.
+
+Where the Hessian of the Lagrangian is not convex, that of a quadratic program must be.
+The cost-to-go of the Riccati recursion, taken away from each stage and added to the one
+before, changes the cost of no trajectory, and leaves a cost of stages that is convex
+wherever the problem is convex along its dynamics.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from .._typing import Array
+from ._lq import apply, product
+from ._transcription import Limits, Model
+
+
+STIFF = 10.0
+"""The weight of the rows that hold with equality, over the largest entry of H."""
+_TRIES = 20
+
+
+class Convex(NamedTuple):
+    """The convex cost: that of the distance from the feedback `u = -k - K x`, weighted
+    by the Hessian of the controls. The costates differ by `P x + s`."""
+
+    H: Array
+    h: Array
+    P: Array  # (T+1, n, n)
+    s: Array  # (T+1, n)
+    K: Array  # (T, m, n)
+    shift: Array  # the largest that was added to a pivot
+
+
+class Held(NamedTuple):
+    """Which rows hold with equality, by their multipliers, and what their change is."""
+
+    rows: Array
+    target: Array
+
+
+class Weights(NamedTuple):
+    """What is added: of the squares of the rows that are held, of those of all
+    variables, and of those of the controls."""
+
+    rows: Array
+    variables: Array
+    controls: Array
+
+
+def held_rows(limits: Limits, sides: Array, low: Array, high: Array) -> Held:
+    """The rows that are held; `low` and `high` are the bounds of their changes."""
+    upper, lower = sides
+    at_high, at_low = upper > jnp.abs(high), lower > jnp.abs(low)
+    # A soft row that is violated is a part of the cost.
+    v = jnp.where(limits.hard, jnp.inf, limits.linear)
+    held = (at_high & (upper < v)) | (at_low & (lower < v)) | (low == high)
+    target = jnp.where(at_low, low, high)
+    return Held(held, jnp.where(held, target, 0))
+
+
+def convexified(
+    limits: Limits, model: Model, held: Held, last: Array, controls: Array
+) -> tuple[Convex, Weights]:
+    """The convex cost, and what had to be added: first nothing, then the squares of the
+    rows that are held, as of an augmented Lagrangian, then a multiple of the identity.
+
+    Source: Waechter and Biegler, 2006 (how the multiple is found, from the `last`).
+    """
+    largest = jnp.max(jnp.abs(model.H))
+    least = 1e-4 * largest
+
+    def again(carry):
+        k, weights, _ = carry
+        stiff = jnp.where(k > 0, STIFF * largest, 0)
+        weights = weights._replace(rows=stiff)
+        found = made_convex(limits, model, held, weights)
+        wanted = jnp.where(last > 0, jnp.maximum(least, last / 3), least)
+        delta = weights.variables
+        more = jnp.where(k == 0, 0, jnp.where(delta > 0, 8 * delta, wanted))
+        delta = jnp.where(found.shift > 0, more, delta)
+        return k + 1, weights._replace(variables=delta), found
+
+    def going(carry):
+        k, _, found = carry
+        return (k == 0) | ((k < _TRIES) & (found.shift > 0))
+
+    none = Weights(jnp.zeros_like(least), jnp.zeros_like(least), controls)
+    (T, n, N), dtype = model.F.shape, model.h.dtype
+    zeros = lambda *shape: jnp.zeros(shape, dtype)
+    nothing = Convex(
+        zeros(T + 1, N, N),
+        zeros(T + 1, N),
+        zeros(T + 1, n, n),
+        zeros(T + 1, n),
+        zeros(T, N - n, n),
+        zeros(),
+    )
+    _, weights, convex = lax.while_loop(
+        going, again, (jnp.zeros((), int), none, nothing)
+    )
+    return convex, weights
+
+
+def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> Convex:
+    """The convex cost, the Hessian of the controls made definite at the expense of its
+    directions of negative curvature.
+
+    Source: Verschueren et al., 2017 (the idea); Gill and Murray, 1974 (the pivots).
+    """
+    (_, n, N), dtype = model.F.shape, model.h.dtype
+    first, last = limits.bounded
+    eye = jnp.eye(N, dtype=dtype)
+    own, general = jnp.split(held.rows.astype(dtype), [limits.own], axis=1)
+    at_own, at_general = jnp.split(held.target, [limits.own], axis=1)
+    norm = jnp.sum(model.G**2, axis=2)
+    general = weights.rows * general / jnp.where(norm > 0, norm, 1)
+    own = weights.rows * jnp.pad(own, ((0, 0), (first, N - last)))
+    at_own = jnp.pad(at_own, ((0, 0), (first, N - last)))
+    over = weights.variables + weights.controls * (jnp.arange(N) >= n)
+    H = model.H + (own + over)[:, :, None] * eye
+    H = H + jnp.einsum("tpi,tp,tpj->tij", model.G, general, model.G)
+    h = model.h - own * at_own
+    h = h - jnp.einsum("tpi,tp->ti", model.G, general * at_general)
+
+    def back(carry, here):
+        P, s = carry
+        F, H, h, d = here
+        M = H + product(F.T, product(P, F))
+        g = h + apply(F.T, s + apply(P, d))
+        Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
+        solved, added = _definite(Quu, jnp.concatenate([Qux, Qu[:, None]], axis=1))
+        K, k = solved[:, :n], solved[:, n]
+        before = M[:n, :n] - product(Qux.T, K)
+        s = g[:n] - apply(Qux.T, k)
+        whole = jnp.concatenate([K, jnp.eye(N - n, dtype=dtype)], axis=1)
+        weighted = product(Quu + jnp.diag(added), whole)
+        cost = product(whole.T, weighted), apply(weighted.T, k)
+        before = (before + before.T) / 2
+        return (before, s), (*cost, before, s, K, jnp.max(added))
+
+    P, s = H[-1, :n, :n], h[-1, :n]
+    xs = model.F, H[:-1], h[:-1], model.values.defects[1:]
+    _, (H, h, Ps, ss, K, shift) = lax.scan(back, (P, s), xs, reverse=True)
+    stack = lambda a, b: jnp.concatenate([a, b[None]])
+    ends = stack(H, jnp.zeros((N, N), dtype)), stack(h, jnp.zeros(N, dtype))
+    return Convex(*ends, stack(Ps, P), stack(ss, s), K, jnp.max(shift))
+
+
+def _definite(matrix: Array, right: Array) -> tuple[Array, Array]:
+    """`(matrix + diag(added))^-1 right` and `added`: each pivot is as large as its
+    magnitude, and well positive."""
+    m = matrix.shape[0]
+    largest = jnp.max(jnp.abs(matrix))
+    least = jnp.finfo(matrix.dtype).eps ** 0.5 * jnp.where(largest > 0, largest, 1)
+    rows = list(jnp.concatenate([matrix, right], axis=1))
+    added = []
+    for i in range(m):
+        pivot = rows[i][i]
+        wanted = jnp.maximum(jnp.abs(pivot), least)
+        added.append(wanted - pivot)
+        rows[i] = rows[i].at[i].set(wanted) / wanted
+        for j in range(i + 1, m):
+            rows[j] = rows[j] - rows[j][i] * rows[i]
+    for i in reversed(range(m)):
+        for j in range(i + 1, m):
+            rows[i] = rows[i] - rows[i][j] * rows[j]
+    return jnp.stack(rows)[:, m:], jnp.stack(added)

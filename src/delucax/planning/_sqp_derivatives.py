@@ -1,0 +1,144 @@
+"""Derivatives of a plan by sequential quadratic programming, by the implicit function
+theorem: those of the quadratic program at the solution, with the exact second
+derivatives, whatever the iteration used.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._check import is_concrete
+from .._jax import by_lanes, deferred, hoisted, nan_tangent
+from .._results import RESULTS
+from ..math._linear_solve import full_precision
+from ..math._small import products_whole
+from ..qp._derivatives import moved_with
+from ._convex import convexified, made_convex
+from ._problem import Problem
+from ._sqp_iteration import (
+    curved,
+    form_of,
+    gains_of,
+    iterated,
+    Options,
+    Outcome,
+    rows_left,
+)
+from ._start import Start
+from ._transcription import expanded, Iterate, limits_of, slopes
+
+
+def solution(problem: Problem, start: Start, options: Options) -> Outcome:
+    """The outcome of the iteration, differentiable with respect to the problem."""
+    # Traced here: a derivative repeats the program, not the tracing of it.
+    iteration = hoisted(iterated, problem, start, options)
+    # The derivative, traced elsewhere, would meet it as a tracer that has escaped.
+    traced = not all(map(is_concrete, jax.tree.leaves(iteration)))
+    return _solution(iteration, problem, start, options, traced)
+
+
+@eqx.filter_custom_jvp
+def _solution(iteration: Any, *given: Any) -> Outcome:
+    return by_lanes(iteration, *given[:-1])
+
+
+@_solution.def_jvp
+@full_precision
+def _solution_jvp(primals: Any, tangents: Any) -> Any:
+    closed_over, change, *_ = tangents
+    problem, *_, traced = primals[1:]
+    if traced or jax.tree.leaves(closed_over):
+        raise ValueError(
+            "SQP: the dynamics, the cost or a constraint closes over a number that is "
+            "differentiated, or that a transformation outside traces. Make it a field "
+            "of a module, a `delucax.parameter()`."
+        )
+    out = _solution(*primals)
+    # None is a tangent of zero that is known to be one.
+    nothing = jax.tree.map(lambda _: None, out)
+    if not jax.tree.leaves(change):
+        return out, nothing
+    return out, nothing._replace(**_tangents(out, problem, change))
+
+
+@products_whole()
+def _tangents(out: Outcome, problem: Problem, change: Any) -> dict[str, Any]:
+    """The tangents of the trajectory, the multipliers and the gains."""
+    # Only what has a tangent is varied below, so that nothing else is differentiated.
+    has_tangent = jax.tree.map(
+        lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
+    )
+    varied, rest = eqx.partition(problem, has_tangent)
+    converged = out.result == RESULTS.successful
+    # Derivatives at a failed outcome must be finite for those of other members of a
+    # batch, so they are taken at the first state.
+    safe = lambda a, b: jnp.where(converged & jnp.isfinite(a), a, b)
+    at = Iterate(
+        safe(out.at.states, problem.x0),
+        safe(out.at.controls, 0),
+        safe(out.at.costates, 0),
+        safe(out.at.sides, 0),
+    )
+    T = at.controls.shape[0]
+    limits = limits_of(problem, T)
+    model = expanded(problem, limits, at, True)
+    held = curved(limits, at, model)
+    zero = jnp.zeros((), model.h.dtype)
+    _, weights = convexified(limits, model, held, zero, zero)
+
+    # What changes with the problem at fixed variables and multipliers. The rest of the
+    # program, which is quadratic or multiplies a change of zero, does not matter.
+    def terms(varied):
+        problem = eqx.combine(varied, rest)
+        own = limits_of(problem, T)
+        h, defects, rows = slopes(problem, own, at)
+        return h, defects, *rows_left(own, rows), own.linear, own.quadratic
+
+    (dh, *dterms) = jax.jvp(terms, (varied,), (change,))[1]
+
+    def program(h, defects, low, high, linear, quadratic):
+        values = model.values._replace(defects=defects)
+        here = model._replace(values=values, h=h)
+        target = jnp.where(jnp.abs(low) < jnp.abs(high), low, high)
+        now = held._replace(target=jnp.where(held.rows, target, 0))
+        own = limits._replace(linear=linear, quadratic=quadratic)
+        convex = made_convex(own, here, now, weights)
+        infinite = jnp.full((), jnp.inf, h.dtype)
+        return form_of(own, here, convex, low, high, infinite), convex.s
+
+    low, high = rows_left(limits, model.values.rows)
+    at_solution = model.h, model.values.defects, low, high
+    at_solution = *at_solution, limits.linear, limits.quadratic
+    # Infinite bounds do not move.
+    pairs = zip(at_solution[1:], dterms, strict=True)
+    moved = [jnp.where(jnp.isfinite(a), d, 0) for a, d in pairs]
+    (form, _), (dform, ds) = jax.jvp(program, at_solution, (dh, *moved))
+    convex = made_convex(limits, model, held, weights)
+    n = at.states.shape[1]
+    costates = at.costates + convex.s
+    point = jnp.zeros_like(form.q), costates, at.sides
+    dz, dp, dsides, unique = moved_with(form, dform, *point)
+    dx = dz[:, :n]
+    dp = dp - ds - jnp.einsum("tij,tj->ti", convex.P, dx)
+    ok = converged & unique & (weights.variables == 0) & (convex.shift == 0)
+    parts = dx, dz[:-1, n:], dp, dsides
+    moved = Iterate(*(nan_tangent(d, ok) for d in parts))
+
+    @full_precision
+    @products_whole()
+    def gains(given, tangents):
+        """The tangent of the gains, which depend on the problem and the solution."""
+        varied, rest, at = given
+
+        def after(varied, at):
+            problem = eqx.combine(varied, rest)
+            limits = limits_of(problem, T)
+            return gains_of(limits, at, expanded(problem, limits, at, True))
+
+        return jax.jvp(after, (varied, at), tangents)[1]
+
+    # Few need it, and it takes the third derivatives of the problem.
+    dK = deferred(gains, out.gains, (varied, rest, at), (change, moved))
+    return dict(at=moved, gains=nan_tangent(dK, ok))

@@ -1,0 +1,316 @@
+"""A plan as a nonlinear program, by multiple shooting: its unknowns are the states and
+the controls, its equations the steps of the dynamics, and its rows the bounds and the
+constraints.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from .._jax import by_components, join_state, split_state, with_stores
+from .._typing import Array
+from ..math._linear_solve import full_precision, symmetric
+from ..math._small import products_whole
+from ..qp import Soft
+from ._constraints import Row, rows_of
+from ._problem import Problem
+
+
+class Iterate(NamedTuple):
+    """A trajectory, which need not follow the dynamics, and its multipliers."""
+
+    states: Array  # (T+1, n)
+    controls: Array  # (T, m)
+    costates: Array  # (T+1, n), of x_0 = start and x_{k+1} = F(x_k, u_k)
+    sides: Array  # (2, T+1, rows), of the upper and the lower sides, not negative
+
+
+class Limits(NamedTuple):
+    """The rows of each stage are first some of the variables `(x, u)`, then the values
+    of the constraints. An equality has both bounds alike, and what is no row of a
+    stage has none."""
+
+    low: Array  # (T+1, rows)
+    high: Array
+    linear: Array  # of a violation; infinite where a row is hard
+    quadratic: Array
+    bounded: tuple[int, int]
+    """Which variables have rows, from and to."""
+    is_soft: bool
+    states: int
+    """So many rows are bounds of states."""
+
+    @property
+    def own(self) -> int:
+        """How many rows are bounds of variables."""
+        first, last = self.bounded
+        return last - first
+
+    @property
+    def hard(self) -> Array:
+        """The rows that must hold."""
+        return ~(jnp.isfinite(self.linear) & jnp.isfinite(self.quadratic))
+
+    def over(self, rows: Array) -> Array:
+        """By how much each row is violated."""
+        return jnp.maximum(jnp.maximum(rows - self.high, self.low - rows), 0)
+
+    def broken(self, rows: Array) -> Array:
+        """By how much each hard row is violated."""
+        return jnp.where(self.hard, self.over(rows), 0)
+
+    def penalty(self, rows: Array) -> Array:
+        """The cost of the violated soft rows."""
+        if not self.is_soft:
+            return jnp.zeros((), rows.dtype)
+        t = self.over(rows)
+        price = t * (self.linear + self.quadratic * t / 2)
+        return jnp.sum(jnp.where(self.hard, 0, price))
+
+    def ends(self) -> tuple[Array, Array] | None:
+        """The bounds of the controls that must hold, shape `(T, m)`."""
+        if self.own == self.states:
+            return None
+        controls = slice(self.states, self.own)
+        hard = self.hard[:-1, controls]
+        low = jnp.where(hard, self.low[:-1, controls], -jnp.inf)
+        return low, jnp.where(hard, self.high[:-1, controls], jnp.inf)
+
+
+class Values(NamedTuple):
+    """The problem at a trajectory."""
+
+    cost: Array  # with that of violated soft rows
+    defects: Array  # (T+1, n), by how much each step misses the next state
+    rows: Array  # (T+1, rows)
+
+
+class Model(NamedTuple):
+    """The problem and its derivatives, `z = (x, u)`."""
+
+    values: Values
+    h: Array  # (T+1, N), of the cost
+    F: Array  # (T, n, N)
+    G: Array  # (T+1, p, N), of the constraints by functions
+    H: Array  # (T+1, N, N), of the Lagrangian
+
+
+def empty_model(limits: Limits, at: Iterate) -> Model:
+    """A model of zeros."""
+    (T, m), n, dtype = at.controls.shape, at.states.shape[1], at.states.dtype
+    rows, N = limits.low.shape[1], n + m
+    zeros = lambda *shape: jnp.zeros(shape, dtype)
+    values = Values(zeros(), zeros(T + 1, n), zeros(T + 1, rows))
+    G = zeros(T + 1, rows - limits.own, N)
+    return Model(values, zeros(T + 1, N), zeros(T, n, N), G, zeros(T + 1, N, N))
+
+
+def limits_of(problem: Problem, horizon: int) -> Limits:
+    """The rows of a problem."""
+    n, m = problem.dynamics.state_size, problem.dynamics.control_size
+    dtype, T, given = problem.x0.dtype, horizon, problem.constraints
+    parts: list[tuple[Array, ...]] = []
+    own = given and given.states, given and given.controls
+    has_states, has_controls = own[0] is not None, own[1] is not None
+    has_controls = has_controls or problem.bounds is not None
+    if has_states:
+        parts.append(_bounds(own[0], "states", T, n, dtype))
+    if has_controls:
+        low, high, *weights = _bounds(own[1], "controls", T, m, dtype)
+        if problem.bounds is not None:
+            always = tuple(jnp.broadcast_to(b, (T, m)) for b in problem.bounds)
+            always = (
+                jnp.pad(always[0], ((0, 1), (0, 0)), constant_values=-jnp.inf),
+                (jnp.pad(always[1], ((0, 1), (0, 0)), constant_values=jnp.inf)),
+            )
+            low, high = jnp.maximum(low, always[0]), jnp.minimum(high, always[1])
+        parts.append((low, high, *weights))
+    if given is not None:
+        args = problem.t0, problem.x0, jnp.zeros(m, dtype)
+        stage = _functions(rows_of(given, False, args), dtype)
+        final = _functions(rows_of(given, True, args[:2]), dtype)
+        size = max(stage.shape[1], final.shape[1])
+        empty = jnp.array([-jnp.inf, jnp.inf, jnp.inf, jnp.inf], dtype)
+        pad = lambda a: jnp.concatenate(
+            [a, jnp.tile(empty[:, None], (1, size - a.shape[1]))], axis=1
+        )
+        each = jnp.tile(pad(stage)[:, None], (1, T, 1))
+        parts.append(tuple(jnp.concatenate([each, pad(final)[:, None]], axis=1)))
+    nothing = jnp.zeros((4, T + 1, 0), dtype)
+    joined = [jnp.concatenate(a, axis=1) for a in zip(nothing, *parts, strict=True)]
+    bounded = (0 if has_states else n), (n + m if has_controls else n)
+    soft = isinstance(own[0], Soft) or isinstance(own[1], Soft)
+    if given is not None:
+        rows = rows_of(given, False, args) + rows_of(given, True, args[:2])
+        soft = soft or any(row.weights is not None for row in rows)
+    arrays: Any = joined
+    return Limits(*arrays, bounded, soft, n if has_states else 0)
+
+
+def _functions(rows: list[Row], dtype: Any) -> Array:
+    """The bounds and the weights of the values of some functions, `(4, size)`."""
+    columns = [jnp.zeros((4, 0), dtype)]
+    for row in rows:
+        weights = row.weights or (jnp.inf, jnp.inf)
+        numbers = (0 if row.is_equality else -jnp.inf), 0, *weights
+        fill = lambda a, k=row.size: jnp.broadcast_to(jnp.asarray(a, dtype), (k,))
+        columns.append(jnp.stack([fill(a) for a in numbers]))
+    return jnp.concatenate(columns, axis=1)
+
+
+def _bounds(value: Any, name: str, T: int, size: int, dtype: Any) -> tuple[Array, ...]:
+    """The bounds and weights of the variables of one kind, each `(T+1, size)`."""
+    points = T + 1 if name == "states" else T
+    soft = isinstance(value, Soft)
+    if value is None:
+        value = -jnp.inf, jnp.inf
+    given = (value.low, value.high, value.linear, value.quadratic) if soft else value
+    shapes = (), (size,), (points, size)
+    arrays = [jnp.asarray(a, dtype) for a in given]
+    for array in arrays:
+        if array.shape not in shapes:
+            raise ValueError(
+                f"Constraints: each of {name} must be a number or have shape "
+                f"{shapes[1]} or {shapes[2]}, got shape {array.shape}."
+            )
+    arrays = [jnp.broadcast_to(a, (points, size)) for a in arrays]
+    if not soft:
+        arrays += [jnp.full((points, size), jnp.inf, dtype)] * 2
+    ends = -jnp.inf, jnp.inf, jnp.inf, jnp.inf
+    if name == "states":
+        # The first state is given.
+        return tuple(a.at[0].set(end) for a, end in zip(arrays, ends, strict=True))
+    pad = ((0, 1), (0, 0))
+    return tuple(
+        jnp.pad(a, pad, constant_values=end)
+        for a, end in zip(arrays, ends, strict=True)
+    )
+
+
+def _joined(problem: Problem, limits: Limits, z: Array, stage: Array, final: Array):
+    """The rows along a trajectory, `z` of `(T+1, N)`."""
+    first, last = limits.bounded
+    size = limits.low.shape[1] - limits.own
+    pad = lambda c: jnp.pad(c, ((0, 0), (0, size - c.shape[1])))
+    c = jnp.concatenate([pad(stage), pad(final[None])])
+    return jnp.concatenate([z[:, first:last], c], axis=1)
+
+
+def _stacked(states: Array, controls: Array) -> Array:
+    return jnp.concatenate([states, jnp.pad(controls, ((0, 1), (0, 0)))], axis=1)
+
+
+def measured(problem: Problem, limits: Limits, states: Array, controls: Array):
+    """The problem at a trajectory."""
+    times = problem.times(controls.shape[0])
+    reached = jax.vmap(problem.step)(times[:-1], states[:-1], controls, problem.w)
+    defects = jax.vmap(problem.deviation)(reached, states[1:])
+    defects = jnp.concatenate([problem.deviation(problem.x0, states[0])[None], defects])
+    stage, final = jnp.zeros_like(states[:-1, :0]), jnp.zeros_like(states[0, :0])
+    if problem.constraints is not None:
+        (stage, _), (final, _) = problem.constraints_along(states, controls)
+    rows = _joined(problem, limits, _stacked(states, controls), stage, final)
+    cost = problem.total(states, controls) + limits.penalty(rows)
+    return Values(cost, defects, rows)
+
+
+@full_precision
+@products_whole()
+def expanded(problem: Problem, limits: Limits, at: Iterate, second_order: bool):
+    """The problem and its derivatives at an iterate; the Hessian is that of the
+    Lagrangian if `second_order`, else that of the cost."""
+    states, controls, costates, sides = at
+    n, T = states.shape[1], controls.shape[0]
+    times, y = problem.times(T), (sides[0] - sides[1])[:, limits.own :]
+    z = jnp.concatenate([states[:-1], controls], axis=1)
+    none = jnp.zeros(0, z.dtype)
+
+    def constraints(z, t):
+        if problem.constraints is None:
+            return none
+        return problem.stage_constraints(t, z[:n], z[n:])[0]
+
+    def final_constraints(x):
+        if problem.constraints is None:
+            return none
+        return problem.final_constraints(times[-1], x)[0]
+
+    like = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), (z, times[:-1], problem.w)
+    )
+
+    @by_components
+    def advance(parts, t, w):
+        z = join_state(parts)
+        return problem.step(t, z[:n], z[n:], w)
+
+    stored = with_stores(lambda z, t, w: advance(split_state(z), t, w), *like)
+
+    def stage(z, t, w, p, y):
+        cost = lambda z: problem.cost(t, z[:n], z[n:]) + 0.0
+
+        # One pass of tangents gives all Jacobians, and of the gradient the Hessian.
+        def terms(z):
+            h = slope = jax.grad(cost)(z)
+            if not second_order:
+                after, c = stored(z, t, w), constraints(z, t)
+                return (after, c, slope), (after, c, h, cost(z))
+            after, pull = jax.vjp(lambda z: stored(z, t, w), z)
+            c, push = jax.vjp(lambda z: constraints(z, t), z)
+            slope = h - pull(p)[0] + push(y[: c.size])[0]
+            return (after, c, slope), (after, c, h, cost(z))
+
+        (F, G, H), values = jax.jacfwd(terms, has_aux=True)(z)
+        return F, G, H, *values
+
+    each = z, times[:-1], problem.w, costates[1:], y[:-1]
+    F, G, H, reached, c, h, cost = jax.vmap(stage)(*each)
+
+    def final(x):
+        cost = lambda x: problem.cost.final(times[-1], x) + 0.0
+        h = slope = jax.grad(cost)(x)
+        c, push = jax.vjp(final_constraints, x)
+        if second_order:
+            slope = h + push(y[-1, : c.size])[0]
+        return (c, slope), (c, h, cost(x))
+
+    (G_end, V), (c_end, v, last) = jax.jacfwd(final, has_aux=True)(states[-1])
+    defects = jax.vmap(problem.deviation)(reached, states[1:])
+    defects = jnp.concatenate([problem.deviation(problem.x0, states[0])[None], defects])
+    rows = _joined(problem, limits, _stacked(states, controls), c, c_end)
+    values = Values(jnp.sum(cost) + last + limits.penalty(rows), defects, rows)
+    N, size = z.shape[1], rows.shape[1] - limits.own
+    pad = lambda a, *sizes: jnp.pad(
+        a, [(0, s - k) for s, k in zip(sizes, a.shape, strict=True)]
+    )
+    stack = lambda a, b: jnp.concatenate([a, b[None]])
+    model = Model(
+        values,
+        stack(h, pad(v, N)),
+        F,
+        stack(pad(G, T, size, N), pad(G_end, size, N)),
+        symmetric(stack(H, pad(V, N, N))),
+    )
+    return jax.tree.map(lambda a: a.astype(states.dtype), model)
+
+
+def slopes(problem: Problem, limits: Limits, at: Iterate) -> tuple[Array, Array, Array]:
+    """The gradient of the Lagrangian without its costates' own terms, the defects and
+    the rows at fixed multipliers, to be differentiated with respect to the problem."""
+    states, controls, costates, sides = at
+    times = problem.times(controls.shape[0])
+    y = (sides[0] - sides[1])[:, limits.own :]
+
+    def lagrangian(states, controls):
+        steps = jax.vmap(problem.step)(times[:-1], states[:-1], controls, problem.w)
+        total = problem.total(states, controls) - jnp.sum(costates[1:] * steps)
+        if problem.constraints is None:
+            return total
+        (stage, _), (final, _) = problem.constraints_along(states, controls)
+        total = total + jnp.sum(y[:-1, : stage.shape[1]] * stage)
+        return total + jnp.sum(y[-1, : final.size] * final)
+
+    hx, hu = jax.grad(lagrangian, (0, 1))(states, controls)
+    values = measured(problem, limits, states, controls)
+    return _stacked(hx, hu), values.defects, values.rows
