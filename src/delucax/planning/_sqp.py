@@ -1,7 +1,5 @@
 """Sequential quadratic programming with hard constraints."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -125,8 +123,13 @@ class SQP(AbstractPlanner):
             jnp.asarray(default if value is None else value, dtype)
             for default, value in zip(defaults, given, strict=True)
         )
-        static: Any = self.second_order, self.max_iterations
-        return _solve(problem, start, Options(*tolerances, states, *static))
+        options = Options(
+            *tolerances,
+            states=states,
+            second_order=self.second_order,
+            max_iterations=self.max_iterations,
+        )
+        return _solve(problem, start, options)
 
 
 @eqx.filter_jit

@@ -111,8 +111,8 @@ def form_of(
         v = jnp.where(hard & elastic, price, limits.linear)
         W = jnp.where(hard & elastic & jnp.isfinite(price), 0, limits.quadratic)
         soft = jnp.stack([v, v]), jnp.stack([W, W])
-    given: Any = convex.H, convex.h, model.F, model.values.defects, model.G
-    return StagedForm(*given, low, high, soft, limits.bounded, False)
+    terms = convex.H, convex.h, model.F, model.values.defects, model.G, low, high, soft
+    return StagedForm(*terms, limits.bounded, False)
 
 
 def infeasibility(limits: Limits, values: Any) -> Array:

@@ -126,10 +126,12 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
             )
             low, high = jnp.maximum(low, always[0]), jnp.minimum(high, always[1])
         parts.append((low, high, *weights))
+    soft = isinstance(own[0], Soft) or isinstance(own[1], Soft)
     if given is not None:
         args = problem.t0, problem.x0, jnp.zeros(m, dtype)
-        stage = _functions(rows_of(given, False, args), dtype)
-        final = _functions(rows_of(given, True, args[:2]), dtype)
+        rows = rows_of(given, False, args), rows_of(given, True, args[:2])
+        soft = soft or any(row.weights is not None for row in sum(rows, []))
+        stage, final = (_functions(part, dtype) for part in rows)
         size = max(stage.shape[1], final.shape[1])
         empty = jnp.array([-jnp.inf, jnp.inf, jnp.inf, jnp.inf], dtype)
         pad = lambda a: jnp.concatenate(
@@ -140,12 +142,8 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
     nothing = jnp.zeros((4, T + 1, 0), dtype)
     joined = [jnp.concatenate(a, axis=1) for a in zip(nothing, *parts, strict=True)]
     bounded = (0 if has_states else n), (n + m if has_controls else n)
-    soft = isinstance(own[0], Soft) or isinstance(own[1], Soft)
-    if given is not None:
-        rows = rows_of(given, False, args) + rows_of(given, True, args[:2])
-        soft = soft or any(row.weights is not None for row in rows)
-    arrays: Any = joined
-    return Limits(*arrays, bounded, soft, n if has_states else 0)
+    states = n if has_states else 0
+    return Limits(*joined, bounded=bounded, is_soft=soft, states=states)
 
 
 def _functions(rows: list[Row], dtype: Any) -> Array:

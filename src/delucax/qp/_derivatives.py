@@ -88,9 +88,9 @@ def _optimum_jvp(primals: Any, tangents: Any) -> Any:
         change,
         is_leaf=lambda leaf: leaf is None,
     )
-    parts = Method(form, form, None, None, form.sides(), None).apart
-    _, _, *at = parts(outcome.iterate.v / outcome.iterate.tau)
-    *moved, unique = _change(form, change, outcome[:3], at)
+    last = outcome.iterate
+    pushes = lambda method: method.apart(last.v / last.tau)[2:]
+    *moved, unique = _change(form, change, outcome[:3], pushes)
     # Of a failed solve there is no derivative.
     ok = unique & (outcome.errors[0] <= 1)
     dx, dp, dz = (nan_tangent(d, ok) for d in moved)
@@ -99,26 +99,29 @@ def _optimum_jvp(primals: Any, tangents: Any) -> Any:
 
 def moved_with(form: AbstractForm, change: AbstractForm, x: Array, p: Array, z: Array):
     """The change of a solution that is known, and whether it is unique."""
-    scaled, (D, _, R, c) = form.equilibrated()
-    sides = scaled.sides()
-    over = both(scaled.rows(x / D)) - sides.h
-    pushed = z * c / R
-    t = jnp.where(sides.soft, jnp.maximum(over, 0), 0)
-    s = jnp.where(sides.inequality, jnp.maximum(t - over, 0), 0)
-    m = jnp.where(sides.hinge, jnp.maximum(sides.v + sides.W * t - pushed, 0), 0)
-    return _change(form, change, (x, p, z), (pushed, s, t, m))
+
+    def pushes(method):
+        (D, _, R, c), sides = method.scaling, method.sides
+        over = both(method.scaled.rows(x / D)) - sides.h
+        pushed = z * c / R
+        t = jnp.where(sides.soft, jnp.maximum(over, 0), 0)
+        s = jnp.where(sides.inequality, jnp.maximum(t - over, 0), 0)
+        m = jnp.where(sides.hinge, jnp.maximum(sides.v + sides.W * t - pushed, 0), 0)
+        return pushed, s, t, m
+
+    return _change(form, change, (x, p, z), pushes)
 
 
-def _change(form: AbstractForm, change: AbstractForm, point: Any, at: Any):
+def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
     """The change of `x`, `p` and `z`, and whether the solution is unique. Of the scaled
-    problem `at` are the multipliers of the sides, their slacks, the violations of soft
-    ones, and the multipliers of these."""
+    problem `pushes` gives the multipliers of the sides, their slacks, the violations of
+    soft ones, and the multipliers of these."""
     scaled, scaling = form.equilibrated()
     D, E, R, c = scaling
     method = Method(form, scaled, scaling, form.sides(), scaled.sides(), None)
     sides = method.sides
     x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in point)
-    scaled_z, s, t, m = at
+    scaled_z, s, t, m = pushes(method)
     pressed = sides.inequality & (scaled_z > s)
     clear = _are_unlike(scaled_z, s) | ~sides.inequality
     violated = jnp.zeros_like(pressed)
