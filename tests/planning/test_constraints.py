@@ -119,7 +119,7 @@ def test_what_cannot_hold():
 
 
 def test_bad_constraints_are_named():
-    with user_error(match="at least one function"):
+    with user_error(match="at least one constraint"):
         Constraints()
     with user_error(match="inequality must be a function"):
         Constraints(3.0)

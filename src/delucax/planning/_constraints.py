@@ -71,6 +71,13 @@ def _as_functions(value: Any) -> Any:
     return as_module(value)
 
 
+def _as_limits(value: Any) -> Any:
+    """Bounds as arrays."""
+    if isinstance(value, tuple | list) and len(value) == 2:
+        return tuple(as_float_array(end) for end in value)
+    return value
+
+
 _FUNCTIONS = "inequality", "equality", "final_inequality", "final_equality"
 
 
@@ -103,7 +110,8 @@ class Constraints(eqx.Module):
     A function that is a module with [`delucax.parameter`][] fields can be
     differentiated with respect to them.
 
-    **Raises:** `ValueError` if one is not a function, or none is given.
+    **Raises:** `ValueError` if one is not a function, a pair of bounds is none, or
+    nothing is given.
 
     !!! example
 
@@ -131,13 +139,13 @@ class Constraints(eqx.Module):
     equality: Any = eqx.field(default=None, converter=_as_functions)
     final_inequality: Any = eqx.field(default=None, converter=_as_functions)
     final_equality: Any = eqx.field(default=None, converter=_as_functions)
-    states: Any = None
-    controls: Any = None
+    states: Any = eqx.field(default=None, converter=_as_limits)
+    controls: Any = eqx.field(default=None, converter=_as_limits)
 
     def __check_init__(self):
         where = "Constraints"
         if all(value is None for value in vars(self).values()):
-            raise ValueError("Constraints: at least one function must be given.")
+            raise ValueError("Constraints: at least one constraint must be given.")
         for field in _FUNCTIONS:
             for name, function in self.named(field).items():
                 check_function(function, name, where)
@@ -145,10 +153,17 @@ class Constraints(eqx.Module):
             value = getattr(self, field)
             if value is None or isinstance(value, Soft):
                 continue
-            if not isinstance(value, tuple | list) or len(value) != 2:
+            if not isinstance(value, tuple):
                 raise ValueError(
                     f"{where}: {field} must be a pair (low, high) or a "
                     f"`delucax.qp.Soft`, got {type(value).__name__}."
+                )
+            if not all(map(is_concrete, value)):
+                continue
+            low, high = map(np.asarray, value)
+            if not np.all(low <= high):
+                raise ValueError(
+                    f"{where}: {field} must have low <= high, got {low} and {high}."
                 )
 
     def named(self, field: str) -> dict[str, Callable[..., Any]]:

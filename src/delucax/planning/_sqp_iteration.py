@@ -111,8 +111,18 @@ def form_of(
         v = jnp.where(hard & elastic, price, limits.linear)
         W = jnp.where(hard & elastic & jnp.isfinite(price), 0, limits.quadratic)
         soft = jnp.stack([v, v]), jnp.stack([W, W])
-    terms = convex.H, convex.h, model.F, model.values.defects, model.G, low, high, soft
-    return StagedForm(*terms, limits.bounded, False)
+    return StagedForm(
+        H=convex.H,
+        q=convex.h,
+        F=model.F,
+        f=model.values.defects,
+        G=model.G,
+        lower=low,
+        upper=high,
+        soft=soft,
+        bounded=limits.bounded,
+        is_free=False,
+    )
 
 
 def infeasibility(limits: Limits, values: Any) -> Array:
@@ -237,7 +247,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         price = jnp.where(settled & ~feasible, 10 * before.price, before.price)
         most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
         hopeless = jnp.isfinite(price) & (price > most)
-        lost = ~jnp.isfinite(model.values.cost) | ~jnp.isfinite(slope)
+        lost = ~jnp.isfinite(model.values.cost + slope + error + violation)
         result = choose(settled & feasible, RESULTS.successful, now.result)
         result = choose(hopeless, RESULTS.infeasible, result)
         result = choose(lost, RESULTS.diverged, result)

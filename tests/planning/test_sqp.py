@@ -1,0 +1,293 @@
+"""Sequential quadratic programming: optima of others, the optimality conditions, hard
+and soft limits, derivatives, and what must not go wrong."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, tolerance, user_error
+from hypothesis import given, settings, strategies as st
+
+import delucax as dlx
+
+
+SQP, Constraints = dlx.planning.SQP, dlx.planning.Constraints
+SoftConstraint = dlx.planning.SoftConstraint
+GOAL = jnp.array([1.0, 0.0, 0.0, 0.0])
+
+
+def steered(scale=1.0):
+    """A point of unit mass in the plane."""
+    dt = 0.2
+    A = jnp.eye(4).at[0, 2].set(dt).at[1, 3].set(dt)
+    B = jnp.zeros((4, 2)).at[2, 0].set(dt).at[3, 1].set(dt)
+    cost = dlx.costs.Quadratic(0.01 * jnp.ones(4), 0.1 * jnp.ones(2))
+    x0 = jnp.array([-1.0, 0.05, 0.0, 0.0])
+    return dlx.LinearDynamics(A, scale * B, dt=dt), cost, x0, jnp.zeros((15, 2))
+
+
+class Clear(eqx.Module):
+    radius: jax.Array = dlx.parameter(0.4)
+
+    def __call__(self, t, x, u):
+        return self.radius**2 - x[0] ** 2 - x[1] ** 2
+
+
+def arrived(t, x):
+    return x - GOAL
+
+
+def pendulum(horizon=20):
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])
+    return dynamics, cost, jnp.array([1.0, 0.0]), jnp.zeros((horizon, 1))
+
+
+@needs_x64
+def test_past_an_obstacle_to_an_end():
+    dynamics, cost, x0, U = steered()
+    constraints = Constraints({"disc": Clear()}, final_equality=arrived)
+    given = dict(bounds=(-2.5, 2.5), constraints=constraints)
+    plan = SQP()(dynamics, cost, x0, U, **given)
+    # SciPy's SLSQP is the reference of `ilqr` on this problem (test_constraints).
+    other = dlx.planning.ilqr(dynamics, cost, x0, U, **given)
+    assert_close(plan.cost, other.cost, rtol=1e-7)
+    assert_close(plan.controls, other.controls, atol=1e-4)
+    inside = jax.vmap(lambda x: Clear()(0.0, x, None))(plan.states[:-1])
+    assert (
+        jnp.max(inside) <= 1e-8 and jnp.max(jnp.abs(arrived(0, plan.states[-1]))) < 1e-8
+    )
+    assert_close(plan.states, dlx.open_loop(dynamics, x0, plan.controls), atol=1e-7)
+    assert plan.violation < 1e-8 and plan.residual < 1e-6
+
+
+@needs_x64
+def test_without_constraints_it_is_ilqr():
+    problem = pendulum()
+    plan = SQP()(*problem)
+    other = dlx.planning.ILQR(tolerance=1e-9, second_order=True)(*problem)
+    assert_close(plan.cost, other.cost, rtol=1e-9)
+    assert_close(plan.controls, other.controls, atol=1e-5)
+    assert_close(plan.gains, other.gains, atol=1e-4)
+    gauss = SQP(second_order=False)(*problem)
+    assert_close(gauss.controls, other.controls, atol=1e-5)
+
+
+@needs_x64
+def test_limits_that_vary_in_time_and_the_feedback_about_them():
+    dynamics, cost, x0, U = pendulum(10)
+    slow = jnp.stack([jnp.full(11, jnp.inf), jnp.linspace(1.5, 0.5, 11)], axis=1)
+    weak = jnp.linspace(6.0, 5.0, 10)[:, None]
+    limits = Constraints(states=(-slow, jnp.inf), controls=(-weak, weak))
+    solve = lambda x0: SQP()(dynamics, cost, x0, U, constraints=limits)
+    plan = solve(x0)
+    low = plan.states[1:, 1] + slow[1:, 1]
+    assert jnp.min(low) > -1e-8 and jnp.min(low) < 1e-8
+    assert jnp.all(jnp.abs(plan.controls) <= weak + 1e-8)
+    free = SQP()(dynamics, cost, x0, U)
+    assert jnp.min(free.states[1:, 1] + slow[1:, 1]) < -0.1
+    # The gains are the derivative of the solution as long as the same limits hold.
+    moved = jax.jacfwd(lambda x: solve(x).controls[0])(x0)
+    assert_close(plan.gains[0], -moved, atol=1e-4)
+
+
+@needs_x64
+def test_a_soft_limit_costs_its_weights():
+    dynamics, cost, x0, U = pendulum(10)
+    fast = lambda t, x, u: -x[1] - 1.2
+    soft = lambda *weights: Constraints({"speed": SoftConstraint(fast, *weights)})
+    solve = lambda c: SQP()(dynamics, cost, x0, U, constraints=c)
+    over = lambda plan: jax.vmap(lambda x: fast(0, x, 0))(plan.states[:-1])
+    hard = solve(Constraints({"speed": fast}))
+    # Above the multiplier of the hard limit the solution meets it, exactly.
+    exact = solve(soft(1e3))
+    assert_close(exact.controls, hard.controls, atol=1e-6)
+    assert jnp.max(over(exact)) < 1e-8
+    cheap = solve(soft(0.1, 0.5))
+    t = jnp.maximum(over(cheap), 0)
+    assert jnp.max(t) > 1e-2
+    plain = lambda x, u: (
+        jnp.sum(jax.vmap(cost)(jnp.zeros(10), x[:-1], u)) + cost.final(0, x[-1])
+    )
+    # The cost of the plan is that of the trajectory; the price is the user's to know.
+    assert_close(cheap.cost, plain(cheap.states, cheap.controls), rtol=1e-12)
+
+    def priced(u):
+        x = dlx.open_loop(dynamics, x0, u)
+        t = jnp.maximum(jax.vmap(lambda x: fast(0, x, 0))(x[:-1]), 0)
+        return plain(x, u) + jnp.sum(0.1 * t + 0.25 * t**2)
+
+    # Smooth there: some are well violated, the others well met.
+    assert jnp.min(jnp.abs(over(cheap))) > 1e-3
+    assert jnp.max(jnp.abs(jax.grad(priced)(cheap.controls))) < 1e-5
+
+
+@needs_x64
+def test_soft_bounds_of_states():
+    dynamics, cost, x0, U = pendulum(10)
+    limit = dlx.qp.Soft([-jnp.inf, -1.0], [jnp.inf, jnp.inf], 0.0, 1e6)
+    plan = SQP()(dynamics, cost, x0, U, constraints=Constraints(states=limit))
+    hard = Constraints(states=([-jnp.inf, -1.0], [jnp.inf, jnp.inf]))
+    exact = SQP()(dynamics, cost, x0, U, constraints=hard)
+    assert_close(plan.controls, exact.controls, atol=1e-3)
+    assert -1.0 - 1e-3 < jnp.min(plan.states[:, 1]) < -1.0
+
+
+@needs_x64
+def test_derivatives_against_central_differences():
+    def total(theta):
+        scale, radius, bound, start = theta
+        dynamics, cost, x0, U = steered(scale)
+        plan = SQP()(
+            dynamics,
+            cost,
+            start * x0,
+            U,
+            bounds=(-2.5 * bound, 2.5),
+            constraints=Constraints({"disc": Clear(radius)}, final_equality=arrived),
+        )
+        weights = jnp.arange(4) + 1.0
+        return plan.cost + jnp.sum(plan.states**2 * weights) + jnp.sum(plan.controls[3])
+
+    theta = jnp.array([1.0, 0.4, 1.0, 1.0])
+    slope = jax.grad(total)(theta)
+    difference = lambda e: (total(theta + e) - total(theta - e)) / 2e-4
+    found = jnp.stack([difference(e) for e in 1e-4 * jnp.eye(4)])
+    assert_close(slope, found, rtol=3e-5, atol=1e-5)
+
+
+@needs_x64
+def test_the_first_state_and_the_bounds_of_states_are_differentiable():
+    dynamics, cost, x0, U = pendulum(10)
+
+    def last(x0, low):
+        limits = Constraints(states=(jnp.array([-jnp.inf, low]), jnp.inf))
+        return SQP()(dynamics, cost, x0, U, constraints=limits).states[-1]
+
+    primal = x0, jnp.asarray(-1.2)
+    change = jnp.array([0.3, -0.2]), jnp.asarray(0.5)
+    moved = jax.jvp(last, primal, change)[1]
+    at = lambda h: last(x0 + h * change[0], primal[1] + h * change[1])
+    assert_close(moved, (at(1e-5) - at(-1e-5)) / 2e-5, rtol=1e-5, atol=1e-7)
+
+
+@needs_x64
+def test_what_cannot_hold_is_named():
+    dynamics, cost, x0, U = steered()
+    never = Constraints({"disc": Clear()}, final_equality={"goal": arrived})
+    given = dict(bounds=(-0.1, 0.1), constraints=never)
+    plan = SQP()(dynamics, cost, x0, U, throw=False, **given)
+    assert plan.result == dlx.RESULTS.infeasible and plan.violation > 1e-2
+    with pytest.raises(RuntimeError, match=r"`goal` \(entry 0\).* by .* at the end"):
+        SQP()(dynamics, cost, x0, U, **given)
+    # No derivative of what is no solution.
+    f = lambda x0: SQP()(dynamics, cost, x0, U, throw=False, **given).cost
+    assert jnp.all(jnp.isnan(jax.grad(f)(x0)))
+    high = Constraints(states=([0.5, -9, -9, -9], jnp.inf))
+    with pytest.raises(RuntimeError, match="`bound of states` .* at stage 1"):
+        SQP()(dynamics, cost, x0, U, bounds=(-2.5, 2.5), constraints=high)
+
+
+@needs_x64
+def test_an_unstable_plant_from_controls_that_let_it_fall():
+    env = dlx.make("cartpole", horizon=40)
+    x0 = jnp.zeros(env.dynamics.state_size).at[0].set(0.5)
+    limits = Constraints(states=(-2.0, 2.0))
+    plan = SQP()(env.dynamics, env.cost, x0, jnp.full((40, 1), 0.3), constraints=limits)
+    assert jnp.max(jnp.abs(plan.states[1:])) < 2 + 1e-8
+    other = SQP()(env.dynamics, env.cost, x0, 40, constraints=limits)
+    assert_close(plan.cost, other.cost, rtol=1e-8)
+
+
+def test_jit_vmap_and_both_precisions():
+    dynamics, cost, x0, U = pendulum(6)
+    limits = Constraints(states=([-9.0, -1.5], [9.0, 9.0]))
+    call = lambda x0: SQP()(dynamics, cost, x0, U, bounds=(-8, 8), constraints=limits)
+    plan = call(x0)
+    assert plan.controls.dtype == x0.dtype and plan.result == dlx.RESULTS.successful
+    starts = jnp.stack([x0, 0.5 * x0])
+    batch = eqx.filter_jit(eqx.filter_vmap(call))(starts)
+    for start, row in zip(starts, batch.controls, strict=True):
+        close = tolerance(2e-3, 1e-6)
+        assert_close(call(start).controls, row, atol=close)
+
+
+@needs_x64
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_a_convex_plan_is_its_quadratic_program(seed):
+    draw = np.random.default_rng(seed)
+    n, m, T = 3, 2, 6
+    A, B = draw.normal(size=(n, n)) / 1.5, draw.normal(size=(n, m))
+    x0, low = draw.normal(size=n), -0.2 - 0.3 * draw.random(m)
+    dynamics = dlx.LinearDynamics(jnp.asarray(A), jnp.asarray(B), dt=0.1)
+    cost = dlx.costs.Quadratic(jnp.ones(n), jnp.full(m, 0.1))
+    speed = SoftConstraint(lambda t, x, u: x[0] - 0.1, 0.2, 1.0)
+    plan = SQP()(
+        dynamics,
+        cost,
+        jnp.asarray(x0),
+        jnp.zeros((T, m)),
+        bounds=(low, 0.3),
+        constraints=Constraints({"speed": speed}),
+    )
+
+    # Optimal is where no direction inside the bounds improves.
+    def total(u):
+        x = dlx.open_loop(dynamics, jnp.asarray(x0), u)
+        t = jnp.maximum(x[:-1, 0] - 0.1, 0)
+        each = jax.vmap(cost)(jnp.zeros(T), x[:-1], u)
+        final = cost.final(0.0, x[-1])
+        return jnp.sum(each) + final + jnp.sum(0.2 * t + 0.5 * t**2)
+
+    best = total(plan.controls)
+    for direction in draw.normal(size=(20, T, m)):
+        moved = jnp.clip(plan.controls + 1e-3 * direction, low, 0.3)
+        assert total(moved) >= best - 1e-9
+
+
+def test_bad_input():
+    dynamics, cost, x0, U = pendulum(4)
+    solve = lambda c: SQP()(dynamics, cost, x0, U, constraints=c)
+    with user_error(match="Constraints: at least one"):
+        Constraints()
+    with user_error(match="states must be a pair"):
+        Constraints(states=3.0)
+    with user_error(match="SoftConstraint: linear"):
+        SoftConstraint(lambda t, x, u: u, -1.0)
+    with user_error(match=r"states.*shape"):
+        solve(Constraints(states=(jnp.zeros(3), 1.0)))
+    with user_error(match=r"limit must return a number or a vector"):
+        solve(Constraints({"limit": lambda t, x, u: (x, u)}))
+    with user_error(match="states must have low <= high"):
+        solve(Constraints(states=(1.0, -1.0)))
+    with user_error(match="SQP: max_iterations"):
+        SQP(max_iterations=0)
+    with user_error(match="SQP: states"):
+        SQP(states=jnp.zeros((3, 2)))(dynamics, cost, x0, U)
+    with user_error(match="soft|bounds"):
+        soft = Constraints({"limit": SoftConstraint(lambda t, x, u: u, 1.0)})
+        dlx.planning.ilqr(dynamics, cost, x0, U, constraints=soft)
+    plan = SQP()(
+        dynamics,
+        cost,
+        x0,
+        U,
+        constraints=Constraints({"log": lambda t, x, u: jnp.log(-1 - x[0] ** 2)}),
+        throw=False,
+    )
+    assert plan.result == dlx.RESULTS.diverged
+    with pytest.raises(RuntimeError, match="`log` .* at stage 0"):
+        solve(Constraints({"log": lambda t, x, u: jnp.log(-1 - x[0] ** 2)}))
+
+
+def test_what_a_transformation_outside_traces_is_refused():
+    dynamics, cost, x0, U = pendulum(4)
+
+    def f(limit):
+        slow = Constraints({"slow": lambda t, x, u: x[1] - limit})
+        return SQP()(dynamics, cost, x0, U, constraints=slow).cost
+
+    with pytest.raises(ValueError, match="closes over"):
+        jax.grad(f)(jnp.asarray(2.0))
