@@ -108,6 +108,20 @@ def _low(t, x):
     return x[0] - 100.0
 
 
+def test_the_first_penalty_changes_the_way_and_not_the_end():
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), 0.1, diffrax.Euler())
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])
+    start = jnp.array([1.3, 0.0]), jnp.zeros((12, 1))
+    plan = lambda **options: dlx.planning.ILQR(**options)(
+        dynamics, cost, *start, constraints=slower_than(1.8)
+    )
+    usual, heavy = plan(), plan(penalty=1000.0)
+    assert_close(heavy.cost, usual.cost, rtol=1e-6)
+    assert heavy.iterations != usual.iterations
+    with user_error(match="ILQR: penalty"):
+        dlx.planning.ILQR(penalty=0.0)
+
+
 def test_what_cannot_hold():
     dynamics, cost, x0, U = steered()
     never = Constraints(equality=lambda t, x, u: u[0] - 1, final_equality=arrived)

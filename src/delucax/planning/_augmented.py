@@ -12,7 +12,6 @@ from ._problem import Multipliers, Problem, updated, violated
 from ._start import Start
 
 
-FIRST_RHO = 10.0
 _RHO_GROWTH = 10.0
 ENOUGH = 0.25
 """The weight stays if the violation falls to this share."""
@@ -89,7 +88,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         rollouts=jnp.zeros((), int),
         regularisation=zero,
         violation=jnp.full((), jnp.inf, dtype),
-        multipliers=Multipliers(stage, final, jnp.full((), FIRST_RHO, dtype)),
+        multipliers=Multipliers(stage, final, jnp.asarray(options.penalty, dtype)),
     )
     # The first minimisations are coarse, because their multipliers are wrong anyway.
     coarse = jnp.full((), 1e-2, dtype)

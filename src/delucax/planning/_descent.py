@@ -34,6 +34,8 @@ class Options(eqx.Module):
     constraint_tolerance: Array
     states: Array | None
     """States to start from that need not follow from the controls."""
+    penalty: Array
+    """The first weight of the squares of what violates a constraint."""
     second_order: bool = eqx.field(static=True)
     regularise: str = eqx.field(static=True)
     line_search: str = eqx.field(static=True)

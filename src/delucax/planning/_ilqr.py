@@ -92,6 +92,9 @@ class ILQR(AbstractPlanner):
         `controls` (multiple shooting): the steps close the gaps. `controls` must then
         be an array, or the number of steps for the controls of the equilibrium. By
         default the states follow from `controls`.
+    - `penalty`: the first weight of the square of what violates a constraint, over two;
+        10 by default. It grows tenfold where the violation does not fall fast. A start
+        near the solution, or a cost much larger than its constraints, wants more.
 
     **Raises:** `ValueError` on an option of the wrong kind or out of its range,
     `parallel` with `regularise="state"`, or `finite_difference` with `second_order`;
@@ -124,6 +127,7 @@ class ILQR(AbstractPlanner):
     parallel: bool = eqx.field(default=False, static=True)
     finite_difference: float | None = eqx.field(default=None, static=True)
     states: Float[Array, "steps n"] | None = parameter(None)
+    penalty: Array = parameter(10.0)
 
     def __check_init__(self):
         where = "ILQR"
@@ -131,6 +135,7 @@ class ILQR(AbstractPlanner):
         for name in ("tolerance", "constraint_tolerance"):
             if getattr(self, name) is not None:
                 check_range(getattr(self, name), name, where)
+        check_positive(self.penalty, "penalty", where)
         check_choice(self.regularise, ("control", "state"), "regularise", where)
         check_choice(self.line_search, SEARCHES, "line_search", where)
         check_bool(self.parallel, "parallel", where)
