@@ -285,3 +285,12 @@ def test_bad_starts():
         dlx.planning.Start.default(3, CHEAP, 5)
     with user_error(match="Start.default: cost must be an AbstractCost"):
         dlx.planning.Start.default(UNSTABLE, 3, 5)
+
+
+def test_a_trajectory_that_runs_away_is_said_to():
+    plant = dlx.LinearDynamics(jnp.array([[30.0]]), jnp.ones((1, 1)), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0], [1.0])
+    U = jnp.zeros((300, 1))
+    with pytest.raises(RuntimeError, match="runs away.*stage .*Start from"):
+        dlx.planning.ilqr(plant, cost, jnp.ones(1), U)
+    assert dlx.planning.ilqr(plant, cost, jnp.ones(1), 300).cost < 1e3

@@ -41,6 +41,14 @@ def checked_plan(
     """The plan; if `throw`, raise unless it is a solution."""
 
     def facts():
+        path = np.isfinite(np.asarray(plan.states)).all(axis=-1)
+        if not path.all():
+            return (
+                "The trajectory runs away: it is not finite from stage "
+                f"{path.argmin()} on. Start from a number of steps, a "
+                "`delucax.planning.Start` with gains that stabilise the plant, or the "
+                "planner's `states`."
+            )
         words = (
             f"After {int(plan.iterations)} iterations the cost is "
             f"{float(plan.cost):.6g} and the residual {float(plan.residual):.2g}."
