@@ -15,14 +15,14 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import is_concrete
-from .._jax import by_lanes, deferred, hoisted, nan_tangent
+from .._jax import deferred, nan_tangent
 from .._results import RESULTS
 from ..math import matvec
 from ..math._linear_solve import full_precision
 from ..math._small import products_whole
 from ._augmented import with_constraints
-from ._descent import Options, Outcome
+from ._descent import Outcome
+from ._implicit_rule import implicit
 from ._lq import (
     apply,
     costates_of,
@@ -34,7 +34,7 @@ from ._lq import (
     Stages,
 )
 from ._problem import Multipliers, Problem
-from ._start import controls_of, Start
+from ._start import controls_of
 
 
 REFINEMENTS = 20
@@ -43,49 +43,11 @@ STIFFER = 10.0
 """The weight of the constraints in it, relative to the planner's last one."""
 
 
-def solution(problem: Problem, start: Start, options: Options) -> Outcome:
-    """The outcome of the iteration, differentiable with respect to the problem."""
-    # Traced here: a derivative repeats the program, not the tracing of it.
-    iteration = hoisted(with_constraints, problem, start, options)
-    closed_over = jax.tree.leaves(iteration)
-    # The derivative, traced elsewhere, would meet it as a tracer that has escaped.
-    traced = not all(map(is_concrete, closed_over))
-    return _solution(iteration, problem, start, options, traced)
-
-
-@eqx.filter_custom_jvp
-def _solution(iteration: Any, *given: Any) -> Outcome:
-    return by_lanes(iteration, *given[:-1])
-
-
-@_solution.def_jvp
-@full_precision
-def _solution_jvp(primals: Any, tangents: Any) -> Any:
-    closed_over, change, *_ = tangents
-    *given, traced = primals[1:]
-    if traced or jax.tree.leaves(closed_over):
-        raise ValueError(
-            "ILQR: the dynamics, the cost or a constraint closes over a number that is "
-            "differentiated, or that a transformation outside traces. Make it a field "
-            "of a module, a `delucax.parameter()`."
-        )
-    out = _solution(*primals)
-    # None is a tangent of zero that is known to be one.
-    nothing = jax.tree.map(lambda _: None, out)
-    if not jax.tree.leaves(change):
-        return out, nothing
-    return out, nothing._replace(**_tangents(out, given, change))
-
-
-@products_whole()
-def _tangents(out: Outcome, primals: Any, change: Any) -> dict[str, Array]:
+def _tangents(
+    out: Outcome, primals: Any, varied: Any, rest: Any, change: Any
+) -> dict[str, Array]:
     """The tangents of the trajectory, its cost and the gains."""
     problem, start, options = primals
-    # Only what has a tangent is varied below, so that nothing else is differentiated.
-    has_tangent = jax.tree.map(
-        lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
-    )
-    varied, rest = eqx.partition(problem, has_tangent)
     solved = out.result == RESULTS.successful
     # A failed outcome is not used, but derivatives at it must be finite for those of
     # other members of a batch: so they are taken at the start.
@@ -269,3 +231,7 @@ def substitute(
 
     last, (dX, dU) = lax.scan(forward, dx0, (stages.F, factors.K, change, stages.d))
     return jnp.concatenate([dX, last[None]]), dU
+
+
+solution = implicit("ILQR", with_constraints, _tangents)
+"""The outcome of the iteration, differentiable with respect to the problem."""

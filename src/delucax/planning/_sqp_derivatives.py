@@ -9,68 +9,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._check import is_concrete
-from .._jax import by_lanes, deferred, hoisted, nan_tangent
+from .._jax import deferred, nan_tangent
 from .._results import RESULTS
 from ..math._linear_solve import full_precision
 from ..math._small import products_whole
 from ..qp._derivatives import moved_with
 from ._convex import convexified, made_convex
-from ._problem import Problem
+from ._implicit_rule import implicit
 from ._sqp_iteration import (
     curved,
     form_of,
     gains_of,
     iterated,
-    Options,
     Outcome,
     rows_left,
 )
-from ._start import Start
 from ._transcription import expanded, Iterate, limits_of, slopes
 
 
-def solution(problem: Problem, start: Start, options: Options) -> Outcome:
-    """The outcome of the iteration, differentiable with respect to the problem."""
-    # Traced here: a derivative repeats the program, not the tracing of it.
-    iteration = hoisted(iterated, problem, start, options)
-    # The derivative, traced elsewhere, would meet it as a tracer that has escaped.
-    traced = not all(map(is_concrete, jax.tree.leaves(iteration)))
-    return _solution(iteration, problem, start, options, traced)
-
-
-@eqx.filter_custom_jvp
-def _solution(iteration: Any, *given: Any) -> Outcome:
-    return by_lanes(iteration, *given[:-1])
-
-
-@_solution.def_jvp
-@full_precision
-def _solution_jvp(primals: Any, tangents: Any) -> Any:
-    closed_over, change, *_ = tangents
-    problem, *_, traced = primals[1:]
-    if traced or jax.tree.leaves(closed_over):
-        raise ValueError(
-            "SQP: the dynamics, the cost or a constraint closes over a number that is "
-            "differentiated, or that a transformation outside traces. Make it a field "
-            "of a module, a `delucax.parameter()`."
-        )
-    out = _solution(*primals)
-    # None is a tangent of zero that is known to be one.
-    nothing = jax.tree.map(lambda _: None, out)
-    if not jax.tree.leaves(change):
-        return out, nothing
-    return out, nothing._replace(**_tangents(out, problem, change))
-
-
-@products_whole()
-def _tangents(out: Outcome, problem: Problem, change: Any) -> dict[str, Any]:
+def _tangents(
+    out: Outcome, given: Any, varied: Any, rest: Any, change: Any
+) -> dict[str, Any]:
     """The tangents of the trajectory, the multipliers and the gains."""
-    # Only what has a tangent is varied below, so that nothing else is differentiated.
-    has_tangent = jax.tree.map(
-        lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
-    )
-    varied, rest = eqx.partition(problem, has_tangent)
+    problem = given[0]
     converged = out.result == RESULTS.successful
     # Derivatives at a failed outcome must be finite for those of other members of a
     # batch, so they are taken at the first state.
@@ -142,3 +103,7 @@ def _tangents(out: Outcome, problem: Problem, change: Any) -> dict[str, Any]:
     # Few need it, and it takes the third derivatives of the problem.
     dK = deferred(gains, out.gains, (varied, rest, at), (change, moved))
     return dict(at=moved, gains=nan_tangent(dK, ok))
+
+
+solution = implicit("SQP", iterated, _tangents)
+"""The outcome of the iteration, differentiable with respect to the problem."""
