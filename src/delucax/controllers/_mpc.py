@@ -1,11 +1,13 @@
 """Model predictive control."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Int, PyTree
 
@@ -22,13 +24,13 @@ from .._check import (
 from .._check_models import check_cost_sizes
 from .._controller import AbstractController, Tally
 from .._jax import host_unless_traced, xp
-from .._module import function_field
+from .._module import as_float_array, function_field
 from .._results import Result, RESULTS
 from .._typing import Control, Difference, Observation, PRNGKey, RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..planning import AbstractPlanner, Constraints, ILQR, Plan, Start
+from ..planning import AbstractPlanner, Constraints, ILQR, Plan, Problem, SQP, Start
 from ._operating_point import check_state, deviation
 
 
@@ -40,6 +42,8 @@ class MPCState(NamedTuple):
     failures: Tally
     iterations: Int[Array, ""]
     key: PRNGKey | None
+    fallback: PyTree
+    prepared: PyTree = None
 
 
 class MPC(AbstractController):
@@ -74,7 +78,22 @@ class MPC(AbstractController):
     [`delucax.planning.Start`][], the last plan a step later, from which the next one
     starts. A plan that ran out of iterations or found no descent is used as it is, the
     best so far. Where there is none to use, since every start diverges or the
-    constraints cannot hold, `throw` says what happens.
+    constraints cannot hold, `throw` and `fallback` say what happens.
+
+    With `real_time` there is no search: each step solves one quadratic program of
+    [`delucax.planning.SQP`][] about the last plan a step later, and takes its full
+    step. `prepare` sets the program up before the state is measured, and `feedback`
+    solves it with at most `max_qp_steps` linear systems, `state.iterations` of them:
+
+        state = mpc.init()
+        while True:
+            state = mpc.prepare(t, state)
+            y = measure()
+            u, state = mpc.feedback(t, y, state)
+
+    A call of the controller does both. The first plan is about the first of `start`,
+    which a converged plan may give. Where a program cannot be solved, the next one is
+    about the same plan, a step later.
 
     Derivatives are those of the planner: of [`delucax.planning.ILQR`][] by the implicit
     function theorem, NaN where a plan did not converge. For a planner that samples they
@@ -101,7 +120,12 @@ class MPC(AbstractController):
     - `throw`: raise at run time where there is no plan to use (default). If false, the
         last plan is used for one more step, under its gains, and then discarded; if
         there is no plan in the next step either, the first one of `start`, by default
-        the LQR, is applied.
+        the LQR, is applied. With `real_time` the last plan is followed on.
+    - `fallback`: a controller to use in a step without a plan, which then does not
+        raise. Its state advances in every step. None by default.
+    - `real_time`: one quadratic program for each step, by
+        [`delucax.planning.SQP`][], the default planner then; false by default.
+    - `max_qp_steps`: the most linear systems of such a program, 50 by default.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
         planners that take them; none by default.
     - `difference`: `(x, x_ref) -> deviation`, as for the planner; subtraction by
@@ -111,7 +135,7 @@ class MPC(AbstractController):
     time as `throw` says.
 
     Source: Richalet, Rault, Testud and Papon, 1978; Diehl, Bock and Schloeder, 2005
-    (warm start).
+    (warm start and real-time iteration).
 
     !!! example
 
@@ -137,6 +161,9 @@ class MPC(AbstractController):
     constraints: Constraints | None
     difference: Difference | None = function_field()
     throw: bool = eqx.field(static=True)
+    fallback: AbstractController | None
+    real_time: bool = eqx.field(static=True)
+    max_qp_steps: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -150,6 +177,9 @@ class MPC(AbstractController):
         throw: bool = True,
         constraints: Constraints | None = None,
         difference: Difference | None = None,
+        fallback: AbstractController | None = None,
+        real_time: bool = False,
+        max_qp_steps: int = 50,
     ):
         where = "MPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
@@ -171,7 +201,10 @@ class MPC(AbstractController):
             start = Start.default(dynamics, cost, horizon, controls=start)
         self.dynamics, self.cost = dynamics, cost
         self.start = start.stacked(dynamics.state_size)
-        self.planner = ILQR() if planner is None else planner
+        self.real_time = check_bool(real_time, "real_time", where)
+        self.max_qp_steps = check_count(max_qp_steps, "max_qp_steps", where)
+        self.planner = planner or (SQP() if real_time else ILQR())
+        self.fallback = fallback
         self.constraints, self.difference = constraints, difference
         self.throw = check_bool(throw, "throw", where)
 
@@ -193,20 +226,109 @@ class MPC(AbstractController):
                 f"states and gains, got shape {start.controls.shape}."
             )
         check_control_bounds(self.bounds, m, where)
+        if self.fallback is not None:
+            check_instance(self.fallback, AbstractController, "fallback", where)
+        if self.real_time and not isinstance(self.planner, SQP):
+            raise ValueError(
+                f"{where}: planner must be a `delucax.planning.SQP` with real_time, "
+                f"got {type(self.planner).__name__}."
+            )
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
         draws = self.planner.is_stochastic
         if draws:
             check_key(key, "MPC.init")
+        fallback = None
+        if self.fallback is not None:
+            spare = None if key is None else jr.fold_in(key, 1)
+            fallback = self.fallback.init(key=spare)
         return MPCState(
-            last=_first(self.start),
+            last=self._first(),
             result=jax.tree.map(jnp.asarray, RESULTS.successful),
             failures=Tally("failed_plan"),
             iterations=jnp.zeros((), int),
             key=key if draws else None,
+            fallback=fallback,
         )
 
+    def _first(self) -> Start:
+        """The first start, with multipliers of zero."""
+        first, n = _first(self.start), self.dynamics.state_size
+        x0: Any = np.zeros(n, first.controls.dtype)
+        problem = self._problem(0.0, x0, x0.dtype)
+        y = self.planner.first_multipliers(problem, first.horizon)
+        return dataclasses.replace(first, multipliers=y)
+
+    def _problem(self, t: RealScalar, y: Observation, dtype: Any) -> Problem:
+        return Problem(
+            self.dynamics,
+            self.cost,
+            jnp.asarray(y, dtype),
+            jnp.asarray(t, dtype),
+            bounds=jax.tree.map(lambda b: b.astype(dtype), self.bounds),
+            difference=self.difference,
+            constraints=self.constraints,
+        )
+
+    def prepare(self, t: RealScalar, state: MPCState) -> MPCState:
+        """With `real_time`: set up the program of a step, before its state is known.
+
+        **Arguments:**
+
+        - `t`: the time of the step.
+        - `state`: as `init`, `feedback` or a call returns it.
+
+        **Returns:** the state for `feedback`.
+        """
+        self._check_real_time("prepare")
+        return self._prepared(as_float_array(t), state)
+
+    @eqx.filter_jit
+    def _prepared(self, t: RealScalar, state: MPCState) -> MPCState:
+        last, planner = state.last, self.planner
+        assert last.states is not None and isinstance(planner, SQP)
+        problem = self._problem(t, last.states[0], last.controls.dtype)
+        return state._replace(prepared=planner.prepare(problem, last))
+
+    def feedback(
+        self, t: RealScalar, y: Observation, state: MPCState
+    ) -> tuple[Control, MPCState]:
+        """With `real_time`: solve the program for the state.
+
+        **Arguments:**
+
+        - `t`: the time of the step, as for `prepare`.
+        - `y`: the state of the plant.
+        - `state`: as `prepare` returns it.
+
+        **Returns:** `(u, state)`.
+
+        **Raises:** `ValueError` without `prepare`; an error at run time as `throw`
+        says.
+        """
+        self._check_real_time("feedback")
+        check_state(self, y, self.dynamics.state_size)
+        if state.prepared is None:
+            raise ValueError("MPC.feedback: state must come from prepare.")
+        u, lost, result, state = self._fed_back(as_float_array(t), y, state)
+        return self._checked(u, lost, result), state
+
+    @eqx.filter_jit
+    def _fed_back(self, t, y, state):
+        planner = self.planner
+        assert isinstance(planner, SQP)
+        problem = self._problem(t, y, state.last.controls.dtype)
+        plan = planner.feedback(problem, state.prepared, self.max_qp_steps)
+        u, lost, after = self._moved_on(t, y, plan, state)
+        return u, lost, plan.result, after._replace(prepared=None)
+
+    def _check_real_time(self, name: str):
+        if not self.real_time:
+            raise ValueError(f"MPC.{name}: real_time must be True.")
+
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
+        if self.real_time:
+            return self.feedback(t, y, self.prepare(t, state))
         check_state(self, y, self.dynamics.state_size)
         key, draw = state.key, None
         if self.planner.is_stochastic:
@@ -227,27 +349,40 @@ class MPC(AbstractController):
             key=draw,
             throw=False,
         )
-        u, lost, after = self._moved_on(y, plan, state._replace(key=key))
-        if self.throw and (isinstance(lost, Tracer) or lost):
+        u, lost, after = self._moved_on(
+            as_float_array(t), y, plan, state._replace(key=key)
+        )
+        return self._checked(u, lost, plan.result), after
+
+    def _checked(self, u: Control, lost: Array, result: Result) -> Control:
+        throw = self.throw and self.fallback is None
+        if throw and (isinstance(lost, Tracer) or lost):
             # Attached to the control, which every caller uses: attached to the state it
             # would be removed as dead code where the state is not read.
-            u = plan.result.error_if(u, lost)
-        return u, after
+            return result.error_if(u, lost)
+        return u
 
     @eqx.filter_jit
-    def _moved_on(self, y: Observation, plan: Plan, state: MPCState) -> Any:
+    def _moved_on(
+        self, t: RealScalar, y: Observation, plan: Plan, state: MPCState
+    ) -> Any:
         """The control, whether there is no plan to use, and the next state."""
         # Usable plans include those that ran out of iterations: the best so far beats
         # the last one, which is a step older.
         lost, u = ~plan.is_usable, plan.controls[0]
-        u = jnp.where(lost, self._followed(y, state.last), u)
+        spare, fallback = self._followed(y, state.last), None
+        if self.fallback is not None:
+            spare, fallback = self.fallback(t, y, state.fallback)
+        u = jnp.where(lost, spare, u)
         # The warm start is the plan a step later, its last step held for the new one. A
-        # lost plan is forgotten, or the next one would start from what had failed.
-        shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
-        later = Start(*(shift(a) for a in (plan.controls, plan.states, plan.gains)))
-        renewed = lambda new, old: jnp.where(lost, old[0], new).astype(old.dtype)
+        # lost plan is forgotten, or the next one would start from what had failed. One
+        # program that has no solution says nothing against the plan it is about.
+        now = Start(plan.controls, plan.states, plan.gains, plan.multipliers)
+        instead = state.last.shifted() if self.real_time else self._first()
+        renewed = lambda new, old: jnp.where(lost, old, new).astype(old.dtype)
         after = state._replace(
-            last=jax.tree.map(renewed, later, self.start),
+            last=jax.tree.map(renewed, now.shifted(), instead),
+            fallback=fallback,
             result=plan.result,
             failures=state.failures.add(plan.result != RESULTS.successful),
             iterations=jnp.asarray(plan.iterations, state.iterations.dtype),
@@ -278,4 +413,5 @@ def _joined(last: Start, starts: Start) -> Start:
     """All starts as one batch, of which the planner refines the cheapest."""
     # The last plan comes first: of starts of equal cost the first is taken.
     join = lambda a, b: xp.concatenate([a[None], b])
-    return jax.tree.map(join, last, starts)
+    joined = jax.tree.map(join, last.trajectories, starts.trajectories)
+    return dataclasses.replace(joined, multipliers=last.multipliers)

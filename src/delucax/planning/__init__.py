@@ -7,6 +7,7 @@ from ._constraints import (
 from ._count import count_evaluations as count_evaluations
 from ._ilqr import ILQR as ILQR, ilqr as ilqr
 from ._iterative_learning import igpc as igpc, ilc as ilc
+from ._multipliers import Multipliers as Multipliers
 from ._plan import Plan as Plan
 from ._planner import AbstractPlanner as AbstractPlanner
 from ._problem import Problem as Problem

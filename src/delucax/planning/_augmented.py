@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from .._results import choose, RESULTS
 from ._descent import optimise, Options, Outcome
-from ._problem import Multipliers, Problem, updated, violated
-from ._start import Start
+from ._multipliers import in_order
+from ._problem import Augmentation, Problem, updated, violated
+from ._start import controls_of, Start
 
 
 _RHO_GROWTH = 10.0
@@ -24,7 +25,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
     Source: Bertsekas, 1982; Howell, Jackson and Manchester, 2019 (in this setting).
     """
     n, dtype = problem.x0.shape[0], problem.x0.dtype
-    starts = start.stacked(n)
+    starts = start.stacked(n).trajectories
     count, T, m = starts.controls.shape
     if problem.constraints is None:
         return optimise(problem, starts, count, options)
@@ -61,7 +62,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         after = after._replace(
             violation=violation,
             # The new multipliers are those of the weight that was minimised with.
-            multipliers=Multipliers(stage, final, raised),
+            multipliers=Augmentation(stage, final, raised),
             result=choose(lost, RESULTS.diverged, result),
         )
         # Once the constraints hold, the last minimisations are to full precision.
@@ -75,7 +76,15 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
     states = jnp.zeros((T + 1, n), dtype) if options.states is None else options.states
     sizes = jax.eval_shape(problem.constraints_along, states, starts.controls[0])
     stage, final = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
-    zero = jnp.zeros((), dtype)
+    rho, zero = jnp.asarray(options.penalty, dtype), jnp.zeros((), dtype)
+    given = start.multipliers
+    if given is not None:
+        args = problem.t0, problem.x0, controls_of(start)[0]
+        stage = in_order(problem.constraints, False, args, given.stage, stage)
+        final = in_order(problem.constraints, True, args[:2], given.final, final)
+        if given.penalty is not None:
+            # A step down, or along many plans it would only ever grow.
+            rho = jnp.maximum(rho, given.penalty / _RHO_GROWTH)
     first = Outcome(
         states=states,
         controls=starts.controls[0],
@@ -88,9 +97,9 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         rollouts=jnp.zeros((), int),
         regularisation=zero,
         violation=jnp.full((), jnp.inf, dtype),
-        multipliers=Multipliers(stage, final, jnp.asarray(options.penalty, dtype)),
+        multipliers=Augmentation(stage, final, rho),
     )
-    # The first minimisations are coarse, because their multipliers are wrong anyway.
+    # The first minimisations are coarse, because their multipliers are wrong.
     coarse = jnp.full((), 1e-2, dtype)
     carry = first, starts, jnp.asarray(count, int), coarse, jnp.asarray(False)
     out, *_ = lax.while_loop(lambda carry: ~carry[-1], body, carry)

@@ -28,7 +28,7 @@ class SoftConstraint(eqx.Module):
         default.
     - `quadratic`: likewise.
 
-    **Raises:** `ValueError` on what is no function, or on a weight that is negative or
+    **Raises:** `ValueError` if `function` is not callable, or a weight is negative or
     not finite.
 
     Source: Kerrigan and Maciejowski, 2000.
@@ -65,9 +65,11 @@ class SoftConstraint(eqx.Module):
 
 
 def _as_functions(value: Any) -> Any:
-    """A function, or several by their names."""
+    """A function, or a dictionary of functions."""
     if isinstance(value, Mapping):
-        return {str(name): as_module(function) for name, function in value.items()}
+        # In the order that JAX gives to the keys of a dictionary.
+        names = sorted(value, key=str)
+        return {str(name): as_module(value[name]) for name in names}
     return as_module(value)
 
 
@@ -86,32 +88,34 @@ class Constraints(eqx.Module):
     `equality(t, x, u) = 0` at each step, `final_inequality(t, x) <= 0` and
     `final_equality(t, x) = 0` at the end, and bounds.
 
-    Each function returns a number or a vector. Several are a dictionary, whose names
-    stand in messages. The constraints of a step hold at the first one too, where the
-    state is given: one on the state alone must hold there anyway. Bounds on the
+    Each function returns a number or a vector. To give several, use a dictionary: its
+    keys name them in messages and in [`delucax.planning.Multipliers`][]. The
+    constraints of a step include the first step, whose state is given: a constraint on
+    the state alone must already hold there. Bounds on the
     controls alone are cheaper as `bounds` of the planner.
 
     **Arguments:**
 
     - `inequality`: a function of time, state and control, a
-        [`delucax.planning.SoftConstraint`][], or a dictionary of such; none by default.
+        [`delucax.planning.SoftConstraint`][], or a dictionary of them; none by default.
     - `equality`: likewise; none by default.
     - `final_inequality`: likewise, of time and the last state; none by default.
     - `final_equality`: likewise; none by default.
     - `states`: `(low, high)`, each a number, or of shape `(n,)` or `(T+1, n)`; or a
-        [`delucax.qp.Soft`][] of them. The first state is given, so that the first row
-        has no part. None by default.
+        [`delucax.qp.Soft`][] of them. The first row is ignored, because the first state
+        is given. None by default.
     - `controls`: likewise, `(m,)` or `(T, m)`. Bounds that do not vary in time are
         better `bounds` of the planner. None by default.
 
-    Soft constraints, and the bounds `states` and `controls`, are those of
-    [`delucax.planning.SQP`][].
+    Only [`delucax.planning.SQP`][] takes soft constraints and the bounds `states` and
+    `controls`.
 
     A function that is a module with [`delucax.parameter`][] fields can be
     differentiated with respect to them.
 
-    **Raises:** `ValueError` if one is not a function, a pair of bounds is none, or
-    nothing is given.
+    **Raises:** `ValueError` if a constraint is not callable, bounds are not a pair of
+    numbers with `low <= high`, two constraints of a step or of the end share a name, or
+    no constraint is given.
 
     !!! example
 
@@ -149,6 +153,13 @@ class Constraints(eqx.Module):
         for field in _FUNCTIONS:
             for name, function in self.named(field).items():
                 check_function(function, name, where)
+        for start in ("", "final_"):
+            pair = (self.named(f"{start}{kind}") for kind in ("inequality", "equality"))
+            if twice := set.intersection(*map(set, pair)):
+                raise ValueError(
+                    f"{where}: {start}inequality and {start}equality must have "
+                    f"different names, got {sorted(twice)} in both."
+                )
         for field in ("states", "controls"):
             value = getattr(self, field)
             if value is None or isinstance(value, Soft):
@@ -161,6 +172,8 @@ class Constraints(eqx.Module):
             if not all(map(is_concrete, value)):
                 continue
             low, high = map(np.asarray, value)
+            if low.dtype.kind not in "iuf" or high.dtype.kind not in "iuf":
+                raise ValueError(f"{where}: {field} must be numbers, got {value}.")
             if not np.all(low <= high):
                 raise ValueError(
                     f"{where}: {field} must have low <= high, got {low} and {high}."
@@ -214,7 +227,6 @@ def rows_of(constraints: Constraints, final: bool, arguments: tuple) -> list[Row
     """What those values are, in their order."""
     rows = []
     for name, function, equal in _each(constraints, final):
-        # Sizes are static: nothing is computed.
         like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *arguments)
         leaves = jax.tree.leaves(like)
         if len(leaves) != 1 or not hasattr(leaves[0], "shape"):
@@ -223,7 +235,14 @@ def rows_of(constraints: Constraints, final: bool, arguments: tuple) -> list[Row
             )
         soft = isinstance(function, SoftConstraint)
         weights = (function.linear, function.quadratic) if soft else None
-        rows.append(Row(name, int(np.prod(leaves[0].shape)), equal, weights))
+        size = int(np.prod(leaves[0].shape))
+        for weight in weights or ():
+            if np.shape(weight) not in ((), (size,)):
+                raise ValueError(
+                    f"SoftConstraint: the weights of {name} must be numbers or have "
+                    f"shape ({size},), got shape {np.shape(weight)}."
+                )
+        rows.append(Row(name, size, equal, weights))
     return rows
 
 
@@ -236,8 +255,8 @@ def _each(constraints: Constraints, final: bool):
 
 
 def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any) -> str:
-    """In words, which constraint is violated most, by how much, and where."""
-    T, found = len(controls), []
+    """A sentence that names the most violated constraint, by how much, and where."""
+    T, violations = len(controls), []
     times = problem.times(T)
     stage = jax.vmap(lambda t, x, u: problem.stage_constraints(t, x, u)[0])
     each = stage(times[:-1], states[:-1], controls)
@@ -250,7 +269,7 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
             start += row.size
             if row.weights is None and row.size:
                 over = np.abs(c) if row.is_equality else np.maximum(c, 0)
-                found.append((np.nan_to_num(over, nan=np.inf), row.name, final))
+                violations.append((np.nan_to_num(over, nan=np.inf), row.name, final))
     for name, value, shown in (
         ("states", constraints.states, states[1:]),
         ("controls", constraints.controls, controls),
@@ -264,10 +283,10 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
             for end in value
         )
         over = np.maximum(np.maximum(low - shown, shown - high), 0)
-        found.append((over, f"bound of {name}", False))
-    if not found:
+        violations.append((over, f"bound of {name}", False))
+    if not violations:
         return ""
-    over, name, final = max(found, key=lambda entry: entry[0].max())
+    over, name, final = max(violations, key=lambda entry: entry[0].max())
     if not over.max() > 0:
         return ""
     k, i = (int(j) for j in np.unravel_index(over.argmax(), over.shape))

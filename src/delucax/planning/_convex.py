@@ -41,8 +41,8 @@ class Held(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What is added: of the squares of the rows that are held, of those of all
-    variables, and of those of the controls."""
+    """The weights of what is added to the cost: the squares of the rows that are held,
+    of all variables, and of the controls."""
 
     rows: Array
     variables: Array
@@ -55,7 +55,8 @@ def held_rows(limits: Limits, sides: Array, low: Array, high: Array) -> Held:
     at_high, at_low = upper > jnp.abs(high), lower > jnp.abs(low)
     # A soft row that is violated is a part of the cost.
     v = jnp.where(limits.hard, jnp.inf, limits.linear)
-    held = (at_high & (upper < v)) | (at_low & (lower < v)) | (low == high)
+    held = (at_high | (low == high)) & (upper < v) | at_low & (lower < v)
+    held = held & (jnp.abs(upper - lower) < v)
     target = jnp.where(at_low, low, high)
     return Held(held, jnp.where(held, target, 0))
 
@@ -63,8 +64,9 @@ def held_rows(limits: Limits, sides: Array, low: Array, high: Array) -> Held:
 def convexified(
     limits: Limits, model: Model, held: Held, last: Array, controls: Array
 ) -> tuple[Convex, Weights]:
-    """The convex cost, and what had to be added: first nothing, then the squares of the
-    rows that are held, as of an augmented Lagrangian, then a multiple of the identity.
+    """The convex cost, and the weights of what was added. If the cost itself will not
+    do, the squares of the rows that are held are added, as in an augmented Lagrangian,
+    and then a multiple of the identity.
 
     Source: Waechter and Biegler, 2006 (how the multiple is found, from the `last`).
     """
@@ -75,21 +77,21 @@ def convexified(
         k, weights, _ = carry
         stiff = jnp.where(k > 0, STIFF * largest, 0)
         weights = weights._replace(rows=stiff)
-        found = made_convex(limits, model, held, weights)
+        convex = made_convex(limits, model, held, weights)
         wanted = jnp.where(last > 0, jnp.maximum(least, last / 3), least)
         delta = weights.variables
         more = jnp.where(k == 0, 0, jnp.where(delta > 0, 8 * delta, wanted))
-        delta = jnp.where(found.shift > 0, more, delta)
-        return k + 1, weights._replace(variables=delta), found
+        delta = jnp.where(convex.shift > 0, more, delta)
+        return k + 1, weights._replace(variables=delta), convex
 
     def going(carry):
-        k, _, found = carry
-        return (k == 0) | ((k < _TRIES) & (found.shift > 0))
+        k, _, convex = carry
+        return (k == 0) | ((k < _TRIES) & (convex.shift > 0))
 
-    none = Weights(jnp.zeros_like(least), jnp.zeros_like(least), controls)
+    plain = Weights(jnp.zeros_like(least), jnp.zeros_like(least), controls)
     (T, n, N), dtype = model.F.shape, model.h.dtype
     zeros = lambda *shape: jnp.zeros(shape, dtype)
-    nothing = Convex(
+    empty = Convex(
         zeros(T + 1, N, N),
         zeros(T + 1, N),
         zeros(T + 1, n, n),
@@ -98,7 +100,7 @@ def convexified(
         zeros(),
     )
     _, weights, convex = lax.while_loop(
-        going, again, (jnp.zeros((), int), none, nothing)
+        going, again, (jnp.zeros((), int), plain, empty)
     )
     return convex, weights
 

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
 from ._lq import in_parallel, in_sequence, model, Policy, predicted_change, Stages
-from ._problem import Multipliers, Problem, roll_out
+from ._problem import Augmentation, Problem, roll_out
 from ._start import Start
 
 
@@ -58,7 +58,7 @@ class Outcome(NamedTuple):
     rollouts: Array
     regularisation: Array
     violation: Array | None = None
-    multipliers: Multipliers | None = None
+    multipliers: Augmentation | None = None
 
 
 class _Progress(NamedTuple):

@@ -22,9 +22,10 @@ from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
 from ._descent import Options, SEARCHES
 from ._implicit import solution
+from ._multipliers import by_name, Multipliers, zeros_like_result
 from ._plan import Plan
 from ._planner import AbstractPlanner
-from ._problem import Problem
+from ._problem import Augmentation, Problem
 from ._start import Start
 
 
@@ -152,6 +153,11 @@ class ILQR(AbstractPlanner):
     def starts_from_states(self) -> bool:
         return self.states is not None
 
+    def first_multipliers(self, problem: Problem, horizon: int) -> Multipliers | None:
+        if problem.constraints is None:
+            return None
+        return zeros_like_result(_zero_multipliers, problem, horizon)
+
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         where, dtype = "ILQR", start.controls.dtype
@@ -159,8 +165,8 @@ class ILQR(AbstractPlanner):
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
         if problem.constraints is not None and not problem.constraints.is_hard:
             raise ValueError(
-                f"{where}: soft constraints, and bounds as constraints, are those of "
-                "`delucax.planning.SQP`."
+                f"{where}: constraints must be hard and given by functions; for soft "
+                "ones, and for bounds of states, use `delucax.planning.SQP`."
             )
         states = self.states
         if states is not None:
@@ -265,5 +271,22 @@ def ilqr(
 @eqx.filter_jit
 def _solve(problem: Problem, start: Start, options: Options) -> Plan:
     fields = solution(problem, start, options)._asdict()
-    del fields["multipliers"]
+    if fields["multipliers"] is not None:
+        fields["multipliers"] = _named(problem, fields["multipliers"])
     return problem.plan(**fields)
+
+
+def _named(problem: Problem, y: Augmentation) -> Multipliers:
+    u = jnp.zeros(problem.dynamics.control_size, problem.x0.dtype)
+    args = problem.t0, problem.x0, u
+    stage = by_name(problem.constraints, False, args, y.stage)
+    final = by_name(problem.constraints, True, args[:2], y.final)
+    return Multipliers(stage, final, penalty=y.rho)
+
+
+def _zero_multipliers(problem: Problem, horizon: int) -> Multipliers:
+    dtype, dynamics = problem.x0.dtype, problem.dynamics
+    x = jnp.zeros((horizon + 1, dynamics.state_size), dtype)
+    u = jnp.zeros((horizon, dynamics.control_size), dtype)
+    (stage, _), (final, _) = problem.constraints_along(x, u)
+    return _named(problem, Augmentation(stage, final, jnp.zeros((), dtype)))

@@ -33,7 +33,7 @@ from ._lq import (
     solve_free,
     Stages,
 )
-from ._problem import Multipliers, Problem
+from ._problem import Augmentation, Problem
 from ._start import controls_of
 
 
@@ -81,12 +81,12 @@ def _tangents(
     about = varied, rest, X, U, y, out.regularisation, free
     dK = deferred(gains, out.gains, about, (change, dX, dU, dy))
     ok = solved & definite
-    dX, dU, dK, dJ = (nan_tangent(d, ok) for d in (dX, dU, dK, dJ))
-    return dict(states=dX, controls=dU, gains=dK, cost=dJ)
+    changes = dict(states=dX, controls=dU, gains=dK, cost=dJ, multipliers=dy)
+    return jax.tree.map(lambda d: nan_tangent(d, ok), changes)
 
 
 def _change(
-    X: Array, U: Array, y: Multipliers | None, problem: Problem, given, varied, change
+    X: Array, U: Array, y: Augmentation | None, problem: Problem, given, varied, change
 ):
     """The tangents of states, controls and multipliers; which controls are free; and
     whether the solution is a strict minimum."""
@@ -175,7 +175,7 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
     nothing = jnp.zeros_like(y.stage), jnp.zeros_like(y.final)
     dy, _ = lax.scan(refine, nothing, None, length=REFINEMENTS)
     dX, dU, dy = minimum(dy)
-    change = Multipliers(dy[0], dy[1], jnp.zeros_like(y.rho))
+    change = Augmentation(dy[0], dy[1], jnp.zeros_like(y.rho))
     return dX, dU, change, jnp.all(factors.ok)
 
 

@@ -13,6 +13,7 @@ from .._results import Result, RESULTS
 from .._typing import RealScalar
 from ..math import matvec
 from ..math._steps import row_at, step_at
+from ._multipliers import Multipliers
 
 
 class Plan(AbstractController):
@@ -40,6 +41,8 @@ class Plan(AbstractController):
         largest change of a control in the last iteration.
     - `violation`: by how much a constraint is violated, or is inactive although its
         multiplier is not zero; 0 without constraints.
+    - `multipliers`: [`delucax.planning.Multipliers`][] of the constraints; `None`
+        without constraints, or of a planner that has none.
     - `result`: success, or why not; one of `delucax.RESULTS`.
     - `iterations`: the iterations taken.
     - `rollouts`: the trajectories computed, each candidate of a line search being one.
@@ -71,6 +74,7 @@ class Plan(AbstractController):
     trace: Array
     residual: Array
     violation: Array
+    multipliers: Multipliers | None
     result: Result
     iterations: Array
     rollouts: Array

@@ -30,6 +30,7 @@ from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints, worst_of
+from ._multipliers import Multipliers
 from ._plan import Plan
 from ._problem import Problem
 from ._start import operating_point, Start
@@ -45,9 +46,9 @@ def checked_plan(
         if not path.all():
             return (
                 "The trajectory runs away: it is not finite from stage "
-                f"{path.argmin()} on. Start from a number of steps, a "
-                "`delucax.planning.Start` with gains that stabilise the plant, or the "
-                "planner's `states`."
+                f"{path.argmin()} on. Start from a number of steps, from a "
+                "`delucax.planning.Start` with gains that stabilise the plant, or "
+                "from `states` of `ILQR` or `SQP`."
             )
         words = (
             f"After {int(plan.iterations)} iterations the cost is "
@@ -61,7 +62,7 @@ def checked_plan(
     return raise_on_failure(plan, where, throw, "the plan", facts)
 
 
-_TRAJECTORY = "states", "controls", "gains"
+_TRAJECTORY = "controls", "states", "gains"
 
 
 class AbstractPlanner(eqx.Module):
@@ -112,6 +113,18 @@ class AbstractPlanner(eqx.Module):
     def starts_from_states(self) -> bool:
         """Whether it has states to start from, and so takes no feedback."""
         return False
+
+    def first_multipliers(self, problem: Problem, horizon: int) -> Multipliers | None:
+        """Multipliers of zero, of the shapes that a plan has; `None` (default) if its
+        plans have none.
+
+        **Arguments:**
+
+        - `problem`: a [`delucax.planning.Problem`][].
+        - `horizon`: T.
+        """
+        del problem, horizon
+        return None
 
     @abc.abstractmethod
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
@@ -186,7 +199,8 @@ class AbstractPlanner(eqx.Module):
                     f"{where}: states go with an array of controls or a number of "
                     f"steps, got {type(controls).__name__}."
                 )
-            start = Start(controls.controls, controls.states, controls.gains)
+            given = (getattr(controls, name) for name in (*_TRAJECTORY, "multipliers"))
+            start = Start(*given)
             start = start.checked(n, m, "controls", where)
         elif not is_count:
             start = Start(finite_rows(controls, m, "controls", where))
@@ -218,7 +232,7 @@ class AbstractPlanner(eqx.Module):
             T = start.horizon
             spare = [getattr(fallback, name, None) for name in _TRAJECTORY]
             shapes = [getattr(array, "shape", None) for array in spare]
-            if shapes != [(T + 1, n), (T, m), (T, m, n)]:
+            if shapes != [(T, m), (T + 1, n), (T, m, n)]:
                 raise ValueError(
                     f"{where}: fallback must be a plan of {T} steps, or a start with "
                     f"states and gains, got {shortened(fallback)}."

@@ -25,7 +25,7 @@ _SPLIT_UP_TO = 6
 """Trajectories of more components are as fast in one piece, and a shorter program."""
 
 
-class Multipliers(NamedTuple):
+class Augmentation(NamedTuple):
     """The Lagrange multipliers at each step and at the end, and the penalty weight."""
 
     stage: Array  # (T, p)
@@ -97,7 +97,7 @@ class Problem(eqx.Module):
     bounds: tuple[Array, Array] | None = None
     difference: Callable[[Array, Array], Array] | None = None
     constraints: Constraints | None = None
-    multipliers: Multipliers | None = None
+    multipliers: Augmentation | None = None
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
         """The deviation of `x` from `x_ref`, by `difference`.
@@ -156,7 +156,7 @@ class Problem(eqx.Module):
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
 
-    def with_multipliers(self, multipliers: Multipliers | None) -> "Problem":
+    def with_multipliers(self, multipliers: Augmentation | None) -> "Problem":
         """The problem whose cost is the augmented Lagrangian with `multipliers`."""
         return dataclasses.replace(self, multipliers=multipliers)
 
@@ -235,6 +235,7 @@ class Problem(eqx.Module):
             trace=cost[None],
             residual=jnp.full_like(cost, jnp.nan),
             violation=zero,
+            multipliers=None,
             result=choose(finite, RESULTS.successful, RESULTS.diverged),
             iterations=jnp.asarray(0),
             rollouts=jnp.asarray(1),

@@ -2,17 +2,20 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import check_bool, check_count, check_range, finite_rows
 from .._module import parameter
 from .._typing import PRNGKey
+from ._multipliers import Multipliers, zeros_like_result
 from ._plan import Plan
 from ._planner import AbstractPlanner
 from ._problem import Problem
+from ._real_time import fed_back, prepared
 from ._sqp_derivatives import solution
 from ._sqp_iteration import Options
 from ._start import Start
+from ._transcription import Iterate, limits_of, multipliers_of
 
 
 class SQP(AbstractPlanner):
@@ -24,7 +27,7 @@ class SQP(AbstractPlanner):
 
     The unknowns are the states and the controls (multiple shooting), so that an
     unstable plant may start from a guess that does not follow the dynamics. Each
-    iteration solves the quadratic program about the present trajectory, as
+    iteration solves the quadratic program about the current trajectory, as
     [`delucax.qp.solve`][] does, first by guesses of the active sides. Its Hessian is
     that of the Lagrangian, or of the cost (Gauss-Newton); where it is not convex along
     the dynamics, the squares of the constraints that hold with equality are added, and
@@ -42,9 +45,12 @@ class SQP(AbstractPlanner):
     steps meet to that tolerance, and no constraint is violated by more than
     `constraint_tolerance`.
 
-    It is called as every [`delucax.planning.AbstractPlanner`][]. The states start from
-    those that follow from the controls; or, if these violate the constraints by more in
-    sum than the steps miss each other there, from the first state held.
+    The states start from those that follow from the controls. If these violate the
+    constraints more than the first state held at every stage violates the dynamics, in
+    sum, they start from that instead. An earlier plan gives its multipliers too.
+
+    `plan.multipliers` are those of the solution. `plan.cost` leaves out the penalty of
+    violated soft constraints; `plan.trace` includes it.
 
     The plan is differentiable in both modes with respect to every array in `dynamics`,
     `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`, by the implicit function
@@ -110,6 +116,9 @@ class SQP(AbstractPlanner):
     def starts_from_states(self) -> bool:
         return self.states is not None
 
+    def first_multipliers(self, problem: Problem, horizon: int) -> Multipliers:
+        return zeros_like_result(_zero_multipliers, problem, horizon)
+
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         dtype, states = start.controls.dtype, self.states
@@ -131,11 +140,54 @@ class SQP(AbstractPlanner):
         )
         return _solve(problem, start, options)
 
+    def prepare(self, problem: Problem, start: Start) -> PyTree:
+        """The first half of a real-time iteration: the quadratic program about the
+        states and controls of `start`, which need not follow the dynamics. It does not
+        depend on `problem.x0`.
+
+        **Arguments:**
+
+        - `problem`: a [`delucax.planning.Problem`][].
+        - `start`: one start, with states.
+
+        **Returns:** what `feedback` takes, a pytree.
+
+        Source: Diehl, Bock, Schloeder, Findeisen, Nagy and Allgoewer, 2002.
+        """
+        if start.states is None or start.controls.ndim != 2:
+            raise ValueError("SQP.prepare: start must be one start, with states.")
+        return prepared(problem, start, self.second_order)
+
+    def feedback(self, problem: Problem, ready: PyTree, max_steps: int = 50) -> Plan:
+        """The second half: the plan from `problem.x0` after one full step.
+
+        **Arguments:**
+
+        - `problem`: a [`delucax.planning.Problem`][].
+        - `ready`: what `prepare` returns.
+        - `max_steps`: the most linear systems to solve, 50 by default.
+
+        **Returns:** a [`delucax.planning.Plan`][], which is `successful` if the
+        quadratic program was solved. `residual`, `violation` and `iterations` are those
+        of the program.
+        """
+        return fed_back(problem, ready, max_steps)
+
 
 @eqx.filter_jit
 def _solve(problem: Problem, start: Start, options: Options) -> Plan:
     out = solution(problem, start, options)
     fields = out._asdict()
     at = fields.pop("at")
+    limits = limits_of(problem, start.horizon)
+    fields["multipliers"] = multipliers_of(problem, limits, at)
     cost = problem.total(at.states, at.controls)
     return problem.plan(at.states, at.controls, cost, **fields)
+
+
+def _zero_multipliers(problem: Problem, horizon: int) -> Multipliers:
+    limits, x0 = limits_of(problem, horizon), problem.x0
+    states = jnp.zeros((horizon + 1, *x0.shape), x0.dtype)
+    controls = jnp.zeros((horizon, problem.dynamics.control_size), x0.dtype)
+    sides = jnp.zeros((2, *limits.low.shape), x0.dtype)
+    return multipliers_of(problem, limits, Iterate(states, controls, states, sides))

@@ -33,7 +33,7 @@ def _tangents(
     """The tangents of the trajectory, the multipliers and the gains."""
     problem = given[0]
     converged = out.result == RESULTS.successful
-    # Derivatives at a failed outcome must be finite for those of other members of a
+    # Derivatives at a failed outcome must be finite for the sake of other members of a
     # batch, so they are taken at the first state.
     safe = lambda a, b: jnp.where(converged & jnp.isfinite(a), a, b)
     at = Iterate(
@@ -66,8 +66,7 @@ def _tangents(
         now = held._replace(target=jnp.where(held.rows, target, 0))
         own = limits._replace(linear=linear, quadratic=quadratic)
         convex = made_convex(own, here, now, weights)
-        infinite = jnp.full((), jnp.inf, h.dtype)
-        return form_of(own, here, convex, low, high, infinite), convex.s
+        return form_of(own, here, convex, low, high), convex.s
 
     low, high = rows_left(limits, model.values.rows)
     at_solution = model.h, model.values.defects, low, high

@@ -35,6 +35,7 @@ from ._transcription import (
     limits_of,
     measured,
     Model,
+    with_multipliers,
 )
 
 
@@ -42,13 +43,17 @@ HALVINGS = 12
 LEAST_SHARE = 1e-4
 """Of the predicted decrease, the share that the cost falls by (Armijo)."""
 WIDTH, TIMES = 1e4, 15.0
-"""The first width of the funnel, or so many times what is violated at first."""
+"""The first width of the funnel: the first constant, or the second one times the first
+violation, whichever is larger."""
 SHRINK = 0.9
 NARROW = 0.9
 SWITCH = 1e-3
-"""Where the predicted decrease is so much of what is violated, the cost must fall."""
+"""The cost must fall where its predicted decrease is at least this share of the
+violation."""
 FIRST_PRICE = 10.0
-MOST_PRICE = 1e9
+MOST_PRICE = 1e7
+PATIENCE = 50
+"""Iterations after which violations at a price are no longer left to the funnel."""
 GUESSES = 4
 MAX_STEPS = 60
 FIRM = 1e6
@@ -85,7 +90,7 @@ class _Progress(NamedTuple):
     now: Outcome
     model: Model
     price: Array
-    """Of a violation in the program; infinite while there is none to pay."""
+    """Of a violation in the program; infinite while its constraints are hard."""
     width: Array
     """Of the funnel."""
     shift: Array
@@ -98,18 +103,25 @@ def rows_left(limits: Limits, rows: Array) -> tuple[Array, Array]:
     return limits.low - rows, limits.high - rows
 
 
-def form_of(
-    limits: Limits, model: Model, convex: Convex, low: Array, high: Array, price: Array
-) -> StagedForm:
-    """The program, whose hard constraints may be violated at a finite price; hard
+def priced(limits: Limits, price: Array) -> Limits:
+    """The limits whose hard rows may be violated at a price, if that is finite; hard
     bounds of controls may not."""
-    soft, (_, rows) = None, low.shape
-    index = jnp.arange(rows)
+    index = jnp.arange(limits.low.shape[1])
     elastic = (index < limits.states) | (index >= limits.own)
+    elastic = elastic & limits.hard & jnp.isfinite(price)
+    return limits._replace(
+        linear=jnp.where(elastic, price, limits.linear),
+        quadratic=jnp.where(elastic, 0, limits.quadratic),
+    )
+
+
+def form_of(
+    limits: Limits, model: Model, convex: Convex, low: Array, high: Array
+) -> StagedForm:
+    """The quadratic program."""
+    soft, rows = None, low.shape[1]
     if rows > limits.own or limits.states or limits.is_soft:
-        hard = limits.hard
-        v = jnp.where(hard & elastic, price, limits.linear)
-        W = jnp.where(hard & elastic & jnp.isfinite(price), 0, limits.quadratic)
+        v, W = limits.linear, limits.quadratic
         soft = jnp.stack([v, v]), jnp.stack([W, W])
     return StagedForm(
         H=convex.H,
@@ -132,9 +144,8 @@ def infeasibility(limits: Limits, values: Any) -> Array:
 
 
 def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
-    """The largest entry of the gradient of the Lagrangian; the largest error of all
-    conditions but the constraints, over what is allowed at a tolerance of one; and the
-    largest violation."""
+    """The largest entry of the gradient of the Lagrangian; the largest relative error
+    of the optimality conditions without the constraints; and the largest violation."""
     n, rows = at.states.shape[1], model.values.rows
     p, z = at.costates, at.sides[0] - at.sides[1]
     first, last = limits.bounded
@@ -142,10 +153,11 @@ def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
     pushed = jnp.einsum("tpi,tp->ti", model.G, z[:, limits.own :])
     pushed = pushed.at[:, first:last].add(z[:, : limits.own])
     gradient = (model.h - pulled + pushed).at[:, :n].add(p)
-    # The last control stands for nothing.
+    # The controls have no last row; that of the array is padding.
     slope = jnp.max(jnp.abs(gradient.at[-1, n:].set(0)))
     scale = 1 + jnp.maximum(jnp.max(jnp.abs(model.h)), jnp.max(jnp.abs(pulled)))
-    # A multiplier is zero where there is slack, and the price of what is violated.
+    # A multiplier is zero where there is slack, and the price where a soft row is
+    # violated.
     slack = jnp.stack([limits.high - rows, rows - limits.low])
     slack = jnp.where(jnp.isfinite(slack), slack, 0)
     products = jnp.maximum(slack, 0) * at.sides
@@ -191,9 +203,8 @@ def gains_of(limits: Limits, at: Iterate, model: Model) -> Array:
 def started(
     problem: Problem, limits: Limits, start: Start, options: Options
 ) -> Iterate:
-    """The trajectory to start from. That of the controls may run away, and then violate
-    the constraints by more than the steps miss each other where the first state is
-    held: of the two, the one that violates less."""
+    """The trajectory to start from: that of the controls, or, where it runs away, the
+    first state held, whose steps do not meet. The one that violates less."""
     _, states, controls, cost = start.cheapest(problem)
     T, n = controls.shape[0], problem.x0.shape[0]
     controls = _clipped(limits, controls)
@@ -208,7 +219,8 @@ def started(
         lost = ~jnp.isfinite(cost) | ~(bad[0] <= bad[1])
         states = jnp.where(lost, still, states)
     sides = jnp.zeros((2, *limits.low.shape), controls.dtype)
-    return Iterate(states, controls, jnp.zeros_like(states), sides)
+    at = Iterate(states, controls, jnp.zeros_like(states), sides)
+    return with_multipliers(problem, limits, at, start.multipliers)
 
 
 def _clipped(limits: Limits, controls: Array) -> Array:
@@ -223,7 +235,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
     (T, m), n, dtype = at.controls.shape, at.states.shape[1], at.states.dtype
     eps = float(jnp.finfo(dtype).eps)
     zero, infinite = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
-    nothing = empty_model(limits, at)
+    model = empty_model(limits, at)
     now = Outcome(
         at=at,
         gains=jnp.zeros((T, m, n), dtype),
@@ -235,7 +247,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         rollouts=jnp.zeros((), int),
         regularisation=zero,
     )
-    first = _Progress(now, nothing, infinite, infinite, zero, jnp.asarray(False))
+    first = _Progress(now, model, infinite, infinite, zero, jnp.asarray(False))
 
     def body(before: _Progress) -> _Progress:
         now = before.now
@@ -266,18 +278,19 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         now, model, price = before.now, before.model, before.price
         at, values = now.at, model.values
         low, high = rows_left(limits, values.rows)
-        held = held_rows(limits, at.sides, low, high)
+        payable = priced(limits, price)
+        held = held_rows(payable, at.sides, low, high)
         controls = now.regularisation
         convex, weights = convexified(limits, model, held, before.shift, controls)
-        form = form_of(limits, model, convex, low, high, price)
-        # The first multipliers are a guess without a ground.
+        form = form_of(payable, model, convex, low, high)
+        # The first multipliers are zero if none are given.
         guesses = jnp.where(now.iterations > 0, GUESSES, 2)
-        found = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
-        dz = found.x
+        qp = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
+        dz = qp.x
         dx, du = dz[:, :n], dz[:-1, n:]
-        p = found.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
-        usable = jnp.all(jnp.isfinite(dz)) & (found.errors[0] <= 1e3)
-        impossible = ~usable & (found.errors[1] <= 1) & jnp.isinf(price)
+        p = qp.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
+        usable = jnp.all(jnp.isfinite(dz)) & (qp.errors[0] <= 1e3)
+        impossible = ~usable & (qp.errors[1] <= 1) & jnp.isinf(price)
         # The width of the funnel, and by how much the cost should fall.
         missed = infeasibility(limits, values)
         first = jnp.maximum(WIDTH, TIMES * missed)
@@ -289,9 +302,19 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             ],
             axis=1,
         )
-        falling = limits.penalty(values.rows) - limits.penalty(values.rows + change)
+        # The funnel may cycle at a price; then the exact penalty function must fall.
+        elastic = jnp.isfinite(price) & (now.iterations >= PATIENCE)
+        firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(p)), 0)
+
+        def merit(values):
+            paid = payable.penalty(values.rows) - limits.penalty(values.rows)
+            return values.cost + paid + firm * jnp.sum(jnp.abs(values.defects))
+
+        falling = payable.penalty(values.rows) - payable.penalty(values.rows + change)
         decrease = falling - jnp.sum(model.h * dz)
-        slack = 10 * eps * jnp.abs(values.cost)
+        decrease = decrease + firm * jnp.sum(jnp.abs(values.defects))
+        now_at = merit(values)
+        slack = 10 * eps * jnp.abs(now_at)
 
         def trial(i):
             length = 0.5 ** i.astype(dtype)
@@ -299,11 +322,11 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             controls = _clipped(limits, at.controls + length * du)
             there = measured(problem, limits, states, controls)
             far = infeasibility(limits, there)
-            by_cost = length * decrease >= SWITCH * missed
-            enough = values.cost - LEAST_SHARE * length * decrease + slack
+            by_cost = elastic | (length * decrease >= SWITCH * missed)
+            enough = now_at - LEAST_SHARE * length * decrease + slack
             closer = jnp.maximum(SHRINK * width, 100 * eps)
-            good = jnp.where(by_cost, there.cost <= enough, far <= closer)
-            good = good & (far <= width) & jnp.isfinite(there.cost)
+            good = jnp.where(by_cost, merit(there) <= enough, far <= closer)
+            good = good & (elastic | (far <= width)) & jnp.isfinite(there.cost)
             narrow = (1 - NARROW) * far + NARROW * width
             narrowed = jnp.where(by_cost, width, narrow)
             return (states, controls, length, narrowed), good
@@ -316,7 +339,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             states,
             controls,
             at.costates + length * (p - at.costates),
-            at.sides + length * (found.z - at.sides),
+            at.sides + length * (qp.z - at.sides),
         )
         pick = lambda new, old: jnp.where(accepted, new, old)
         scale = jnp.max(jnp.abs(model.H))
@@ -325,12 +348,13 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         mu = jnp.where(failed, jnp.maximum(10 * mu, 1e-4 * scale), mu / 10)
         mu = jnp.where(mu < 1e-8 * scale, 0, mu)
         stuck = mu > 1e10 * scale
+        failure = choose(elastic, RESULTS.infeasible, RESULTS.no_descent)
         after = now._replace(
             at=jax.tree.map(pick, moved, at),
             iterations=now.iterations + 1,
             rollouts=now.rollouts + tried,
             regularisation=mu,
-            result=choose(stuck, RESULTS.no_descent, now.result),
+            result=choose(stuck, failure, now.result),
         )
         start = FIRST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
         return before._replace(

@@ -1,5 +1,6 @@
 """The starts of planners: trajectories under feedback."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from ..dynamics import AbstractDynamics
 from ..math._linear_solve import full_precision, is_definite, symmetric
 from ..math._small import products_whole
 from ..riccati import dare
+from ._multipliers import Multipliers
 from ._problem import Problem
 
 
@@ -37,6 +39,9 @@ class Start(eqx.Module):
     - `controls`: shape `(T, m)`, or `(c, T, m)` for `c` starts.
     - `states`: shape `(T+1, n)` or `(c, T+1, n)`; needed with `gains`.
     - `gains`: shape `(T, m, n)` or `(c, T, m, n)`; none by default.
+    - `multipliers`: [`delucax.planning.Multipliers`][] to start from, the same for all
+        starts, by planners that have them; zero by default, and where the names or the
+        shapes are not those of the constraints.
 
     **Raises:** `ValueError` from the planner on shapes that do not fit, or numbers that
     are not finite.
@@ -65,11 +70,28 @@ class Start(eqx.Module):
     controls: Float[Array, "*batch T m"] = parameter()
     states: Float[Array, "*batch T+1 n"] | None = parameter(None)
     gains: Float[Array, "*batch T m n"] | None = parameter(None)
+    multipliers: Multipliers | None = None
 
     @property
     def horizon(self) -> int:
         """The number of steps."""
         return self.controls.shape[-2]
+
+    @property
+    def trajectories(self) -> "Start":
+        """The start without multipliers."""
+        return Start(self.controls, self.states, self.gains)
+
+    def shifted(self) -> "Start":
+        """The start a step later, its last step held."""
+        shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
+        start, y = jax.tree.map(shift, self.trajectories), self.multipliers
+        if y is not None:
+            moving = dict(
+                stage=y.stage, states=y.states, controls=y.controls, costates=y.costates
+            )
+            y = dataclasses.replace(y, **jax.tree.map(shift, moving))
+        return dataclasses.replace(start, multipliers=y)
 
     @property
     def count(self) -> int:
@@ -113,7 +135,7 @@ class Start(eqx.Module):
             raise ValueError(
                 f"{where}: {name}.states must be given with {name}.gains, got none."
             )
-        return Start(*arrays)
+        return Start(*arrays, multipliers=self.multipliers)
 
     def stacked(self, state_size: int) -> "Start":
         """One start or several as several, with states and gains.
@@ -122,14 +144,14 @@ class Start(eqx.Module):
         """
         start = self
         if self.controls.ndim == 2:
-            start = jax.tree.map(lambda a: a[None], self)
+            start = jax.tree.map(lambda a: a[None], self.trajectories)
         controls, states, gains = start.controls, start.states, start.gains
         if states is None or gains is None:
             # Zero gains make the states irrelevant.
             c, T, m = controls.shape
             states = jnp.zeros((c, T + 1, state_size), controls.dtype)
             gains = jnp.zeros((c, T, m, state_size), controls.dtype)
-        return Start(controls, states, gains)
+        return Start(controls, states, gains, self.multipliers)
 
     def cheapest(self, problem: Problem) -> tuple["Start", Array, Array, Array]:
         """The start with the cheapest trajectory.
@@ -149,11 +171,13 @@ class Start(eqx.Module):
 
         if self.controls.ndim == 2:
             return self, *roll(self)
+        starts = self.trajectories
         # A loop over scalars is faster on CPU than one over vectors of a few entries.
-        rolled = lax.map(roll, self)
+        rolled = lax.map(roll, starts)
         # The choice is piecewise constant in the costs.
         best = jnp.argmin(lax.stop_gradient(rolled[2]))
-        return jax.tree.map(lambda a: a[best], (self, *rolled))
+        start, *rolled = jax.tree.map(lambda a: a[best], (starts, *rolled))
+        return dataclasses.replace(start, multipliers=self.multipliers), *rolled
 
     @staticmethod
     def default(

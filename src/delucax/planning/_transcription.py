@@ -14,6 +14,7 @@ from ..math._linear_solve import full_precision, symmetric
 from ..math._small import products_whole
 from ..qp import Soft
 from ._constraints import Row, rows_of
+from ._multipliers import by_name, in_order, Multipliers
 from ._problem import Problem
 
 
@@ -28,18 +29,18 @@ class Iterate(NamedTuple):
 
 class Limits(NamedTuple):
     """The rows of each stage are first some of the variables `(x, u)`, then the values
-    of the constraints. An equality has both bounds alike, and what is no row of a
-    stage has none."""
+    of the constraints. The two bounds of an equality are equal. A stage that lacks a
+    row has infinite bounds there."""
 
     low: Array  # (T+1, rows)
     high: Array
     linear: Array  # of a violation; infinite where a row is hard
     quadratic: Array
     bounded: tuple[int, int]
-    """Which variables have rows, from and to."""
+    """The first variable with a row, and the one after the last."""
     is_soft: bool
     states: int
-    """So many rows are bounds of states."""
+    """How many rows are bounds of states."""
 
     @property
     def own(self) -> int:
@@ -62,11 +63,9 @@ class Limits(NamedTuple):
 
     def penalty(self, rows: Array) -> Array:
         """The cost of the violated soft rows."""
-        if not self.is_soft:
-            return jnp.zeros((), rows.dtype)
-        t = self.over(rows)
-        price = t * (self.linear + self.quadratic * t / 2)
-        return jnp.sum(jnp.where(self.hard, 0, price))
+        t, hard = self.over(rows), self.hard
+        v, W = (jnp.where(hard, 0, a) for a in (self.linear, self.quadratic))
+        return jnp.sum(t * (v + W * t / 2))
 
     def ends(self) -> tuple[Array, Array] | None:
         """The bounds of the controls that must hold, shape `(T, m)`."""
@@ -139,8 +138,8 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
         )
         each = jnp.tile(pad(stage)[:, None], (1, T, 1))
         parts.append(tuple(jnp.concatenate([each, pad(final)[:, None]], axis=1)))
-    nothing = jnp.zeros((4, T + 1, 0), dtype)
-    joined = [jnp.concatenate(a, axis=1) for a in zip(nothing, *parts, strict=True)]
+    blank = jnp.zeros((4, T + 1, 0), dtype)
+    joined = [jnp.concatenate(a, axis=1) for a in zip(blank, *parts, strict=True)]
     bounded = (0 if has_states else n), (n + m if has_controls else n)
     states = n if has_states else 0
     return Limits(*joined, bounded=bounded, is_soft=soft, states=states)
@@ -312,3 +311,46 @@ def slopes(problem: Problem, limits: Limits, at: Iterate) -> tuple[Array, Array,
     hx, hu = jax.grad(lagrangian, (0, 1))(states, controls)
     values = measured(problem, limits, states, controls)
     return _stacked(hx, hu), values.defects, values.rows
+
+
+def multipliers_of(problem: Problem, limits: Limits, at: Iterate) -> Multipliers:
+    """The multipliers of an iterate, by their names."""
+    upper, lower = at.sides
+    n, own, args = limits.states, limits.own, (problem.t0, problem.x0, at.controls[0])
+    z = (upper - lower)[:, own:]
+    return Multipliers(
+        by_name(problem.constraints, False, args, z[:-1]),
+        by_name(problem.constraints, True, args[:2], z[-1]),
+        (lower[:, :n], upper[:, :n]) if n else None,
+        (lower[:-1, n:own], upper[:-1, n:own]) if own > n else None,
+        at.costates,
+    )
+
+
+def with_multipliers(
+    problem: Problem, limits: Limits, at: Iterate, given: Multipliers | None
+) -> Iterate:
+    """The iterate with the given multipliers that fit, and zero for the others."""
+    if given is None:
+        return at
+    blank = jnp.zeros_like(at.sides)
+    n, own, args = limits.states, limits.own, (problem.t0, problem.x0, at.controls[0])
+    c = blank[0, :, own:]
+    stage = in_order(problem.constraints, False, args, given.stage, c[:-1])
+    final = in_order(problem.constraints, True, args[:2], given.final, c[-1])
+    z = c.at[:-1, : stage.shape[1]].set(stage).at[-1, : final.size].set(final)
+    x, u = (
+        pair if pair is not None and pair[0].shape == like.shape else (like, like)
+        for pair, like in (
+            (given.states, blank[0, :, :n]),
+            (given.controls, blank[0, :-1, n:own]),
+        )
+    )
+    sides = [
+        jnp.concatenate([x, jnp.pad(u, ((0, 1), (0, 0))), jnp.maximum(y, 0)], axis=1)
+        for x, u, y in zip(x, u, (-z, z), strict=True)
+    ]
+    costates = given.costates
+    if costates is None or costates.shape != at.costates.shape:
+        costates = jnp.zeros_like(at.costates)
+    return at._replace(costates=costates, sides=jnp.stack(sides[::-1]))
