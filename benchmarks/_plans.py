@@ -26,6 +26,8 @@ class Plans:
     bounds: tuple[float, float] | None = None  # where they are not symmetric
     obstacle: Callable[..., Any] | None = None  # at most 0
     arrival: tuple[float, ...] | None = None
+    room: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # of the states
+    towards: tuple[float, ...] | None = None  # the end of a guess of the states
 
     @property
     def limits(self) -> tuple[float, float] | None:
@@ -168,6 +170,71 @@ REACTOR = Plans(
 )
 
 
+# The equilibrium with the hand at (1, 0, 0), which the benchmark checks.
+SIDE, DEPTH, MIDDLE = 0.2435665195776434, -0.5154314417277843, -0.696318205571689
+AT_REST = (SIDE, 0.0, DEPTH, 0.5, 0.0, MIDDLE, 1 - SIDE, 0.0, DEPTH, 1.0, 0.0, 0.0)
+AT_REST += (0.0,) * 9
+# After a second of the velocity (-1, 1, 1).
+SWUNG = (-0.107901, 0.370719, -0.154041, -0.115926, 0.626601, -0.0680958, -0.0489389)
+SWUNG += (0.818251, 0.30389, 0.0, 1.0, 1.0, -0.664315, 0.7355, 0.637243, -0.759788)
+SWUNG += (0.736595, 0.705383, -1.00365, 1.0124, 1.03423)
+WALL = -0.05
+
+
+def pull(module: Any, x: Any, u: Any) -> Any:
+    """A chain of five masses between a wall and a hand that moves with velocity `u`:
+    the three free masses and the hand, then the velocities of the masses; two steps of
+    Runge and Kutta.
+
+    Source: Wirsching, Bock and Diehl, 2006; the parameters are those of acados.
+    """
+    mass, stiffness, length = 0.033, 1.0, 0.033
+
+    def rates(x: Any) -> Any:
+        joints = [[0.0] * 3] + [[x[3 * i + j] for j in range(3)] for i in range(4)]
+        forces = []
+        for a, b in zip(joints, joints[1:], strict=False):
+            link = [q - p for p, q in zip(a, b, strict=True)]
+            far = module.sqrt(sum(e * e for e in link))
+            forces.append([stiffness / mass * (1 - length / far) * e for e in link])
+        speeds = [x[12 + i] for i in range(9)] + [u[j] for j in range(3)]
+        pulls = [
+            forces[i + 1][j] - forces[i][j] - (9.81 if j == 2 else 0.0)
+            for i in range(3)
+            for j in range(3)
+        ]
+        return stack(module, [*speeds, *pulls])
+
+    h = 0.2 / 2
+    for _ in range(2):
+        k1 = rates(x)
+        k2 = rates(x + h / 2 * k1)
+        k3 = rates(x + h / 2 * k2)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3))
+    return x
+
+
+def stilled(module: Any, x: Any, u: Any) -> Any:
+    """The cost of a step of the chain: the hand counts four times."""
+    weights = [4.0 if 9 <= i < 12 else 1.0 for i in range(21)]
+    off = [x[i] - AT_REST[i] for i in range(21)]
+    far = sum(w * e * e for w, e in zip(weights, off, strict=True))
+    return far + 0.01 * squares(u, 3)
+
+
+DISCS = (0.5, 0.6, 0.3), (1.0, 0.25, 0.25)
+
+
+def discs(module: Any, x: Any) -> Any:
+    """At most 0 outside."""
+    values = [r * r - (x[0] - a) ** 2 - (x[1] - b) ** 2 for a, b, r in DISCS]
+    return stack(module, values)
+
+
+INFINITE = float("inf")
+# Neither the masses nor the hand go through the wall.
+BEFORE_WALL = tuple(WALL if i < 12 and i % 3 == 1 else -INFINITE for i in range(21))
+
 CASES = {
     "reactor": REACTOR,
     "reactor, at most 352 K": replace(REACTOR, obstacle=lambda module, x: x[1] - 352.0),
@@ -219,3 +286,35 @@ CASES = {
         arrival=(1.0, 0.0, 0.0, 0.0),
     ),
 }
+
+# Problems of model predictive control, with limits on states.
+LIMITED = {
+    "cart-pole, track of 0.5 m": replace(
+        CASES["cart-pole swing-up"],
+        room=((-0.5, *[-INFINITE] * 3), (0.5, *[INFINITE] * 3)),
+        towards=(0.0, 0.0, 0.0, 0.0),
+    ),
+    "chain of five masses, wall": Plans(
+        SWUNG,
+        3,
+        40,
+        0.2,
+        pull,
+        stilled,
+        lambda module, x: stilled(module, x, [0.0] * 3),
+        bound=1.0,
+        room=(BEFORE_WALL, (INFINITE,) * 21),
+        towards=AT_REST,
+    ),
+    "quadrotor among discs": replace(
+        CASES["quadrotor"],
+        x0=(1.5, 1.0, 0.0, 0.0, 0.0, 0.0),
+        horizon=50,
+        bounds=(0.0, 3 * HOVER),
+        obstacle=discs,
+        towards=(0.0,) * 6,
+    ),
+    "reactor, at most 352 K": CASES["reactor, at most 352 K"],
+    "reactor, at most 349.5 K": CASES["reactor, at most 349.5 K"],
+}
+ALL = CASES | LIMITED

@@ -144,8 +144,9 @@ def guess_of(case: Plans, x0: Any) -> tuple[Any, Any]:
     """States and controls that all start from: the control at rest, and where it
     leads; or, where an end is given, the line to it, without which IPOPT finds none."""
     U = np.full((case.horizon, case.controls), case.rest)
-    if case.arrival is not None:
-        return np.linspace(x0, case.arrival, case.horizon + 1).tolist(), U.tolist()
+    towards = case.arrival if case.towards is None else case.towards
+    if towards is not None:
+        return np.linspace(x0, towards, case.horizon + 1).tolist(), U.tolist()
     X = dlx.open_loop(Discrete(case), jnp.asarray(x0), jnp.asarray(U))
     return np.asarray(X).tolist(), U.tolist()
 

@@ -17,7 +17,7 @@ from typing import Any
 import casadi as ca  # pyright: ignore[reportMissingImports]
 import numpy as np
 
-from benchmarks._plans import CASES, Plans
+from benchmarks._plans import ALL, Plans
 
 
 def build(case: Plans, solver: str) -> Any:
@@ -45,7 +45,11 @@ def build(case: Plans, solver: str) -> Any:
         # The first state is given.
         if case.obstacle is not None and k > 0:
             opti.subject_to(case.obstacle(ca, X[k]) <= 0)
+        if case.room is not None and k > 0:
+            confine(opti, X[k], case.room)
         cost += stage(X[k], U[k])
+    if case.room is not None:
+        confine(opti, X[T], case.room)
     if case.arrival is not None:
         opti.subject_to(X[T] == np.asarray(case.arrival))
     opti.minimize(cost + case.final(ca, X[T]))
@@ -57,6 +61,13 @@ def build(case: Plans, solver: str) -> Any:
         quiet["ipopt"] = {"print_level": 0, "sb": "yes", "tol": 1e-10}
     opti.solver(solver, quiet)
     return opti, x0, X, U
+
+
+def confine(opti: Any, x: Any, room: Any) -> None:
+    """Bound the entries of a state that have bounds."""
+    for i, (low, high) in enumerate(zip(*room, strict=True)):
+        if np.isfinite(low) or np.isfinite(high):
+            opti.subject_to(opti.bounded(low, x[i], high))
 
 
 def solve(built: Any, case: Plans, starts: Any, guess: Any) -> dict[str, Any]:
@@ -100,7 +111,7 @@ def main() -> None:
         answer: dict[str, Any]
         if "build" in request:
             began = time.perf_counter()
-            case = CASES[request["build"]]
+            case = ALL[request["build"]]
             try:
                 ready.append((build(case, request["solver"]), case))
                 seconds = time.perf_counter() - began

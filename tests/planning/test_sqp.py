@@ -139,7 +139,7 @@ def test_derivatives_against_central_differences():
     def total(theta):
         scale, radius, bound, start = theta
         dynamics, cost, x0, U = steered(scale)
-        plan = SQP()(
+        plan = SQP(tolerance=1e-12)(
             dynamics,
             cost,
             start * x0,

@@ -29,9 +29,9 @@ class SQP(AbstractPlanner):
     unstable plant may start from a guess that does not follow the dynamics. Each
     iteration solves the quadratic program about the current trajectory, as
     [`delucax.qp.solve`][] does, first by guesses of the active sides. Its Hessian is
-    that of the Lagrangian, or of the cost (Gauss-Newton); where it is not convex along
-    the dynamics, the squares of the constraints that hold with equality are added, and
-    then a multiple of the identity.
+    that of the cost far from a solution, and that of the Lagrangian from a relative
+    error of 0.01 on. Where it is not convex along the dynamics, the squares of the
+    constraints that hold with equality are added, and then a multiple of the identity.
 
     A step `1, 1/2, ..., 1/2048` is accepted by a funnel: the sum of all violations
     stays below its width, and either the cost falls by 1e-4 of the predicted decrease,
@@ -67,8 +67,8 @@ class SQP(AbstractPlanner):
     - `max_iterations`: 200 by default.
     - `tolerance`: the square root of the precision by default (1.5e-8 in float64).
     - `constraint_tolerance`: a tenth of that by default.
-    - `second_order`: if true (default), with the Hessian of the Lagrangian; if false,
-        with that of the cost alone (Gauss-Newton).
+    - `second_order`: if true (default), with the Hessian of the Lagrangian near a
+        solution; if false, with that of the cost throughout (Gauss-Newton).
     - `states`: states to start from, shape `(T+1, n)`. `controls` must then be an
         array, or the number of steps for the controls of the equilibrium.
 

@@ -50,6 +50,8 @@ NARROW = 0.9
 SWITCH = 1e-3
 """The cost must fall where its predicted decrease is at least this share of the
 violation."""
+NEAR = 0.01
+"""At this error the Hessian of the cost gives way to that of the Lagrangian."""
 FIRST_PRICE = 10.0
 MOST_PRICE = 1e7
 PATIENCE = 50
@@ -95,6 +97,8 @@ class _Progress(NamedTuple):
     """Of the funnel."""
     shift: Array
     """The multiple of the identity that was last added to a Hessian."""
+    near: Array
+    """Whether the last error was small enough for the Hessian of the Lagrangian."""
     done: Array
 
 
@@ -247,11 +251,14 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         rollouts=jnp.zeros((), int),
         regularisation=zero,
     )
-    first = _Progress(now, model, infinite, infinite, zero, jnp.asarray(False))
+    first = _Progress(now, model, infinite, infinite, zero, *[jnp.asarray(False)] * 2)
 
     def body(before: _Progress) -> _Progress:
         now = before.now
-        model = expanded(problem, limits, now.at, options.second_order)
+        # Far from a solution the curvature of the constraints, weighted by multipliers
+        # that are far off too, is worse than none.
+        share = jnp.where(before.near, 1, 0).astype(dtype)
+        model = expanded(problem, limits, now.at, options.second_order, share)
         slope, error, violation = optimality(limits, now.at, model)
         feasible = violation <= options.constraint_tolerance
         settled = error <= options.tolerance
@@ -271,7 +278,10 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         )
         ended = (settled & feasible) | hopeless | lost
         ended = ended | (now.iterations >= options.max_iterations)
-        after = before._replace(now=now, model=model, price=price, done=ended)
+        near = error <= NEAR
+        after = before._replace(
+            now=now, model=model, price=price, near=near, done=ended
+        )
         return lax.cond(ended, lambda progress: progress, step, after)
 
     def step(before: _Progress) -> _Progress:
@@ -290,7 +300,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         dx, du = dz[:, :n], dz[:-1, n:]
         p = qp.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
         usable = jnp.all(jnp.isfinite(dz)) & (qp.errors[0] <= 1e3)
-        impossible = ~usable & (qp.errors[1] <= 1) & jnp.isinf(price)
+        impossible = ~usable & jnp.isinf(price)
         # The width of the funnel, and by how much the cost should fall.
         missed = infeasibility(limits, values)
         first = jnp.maximum(WIDTH, TIMES * missed)

@@ -214,10 +214,18 @@ def measured(problem: Problem, limits: Limits, states: Array, controls: Array):
 
 @full_precision
 @products_whole()
-def expanded(problem: Problem, limits: Limits, at: Iterate, second_order: bool):
+def expanded(
+    problem: Problem,
+    limits: Limits,
+    at: Iterate,
+    second_order: bool,
+    share: Array | float = 1.0,
+):
     """The problem and its derivatives at an iterate; the Hessian is that of the
-    Lagrangian if `second_order`, else that of the cost."""
+    Lagrangian if `second_order`, with a share of the multipliers, else that of the
+    cost."""
     states, controls, costates, sides = at
+    costates, sides = share * costates, share * sides
     n, T = states.shape[1], controls.shape[0]
     times, y = problem.times(T), (sides[0] - sides[1])[:, limits.own :]
     z = jnp.concatenate([states[:-1], controls], axis=1)
