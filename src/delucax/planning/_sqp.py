@@ -37,7 +37,7 @@ class SQP(AbstractPlanner):
     stays below its width, and either the cost falls by 1e-4 of the predicted decrease,
     or the violations fall below 0.9 of the width, which then narrows.
     Where the linearised constraints have no feasible point, they may be violated at a
-    price, that of an exact penalty; it rises at each stationary point that is not
+    price, that of an exact penalty; it rises near each stationary point that is not
     feasible, and if no price makes them hold, the result is `infeasible`.
 
     It has converged if the gradient of the Lagrangian and the complementarity are at

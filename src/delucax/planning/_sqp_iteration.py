@@ -51,7 +51,8 @@ SWITCH = 1e-3
 """The cost must fall where its predicted decrease is at least this share of the
 violation."""
 NEAR = 0.01
-"""At this error the Hessian of the cost gives way to that of the Lagrangian."""
+"""At this error the Hessian of the cost gives way to that of the Lagrangian, and the
+price of violations that are left rises."""
 FIRST_PRICE = 10.0
 MOST_PRICE = 1e7
 PATIENCE = 50
@@ -262,10 +263,11 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         slope, error, violation = optimality(limits, now.at, model)
         feasible = violation <= options.constraint_tolerance
         settled = error <= options.tolerance
-        # At a stationary point that is not feasible the price was too low.
-        price = jnp.where(settled & ~feasible, 10 * before.price, before.price)
+        # Close to a point that is stationary but not feasible the price was too low.
         most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
-        hopeless = jnp.isfinite(price) & (price > most)
+        low = (error <= NEAR) & ~feasible & jnp.isfinite(before.price)
+        hopeless = settled & low & (before.price >= most)
+        price = jnp.where(low, jnp.minimum(10 * before.price, most), before.price)
         lost = ~jnp.isfinite(model.values.cost + slope + error + violation)
         result = choose(settled & feasible, RESULTS.successful, now.result)
         result = choose(hopeless, RESULTS.infeasible, result)
