@@ -82,8 +82,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "
-        "the constraints cannot all hold, or gamma is below the least level that any "
-        "controller attains."
+        "or gamma is below the least level that any controller attains."
     )
     no_feasible_point = "No point satisfies all constraints."
     unbounded = (

@@ -89,7 +89,7 @@ def test_without_a_solution():
     u, state = (mpc := controller(throw=False))(0.0, FAST, mpc.init())
     # The last plan under its gains, within the bounds.
     assert jnp.isfinite(u).all() and jnp.abs(u) <= 8
-    assert state.result == dlx.RESULTS.infeasible and state.failures.count == 1
+    assert state.result == dlx.RESULTS.no_feasible_point and state.failures.count == 1
     u, state = mpc(0.05, X0, state)
     assert state.result == dlx.RESULTS.successful
     with pytest.raises(RuntimeError, match="constraints cannot all hold"):

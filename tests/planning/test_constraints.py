@@ -126,7 +126,7 @@ def test_what_cannot_hold():
     dynamics, cost, x0, U = steered()
     never = Constraints(equality=lambda t, x, u: u[0] - 1, final_equality=arrived)
     plan = ilqr(dynamics, cost, x0, U, constraints=never, throw=False)
-    assert plan.result == dlx.RESULTS.infeasible and plan.violation > 1e-2
+    assert plan.result == dlx.RESULTS.no_feasible_point and plan.violation > 1e-2
     assert all(jnp.all(jnp.isfinite(a)) for a in jax.tree.leaves(plan))
     with pytest.raises(RuntimeError, match="constraints cannot all hold"):
         ilqr(dynamics, cost, x0, U, constraints=never)

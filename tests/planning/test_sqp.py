@@ -178,7 +178,7 @@ def test_what_cannot_hold_is_named():
     never = Constraints({"disc": Clear()}, final_equality={"goal": arrived})
     given = dict(bounds=(-0.1, 0.1), constraints=never)
     plan = SQP()(dynamics, cost, x0, U, throw=False, **given)
-    assert plan.result == dlx.RESULTS.infeasible and plan.violation > 1e-2
+    assert plan.result == dlx.RESULTS.no_feasible_point and plan.violation > 1e-2
     with pytest.raises(RuntimeError, match=r"`goal` \(entry 0\).* by .* at the end"):
         SQP()(dynamics, cost, x0, U, **given)
     # No derivative of what is no solution.

@@ -14,8 +14,8 @@ def in_parts(body: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     XLA makes one function of machine code of a loop over small arrays on CPU, with all
     that is inside. For a solver that takes two or three times as long to compile, on
-    one core, and runs up to 15% faster. XLA leaves a loop
-    in parts if its body calls a library, so this one does, to no effect.
+    one core, and runs up to 15% faster. XLA leaves a loop in parts if its body calls a
+    library, so this one does, to no effect.
     """
 
     def called(carry):

@@ -58,7 +58,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         hopeless = (raised > most_rho) & ~settled & ~spent
         lost = after.result == RESULTS.diverged
         result = choose(settled, RESULTS.successful, RESULTS.not_converged)
-        result = choose(hopeless, RESULTS.infeasible, result)
+        result = choose(hopeless, RESULTS.no_feasible_point, result)
         after = after._replace(
             violation=violation,
             # The new multipliers are those of the weight that was minimised with.

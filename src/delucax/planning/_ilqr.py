@@ -238,9 +238,9 @@ def ilqr(
     - `tolerance`: the square root of the precision by default (1.5e-8 in float64). At 0
         all iterations are taken.
     - `throw`: raise unless converged (default); if false, look at `plan.result`, which
-        is `not_converged`, `no_descent`, `infeasible` if no weight makes the
-        constraints hold, or `diverged` if every start diverges: the plan is then
-        the best iterate.
+        is `not_converged`, `no_descent`, `no_feasible_point` if no weight makes
+        the constraints hold, or `diverged` if every start diverges: the plan is
+        then the best iterate.
 
     **Returns:** a [`delucax.planning.Plan`][]. It is stationary if it has converged.
         Where the control Hessian is not positive definite, `plan.regularisation` says

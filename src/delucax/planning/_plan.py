@@ -100,7 +100,8 @@ class Plan(AbstractController):
         """
         finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
         # Of other failures, such as too few iterations, the best iterate is left.
-        lost = (self.result == RESULTS.diverged) | (self.result == RESULTS.infeasible)
+        lost = self.result == RESULTS.diverged
+        lost = lost | (self.result == RESULTS.no_feasible_point)
         return finite & ~lost
 
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:

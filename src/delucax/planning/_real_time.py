@@ -76,7 +76,7 @@ def fed_back(problem: Problem, ready: Prepared, max_steps: int) -> Plan:
     p = qp.p - jnp.einsum("tij,tj->ti", convex.P, qp.x[:, :n]) - convex.s
     solved, bad, _ = qp.errors
     usable = jnp.all(jnp.isfinite(qp.x)) & (solved <= _USABLE)
-    result = choose(bad <= 1, RESULTS.infeasible, RESULTS.diverged)
+    result = choose(bad <= 1, RESULTS.no_feasible_point, RESULTS.diverged)
     result = choose(usable, RESULTS.not_converged, result)
     result = choose(solved <= 1, RESULTS.successful, result)
     return problem.plan(

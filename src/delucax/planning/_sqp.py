@@ -38,7 +38,7 @@ class SQP(AbstractPlanner):
     or the violations fall below 0.9 of the width, which then narrows.
     Where the linearised constraints have no feasible point, they may be violated at a
     price, that of an exact penalty; it rises near each stationary point that is not
-    feasible, and if no price makes them hold, the result is `infeasible`.
+    feasible, and if no price makes them hold, the result is `no_feasible_point`.
 
     It has converged if the gradient of the Lagrangian and the complementarity are at
     most `tolerance` times one plus the size of the terms that cancel in them, the

@@ -270,7 +270,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         price = jnp.where(low, jnp.minimum(10 * before.price, most), before.price)
         lost = ~jnp.isfinite(model.values.cost + slope + error + violation)
         result = choose(settled & feasible, RESULTS.successful, now.result)
-        result = choose(hopeless, RESULTS.infeasible, result)
+        result = choose(hopeless, RESULTS.no_feasible_point, result)
         result = choose(lost, RESULTS.diverged, result)
         now = now._replace(
             trace=now.trace.at[now.iterations].set(model.values.cost),
@@ -360,7 +360,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         mu = jnp.where(failed, jnp.maximum(10 * mu, 1e-4 * scale), mu / 10)
         mu = jnp.where(mu < 1e-8 * scale, 0, mu)
         stuck = mu > 1e10 * scale
-        failure = choose(elastic, RESULTS.infeasible, RESULTS.no_descent)
+        failure = choose(elastic, RESULTS.no_feasible_point, RESULTS.no_descent)
         after = now._replace(
             at=jax.tree.map(pick, moved, at),
             iterations=now.iterations + 1,
