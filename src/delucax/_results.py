@@ -84,7 +84,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The problem has no solution: the cost has no unique minimum over the control, "
         "or gamma is below the least level that any controller attains."
     )
-    no_feasible_point = "No point satisfies all constraints."
+    no_feasible_point = "The constraints cannot all hold: no point satisfies them."
     unbounded = (
         "The cost is unbounded below: it falls without end along a direction that "
         "keeps within the constraints."
