@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class Plans:
@@ -189,21 +191,19 @@ def pull(module: Any, x: Any, u: Any) -> Any:
     Source: Wirsching, Bock and Diehl, 2006; the parameters are those of acados.
     """
     mass, stiffness, length = 0.033, 1.0, 0.033
+    # Links from the joints, the first of which stands still, and their sums by link.
+    links = np.kron(np.eye(4) - np.eye(4, k=-1), np.eye(3))
+    by_link = np.kron(np.eye(4), np.ones((1, 3)))
+    between = np.kron(np.eye(3, 4, k=1) - np.eye(3, 4), np.eye(3)) * stiffness / mass
+    weight = np.tile([0.0, 0.0, 9.81], 3)
 
     def rates(x: Any) -> Any:
-        joints = [[0.0] * 3] + [[x[3 * i + j] for j in range(3)] for i in range(4)]
-        forces = []
-        for a, b in zip(joints, joints[1:], strict=False):
-            link = [q - p for p, q in zip(a, b, strict=True)]
-            far = module.sqrt(sum(e * e for e in link))
-            forces.append([stiffness / mass * (1 - length / far) * e for e in link])
-        speeds = [x[12 + i] for i in range(9)] + [u[j] for j in range(3)]
-        pulls = [
-            forces[i + 1][j] - forces[i][j] - (9.81 if j == 2 else 0.0)
-            for i in range(3)
-            for j in range(3)
-        ]
-        return stack(module, [*speeds, *pulls])
+        along = links @ x[:12]
+        far = module.sqrt(by_link @ along**2)
+        pulls = between @ (along * (by_link.T @ (1 - length / far))) - weight
+        join = module.vertcat if hasattr(module, "vertcat") else module.hstack
+        parts = [x[12:], u, pulls]
+        return join(*parts) if hasattr(module, "vertcat") else join(parts)
 
     h = 0.2 / 2
     for _ in range(2):
