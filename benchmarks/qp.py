@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -32,7 +33,9 @@ from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._timing import Contender, python, race
 
 
-FAMILIES = "LIPMWALK", "WHLIPBAL", "QUADCMPC"
+FAMILIES = "LIPMWALK", "WHLIPBAL", "QUADCMPC", "QUADCMPC in stages"
+QUADRUPED = 12
+"""The states of the programs in stages, and their controls."""
 STATES, CONTROLS, HORIZON, COUNT = 8, 4, 20, 128
 FIRST = """
 import time
@@ -96,6 +99,72 @@ def ours(d: dict[str, Any], tolerance: float) -> Callable[[], Any]:
     return lambda: jax.block_until_ready(compiled(arrays, tolerance, d["bounded"]))
 
 
+def in_stages(d: dict[str, Any], n: int = QUADRUPED) -> dict[str, np.ndarray]:
+    """The stages of a program of a quadruped: its variables are the states 1 to T, then
+    the controls; its start is zero, and its rows are of the controls alone."""
+    T = len(d["b"]) // n
+    m, p = (len(d["q"]) - T * n) // T, len(d["h"]) // T
+    blocks = lambda M, rows, columns: np.stack(
+        [M[rows(k), columns(k)] for k in range(T)]
+    )
+    x = lambda k: slice(k * n, (k + 1) * n)
+    u = lambda k: slice(T * n + k * m, T * n + (k + 1) * m)
+    # The first state is not a variable.
+    before = lambda a: np.concatenate([np.zeros_like(a[:1]), a[:-1]])
+    Q, q = blocks(d["P"], x, x), d["q"][: T * n].reshape(T, n)
+    back = lambda k: x(max(k - 1, 0))
+    A = blocks(d["A"], x, back)
+    A[0] = 0
+    controls = lambda a: a[T * n :].reshape(T, m)
+    return {
+        "A": A,
+        "B": blocks(d["A"], x, u),
+        "Q": before(Q),
+        "R": blocks(d["P"], u, u),
+        "d": -d["b"].reshape(T, n),
+        "q": before(q),
+        "r": controls(d["q"]),
+        "final": Q[-1],
+        "final_q": q[-1],
+        "D": blocks(d["G"], lambda k: slice(k * p, (k + 1) * p), u),
+        "upper": d["h"].reshape(T, p),
+        "low": controls(d["lb"]),
+        "high": controls(d["ub"]),
+    }
+
+
+@jax.jit
+def compiled_stages(s: dict[str, Any], tolerance: Any) -> dlx.qp.Solution:
+    """Our solution of a program in stages."""
+    names = "A", "B", "Q", "R", "d", "q", "r", "final", "final_q"
+    n, p = s["A"].shape[-1], s["D"].shape[-2]
+    problem = dlx.qp.Staged(
+        **{name: s[name] for name in names},
+        start=jnp.zeros(n),
+        controls=(s["low"], s["high"]),
+        rows=dlx.qp.Rows(jnp.zeros((p, n)), s["D"], upper=s["upper"]),
+    )
+    return dlx.qp.solve(problem, rtol=0.0, atol=tolerance, throw=False)
+
+
+def our_stages(d: dict[str, Any], tolerance: float) -> Callable[[], Any]:
+    """A call of it; the program is taken apart before."""
+    arrays = jax.tree.map(jnp.asarray, in_stages(d))
+    return lambda: jax.block_until_ready(compiled_stages(arrays, tolerance))
+
+
+def as_dense(d: dict[str, Any], solution: Any) -> Any:
+    """The solution of a program in stages in the variables that it came in."""
+    y, flat = solution.multipliers, lambda *a: np.concatenate(list(map(np.ravel, a)))
+    none = np.zeros(len(d["b"]))
+    multipliers = SimpleNamespace(
+        equalities=-flat(y.costates[1:]),
+        rows=tuple(map(flat, y.rows)),
+        bounds=tuple(flat(none, side) for side in y.controls),
+    )
+    return SimpleNamespace(x=flat(solution.x[1:], solution.u), multipliers=multipliers)
+
+
 def clarabel_peer(d: dict[str, Any], tolerance: float) -> Callable[[], Any]:
     """Clarabel on the same data, in cones."""
     import clarabel
@@ -156,15 +225,17 @@ def public(folder: Path, rounds: int) -> list[dict[str, Any]]:
     peers = {"clarabel": clarabel_peer, "piqp": piqp_peer}
     rows = []
     for family in FAMILIES:
-        programs = [load(f) for f in sorted(folder.glob(f"{family}*.npz"))]
+        staged, name = "stages" in family, family.split()[0]
+        programs = [load(f) for f in sorted(folder.glob(f"{name}*.npz"))]
         for tolerance in (1e-6, 1e-9):
             times: dict[str, list[float]] = {}
             good = false = 0
             for d in programs:
-                solve = ours(d, tolerance)
+                solve = (our_stages if staged else ours)(d, tolerance)
                 solution = solve()
                 claims = bool(solution.result == dlx.RESULTS.successful)
-                right = criteria(d, solution) <= tolerance
+                dense = as_dense(d, solution) if staged else solution
+                right = criteria(d, dense) <= tolerance
                 good, false = good + (claims and right), false + (claims and not right)
                 contenders = [python("delucax", 1, solve)]
                 for name, peer in peers.items():

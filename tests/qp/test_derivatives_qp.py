@@ -146,3 +146,26 @@ def test_a_failed_solve_has_nan_and_infinite_bounds_have_none():
     g = lambda q: dense(np.eye(2), q, bounds=(-np.inf, np.array([np.inf, 1.0])))
     slopes = jax.jit(jax.jacrev(g))(np.array([-2.0, -2.0]))
     assert_close(slopes, np.diag([-1.0, 0.0]), atol=1e-3)
+
+
+@needs_x64
+def test_a_solution_of_the_interior_point_method_is_that_of_its_active_sides():
+    """Guesses of the active sides do not solve this one of the bounded problems of
+    Frey et al., and the last iterate of the method alone leaves a side in doubt."""
+    rng = np.random.RandomState(42)
+    A, B = np.eye(8) + 0.2 * rng.randn(8, 8), rng.randn(8, 4)
+    d, start = rng.randn(8), rng.randn(128, 8)[75]
+
+    @jax.jit
+    def solved(d):
+        weights = 2 * np.eye(8), 2 * np.eye(4)
+        options = dict(d=d, final=weights[0], start=start, horizon=20)
+        problem = dlx.qp.Staged(A, B, *weights, controls=(-1.0, 1.0), **options)
+        return dlx.qp.solve(problem, throw=False)
+
+    solution = solved(d)
+    assert solution.iterations > 10
+    assert solution.complementarity < 1e-11 * solution.cost
+    first = jax.jit(jax.grad(lambda d: jnp.sum(solved(d).u[0])))
+    expected = central_difference(lambda d: jnp.sum(solved(d).u[0]), d, 1e-5)
+    assert_close(first(d), expected, rtol=1e-6, atol=1e-6)

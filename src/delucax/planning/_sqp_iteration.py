@@ -181,10 +181,8 @@ def solved(
 ) -> Solved:
     """The solution of the program; the first guess of its active sides is that of the
     multipliers."""
-    scaled, scaling = form.equilibrated()
     certificate = jnp.asarray(1e-6, form.q.dtype)
-    tolerances = Tolerances(tolerance, tolerance, certificate)
-    method = Method(form, scaled, scaling, form.sides(), scaled.sides(), tolerances)
+    method = Method.of(form, Tolerances(tolerance, tolerance, certificate))
     guess = warm(method, jnp.zeros_like(form.q), at.sides)
     left = jnp.asarray(guesses, guess.left.dtype)
     return minimise(method, guess._replace(left=left), MAX_STEPS, 2)

@@ -43,6 +43,14 @@ class Guess(NamedTuple):
         return jnp.where(self.over & (sides.W == 0), sides.v, 0)
 
 
+def active_at(method: Method, at: Iterate) -> Guess:
+    """The sides that are active at a point of the method."""
+    _, _, z, s, t, m = method.apart(at.v)
+    active = method.sides.inequality & (z > s)
+    over = active & method.sides.soft & (t > m)
+    return Guess(active & ~over, over, jnp.asarray(1))
+
+
 def tried(method: Method, along: Array, guess: Guess) -> tuple[Iterate, Guess]:
     """The point at which the active sides are as guessed, and the next guess."""
     sides = method.sides

@@ -1,6 +1,7 @@
 """The dense form: any program of up to some hundreds of variables."""
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -98,23 +99,40 @@ class DenseForm(AbstractForm):
         H, F, G = lax.stop_gradient((self.H, self.F, self.G))
         largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
         unit = lambda size: power_of_two(lax.rsqrt(jnp.where(size > 0, size, 1)))
-        for _ in range(_PASSES):
+
+        def balance(_, scaled):
+            H, F, G, D, E, R = scaled
             across = jnp.maximum(largest(H, 0), largest(F, 0))
             d = unit(jnp.maximum(across, largest(G, 0)))
             e, r = unit(largest(F, 1)), unit(largest(G, 1))
             H, F, G = d[:, None] * H * d, e[:, None] * F * d, r[:, None] * G * d
-            D, E, R = D * d, E * e, R * r
+            return H, F, G, D * d, E * e, R * r
+
+        H, *_, D, E, R = lax.fori_loop(0, _PASSES, balance, (H, F, G, D, E, R))
         q = D * self.q
         c = cost_unit(H, lax.stop_gradient(q))
         H = D[:, None] * self.H * D
         F, G = E[:, None] * self.F * D, R[:, None] * self.G * D
-        form = without_empty_rows(self, largest(self.rows_matrix(), 1) == 0)
         # A bound of a variable is scaled as the variable is.
         rows = jnp.concatenate([1 / D, R]) if self.bounded else R
-        scaling = Scaling(D, E, rows, c)
-        bounds, soft = scaled_sides(form, scaling)
-        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft, self.bounded)
-        return DenseForm(*parts), scaling
+        scaled = dict(H=c * H, q=c * q, F=F, f=E * self.f, G=G)
+        return dataclasses.replace(self, **scaled), Scaling(D, E, rows, c)
+
+    def meaningful(self, sides):
+        # A row of zeros whose bound is zero has no interior, and the method would not
+        # converge.
+        empty = jnp.max(jnp.abs(self.rows_matrix()), axis=1, initial=0) == 0
+        slack = 10 * jnp.finfo(self.q.dtype).eps * jnp.max(jnp.abs(sides.h), initial=0)
+        off = empty & (sides.h >= -slack)
+        off = off & ~(sides.equality & (sides.h > slack))
+        on = lambda kind: kind & ~off
+        return sides._replace(
+            h=jnp.where(off, 0, sides.h),
+            inequality=on(sides.inequality),
+            equality=on(sides.equality),
+            soft=on(sides.soft),
+            hinge=on(sides.hinge),
+        )
 
 
 def regularisation(dtype) -> float:
@@ -127,24 +145,3 @@ def cost_unit(H: Array, q: Array) -> Array:
     """A power of two that makes the scaled cost of size 1."""
     size = jnp.maximum(jnp.mean(jnp.max(jnp.abs(H), axis=-1)), jnp.max(jnp.abs(q)))
     return power_of_two(1 / jnp.where(size > 0, size, 1))
-
-
-def without_empty_rows(form: AbstractForm, empty: Array) -> AbstractForm:
-    """Without the bounds of rows of zeros that hold, up to rounding: such a row has no
-    interior if its bound is zero, and the method would not converge."""
-    slack = 10 * jnp.finfo(form.q.dtype).eps
-    size = lambda b: jnp.max(jnp.where(jnp.isfinite(b), jnp.abs(b), 0), initial=0)
-    slack = slack * jnp.maximum(size(form.lower), size(form.upper))
-    upper = jnp.where(empty & (form.upper >= -slack), jnp.inf, form.upper)
-    lower = jnp.where(empty & (form.lower <= slack), -jnp.inf, form.lower)
-    return eqx.tree_at(lambda form: (form.lower, form.upper), form, (lower, upper))
-
-
-def scaled_sides(form: AbstractForm, scaling: Scaling):
-    """The bounds and the weights of the scaled problem."""
-    R, c = scaling.rows, scaling.cost
-    bounds = R * form.lower, R * form.upper
-    if form.soft is None:
-        return bounds, None
-    v, W = form.soft
-    return bounds, (c * v / R, c * W / R**2)

@@ -27,7 +27,9 @@ from ._interior_point import assembled, minimise, solved
 _CLEAR = 1e3
 """Of a multiplier and its slack, one is this many times the other where it is clear
 whether the side is active, in the scaled problem; both are alike where it is not."""
-_PASSES = 4
+_PASSES = 3
+_PROBING = 2
+"""Passes of the linear solve, and of the one that shows whether it is singular."""
 
 
 class Options(eqx.Module):
@@ -45,9 +47,7 @@ def optimum(form: AbstractForm, options: Options) -> Outcome:
 
 
 def _run(form: AbstractForm, options: Options) -> Outcome:
-    scaled, scaling = form.equilibrated()
-    sides = form.sides(), scaled.sides()
-    method = Method(form, scaled, scaling, *sides, options.tolerances)
+    method = Method.of(form, options.tolerances)
     none = jnp.zeros_like(method.sides.h, bool)
     guess = Guess(none, none, jnp.asarray(GUESSES))
     if options.start is not None:
@@ -116,10 +116,8 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
     """The change of `x`, `p` and `z`, and whether the solution is unique. Of the scaled
     problem `pushes` gives the multipliers of the sides, their slacks, the violations of
     soft ones, and the multipliers of these."""
-    scaled, scaling = form.equilibrated()
-    D, E, R, c = scaling
-    method = Method(form, scaled, scaling, form.sides(), scaled.sides(), None)
-    sides = method.sides
+    method = Method.of(form)
+    scaled, sides, (D, E, R, c) = method.scaled, method.sides, method.scaling
     x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in point)
     scaled_z, s, t, m = pushes(method)
     pressed = sides.inequality & (scaled_z > s)
@@ -156,7 +154,6 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
     W = jnp.where(spring, sides.W, 1)
     system_sides = Sides(none, spring, held, spring, spring, none, W)
     compliance = jnp.where(spring, 1 / W, 0)
-    system = assembled(scaled, system_sides, compliance)
     on = system_sides.active
 
     def product(vector):
@@ -166,21 +163,32 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
         # The rows that do not take part are those of the identity.
         return scaled.hessian(x) + pull, scaled.equations(x), jnp.where(on, rows, z)
 
-    def solve(_, right):
-        x, p, z = solved(scaled, system_sides, system, right, _PASSES)
-        return x, p, jnp.where(on, z, right[2])
-
     # A singular system does not return a vector that it was multiplied with.
     probe = jax.tree.map(
         lambda a: jnp.cos(1.0 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape),
         (x, p, z),
     )
     probe = scaled.admissible(*probe[:2]) + (jnp.where(on, probe[2], 0),)
-    returned = solve(None, product(probe))
-    off = [
-        jnp.max(jnp.abs(a - b), initial=0) for a, b in zip(probe, returned, strict=True)
-    ]
-    unique = jnp.all(clear) & (jnp.max(jnp.stack(off)) < 1e-2)
+
+    def factorised(scaled, sides, compliance, probe, right):
+        system = assembled(scaled, sides, compliance)
+        returned = solved(scaled, sides, system, right, _PROBING)
+        pairs = zip(probe, returned, strict=True)
+        off = [jnp.max(jnp.abs(a - b), initial=0) for a, b in pairs]
+        return system, jnp.max(jnp.stack(off))
+
+    # A linear solve needs no derivative of its factors.
+    fixed = lax.stop_gradient((scaled, system_sides, compliance, probe, product(probe)))
+    system, off = by_lanes(factorised, *fixed)
+    unique = jnp.all(clear) & (off < 1e-2)
+
+    def refined(scaled, sides, system, right):
+        return solved(scaled, sides, system, right, _PASSES)
+
+    def solve(_, right):
+        x, p, z = by_lanes(refined, *fixed[:2], system, right)
+        return x, p, jnp.where(on, z, right[2])
+
     # As one vector: all of a right side must be linear in the tangents.
     flat, apart = ravel_pytree(tuple(right))
     flattened = lambda f: lambda *args: ravel_pytree(f(*args[:-1], apart(args[-1])))[0]

@@ -82,6 +82,14 @@ class Method(NamedTuple):
     sides: Sides
     tolerances: Tolerances | None
 
+    @staticmethod
+    def of(form: AbstractForm, tolerances: Tolerances | None = None) -> "Method":
+        """The method for a program."""
+        scaled, scaling = form.equilibrated()
+        own = form.sides()
+        sides = form.meaningful(own).scaled(scaling)
+        return Method(form, scaled, scaling, own, sides, tolerances)
+
     @property
     def is_soft(self) -> bool:
         """Whether a side may be violated."""

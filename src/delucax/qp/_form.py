@@ -41,6 +41,11 @@ class Sides(NamedTuple):
         """The sides that take part."""
         return self.inequality | self.equality
 
+    def scaled(self, scaling: Scaling) -> "Sides":
+        """The sides of the scaled problem."""
+        R, c = scaling.rows, scaling.cost
+        return self._replace(h=R * self.h, v=c * self.v / R, W=c * self.W / R**2)
+
 
 class AbstractForm(eqx.Module):
     """The arrays of a program, and what is linear algebra of its own structure.
@@ -86,7 +91,12 @@ class AbstractForm(eqx.Module):
 
     @abstractmethod
     def equilibrated(self) -> tuple["AbstractForm", Scaling]:
-        """The same problem with rows and columns of similar size."""
+        """The same problem with rows and columns of similar size, but for its bounds
+        and weights, which are those of `Sides.scaled`."""
+
+    def meaningful(self, sides: Sides) -> Sides:
+        """The sides that the method takes, of all."""
+        return sides
 
     def admissible(self, x: Array, p: Array) -> tuple[Array, Array]:
         """A vector without the entries that stand for nothing."""

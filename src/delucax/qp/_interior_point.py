@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .._jax import in_parts
 from .._typing import Array
-from ._active_set import Guess, PASSES, tried
+from ._active_set import active_at, Guess, PASSES, tried
 from ._embedding import evaluated, Iterate, Method, Outcome, Residuals
 from ._form import AbstractForm, both, Sides, signed
 
@@ -199,13 +200,14 @@ def begun(method: Method, along: Array) -> Iterate:
 
 def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> Outcome:
     """Try a guess of the active sides and what follows from it; then, if none of them
-    gives the solution, run the method from its own start."""
+    gives the solution, run the method from its own start. With the sides that are
+    active at its end one more linear system gives the solution up to rounding."""
     sides, dtype = method.sides, method.form.q.dtype
     count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
     rounding = jnp.finfo(dtype).eps
 
     def body(carry):
-        at, left, best, known, k, since, passes, begun_yet, guess = carry
+        at, left, best, known, k, since, passes, begun_yet, guess, ends = carry
         guessing = guess.left > 0
         first, before = ~begun_yet & ~guessing, left.linear
         now = jnp.where(guessing, PASSES, passes)
@@ -231,12 +233,16 @@ def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> 
         # While the products fall, an error may rise for a while.
         falls = left.products > count * rounding * at.tau**2
         since = jnp.where(better | fresh, 0, since + ~falls)
-        guess = jax.tree.map(lambda a, b: jnp.where(guessing, a, b), next_guess, guess)
-        return at, left, best, known, k + 1, since, passes, begun_yet | first, guess
+        ends = (jnp.min(known[1]) <= 1) & (guessing | (known[1][0] > 1))
+        last = active_at(method, at)._replace(left=jnp.where(ends, 0, 1))
+        pick = lambda a, b, c: jnp.where(guessing, a, jnp.where(known[1][0] <= 1, b, c))
+        guess = jax.tree.map(pick, next_guess, last, guess)
+        begun_yet = begun_yet | first
+        return at, left, best, known, k + 1, since, passes, begun_yet, guess, ends
 
     def going(carry):
-        _, _, _, known, k, since, *_ = carry
-        return (jnp.min(known[1]) > 1) & (k < max_steps) & (since < _PATIENCE)
+        *_, k, since, _, _, _, ends = carry
+        return ~ends & (k < max_steps) & (since < _PATIENCE)
 
     k, one = jnp.zeros((), int), jnp.ones((), dtype)
     none = jnp.zeros_like(sides.h)
@@ -248,10 +254,10 @@ def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> 
     known = left.measured, jnp.full(3, jnp.inf, dtype), left.gains
     no = jnp.asarray(False)
     passes = jnp.ones((), int)
-    carry = at, left, at, known, k, jnp.zeros((), int), passes, no, guess
-    out = lax.while_loop(going, body, carry)
-    _, _, best, known, k, *_ = out
-    return Outcome(*method.point(best), best, *known, k)
+    carry = at, left, at, known, k, jnp.zeros((), int), passes, no, guess, no
+    out = lax.while_loop(going, in_parts(body), carry)
+    _, _, best, (measured, errors, gains), k, *_ = out
+    return Outcome(*method.point(best), best, measured, errors, gains, k)
 
 
 def interior(z: Array, on: Array) -> Array:

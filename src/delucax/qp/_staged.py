@@ -6,7 +6,8 @@ equations are `x_0 = f_0` and `x_{k+1} - A_k x_k - B_k u_k = f_{k+1}`, and their
 multipliers the costates. A start that is free has no equation.
 """
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import Float
 from .._typing import Array
 from ..math._linear_solve import solve
 from ..math._norms import power_of_two
-from ._dense import cost_unit, regularisation, scaled_sides
+from ._dense import cost_unit, regularisation
 from ._form import AbstractForm, Scaling
 
 
@@ -143,14 +144,18 @@ class StagedForm(AbstractForm):
         D, R = jnp.ones(N, self.q.dtype), jnp.ones(self.G.shape[:2], self.q.dtype)
         # One scale for each component at all times, so that the equations keep theirs.
         H, general = lax.stop_gradient((largest(self.H, 0), self.G))
-        for _ in range(_PASSES):
-            d = unit(
-                jnp.maximum(largest(H, 0), largest(R[..., None] * general, (0, 1)) * D)
-            )
+
+        def balance(_, scaled):
+            H, D, R = scaled
+            rows = largest(R[..., None] * general, (0, 1)) * D
+            d = unit(jnp.maximum(largest(H, 0), rows))
             H, D = d[:, None] * H * d, D * d
             if self.G.shape[1]:
                 R = 1 / largest(general * D, 2)
                 R = power_of_two(jnp.where(jnp.isfinite(R), R, 1))
+            return H, D, R
+
+        _, D, R = lax.fori_loop(0, _PASSES, balance, (H, D, R))
         first, last = self.bounded
         E = 1 / D[:n]
         H = D[:, None] * self.H * D
@@ -164,11 +169,9 @@ class StagedForm(AbstractForm):
             jnp.concatenate([rows, R], axis=1),
             c,
         )
-        bounds, soft = scaled_sides(self, scaling)
         F = E[:, None] * self.F * D
-        own: Any = self.bounded, self.is_free
-        parts: Any = (c * H, c * q, F, E * self.f, G, *bounds, soft, *own)
-        return StagedForm(*parts), scaling
+        scaled = dict(H=c * H, q=c * q, F=F, f=E * self.f, G=G)
+        return dataclasses.replace(self, **scaled), scaling
 
     def admissible(self, x, p):
         n = self.f.shape[1]
