@@ -2,7 +2,8 @@
 
 `python -m benchmarks.scoreboard` runs what is missing or changed, writes
 `results/scoreboard.jsonl`, and puts the tables into `docs/scoreboard.md` and draws its
-picture; with `--table` it only does the latter, with `--fresh` it runs all.
+picture; with `--table` it only does the latter, with `--fresh` it runs all, and with
+`-k "SQP or RTI"` a selection.
 """
 
 import argparse
@@ -236,6 +237,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scoreboard")
     parser.add_argument("--table", action="store_true", help="from what is stored")
     parser.add_argument("--fresh", action="store_true", help="run all again")
+    parser.add_argument("-k", default="", metavar="CASES", help="a selection")
     options = parser.parse_args(arguments)
     keep_programs()
     begin = time.perf_counter()
@@ -243,8 +245,14 @@ def main(arguments: list[str] | None = None) -> int:
         results = Results.read(STORE)
     else:
         results = experiments.run(
-            scoreboard, store=STORE, workers=WORKERS, fresh=options.fresh
+            scoreboard,
+            store=STORE,
+            workers=WORKERS,
+            select=options.k,
+            fresh=options.fresh,
         )
+        # With what was stored before.
+        results = Results.read(STORE)
     for row in {row["case"]: row for row in results.failed}.values():
         print(f"FAILED {row['case']}: {row['error'].splitlines()[0]}", file=sys.stderr)
     text = f"{tables(results)}\n{footer()}"

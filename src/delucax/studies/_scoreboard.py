@@ -25,7 +25,7 @@ from ..dynamics import linearize
 from ..environments import Environment, make, registered, UniformState
 from ..experiments import experiment
 from ..lung import BreathCost, Breathing
-from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI
+from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI, SQP
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
 
@@ -108,14 +108,18 @@ def _learning(
 
 
 def _receding(
-    name: str, env: Environment, kind: type[AbstractPlanner], **options: Any
+    name: str,
+    env: Environment,
+    kind: type[AbstractPlanner],
+    real_time: bool = False,
+    **options: Any,
 ) -> Any:
     """MPC with the model and the cost of the task and, at the end of a plan, the cost
     to go of the LQR where there is one."""
     if env.dynamics.observation_size != env.dynamics.state_size:
         raise Unsuitable("the state is not observed")
     bounds = env.control_bounds
-    if kind is not ILQR and bounds is not None:
+    if kind in (MPPI, CEM) and bounds is not None:
         low, high = (np.asarray(bound, float) for bound in bounds)
         width = high - low
         options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
@@ -128,7 +132,7 @@ def _receding(
 
         cost = Function(env.cost, to_go)
     how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
-    return controllers.MPC(env.dynamics, cost, LOOKAHEAD, **how)
+    return controllers.MPC(env.dynamics, cost, LOOKAHEAD, real_time=real_time, **how)
 
 
 def _by_gradient(env: Environment, network: Callable[..., Any], **options: Any) -> Any:
@@ -191,6 +195,8 @@ FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
     },
     "Planning": {
         "MPC": lambda name, env: _receding(name, env, ILQR, max_iterations=8),
+        "SQP": lambda name, env: _receding(name, env, SQP, max_iterations=8),
+        "RTI": lambda name, env: _receding(name, env, SQP, real_time=True),
         "MPPI": lambda name, env: _receding(name, env, MPPI, samples=128, iterations=3),
         "CEM": lambda name, env: _receding(name, env, CEM, samples=128, iterations=3),
     },
