@@ -18,6 +18,8 @@ from ._transcription import Limits, Model
 
 STIFF = 10.0
 """The weight of the rows that hold with equality, over the largest entry of H."""
+FIRM = 1e6
+"""The same of the rows that the feedback must keep."""
 _TRIES = 20
 
 
@@ -62,20 +64,27 @@ def held_rows(limits: Limits, sides: Array, low: Array, high: Array) -> Held:
 
 
 def convexified(
-    limits: Limits, model: Model, held: Held, last: Array, controls: Array
+    limits: Limits,
+    model: Model,
+    held: Held,
+    last: Array,
+    controls: Array,
+    is_firm: Array | bool = False,
 ) -> tuple[Convex, Weights]:
     """The convex cost, and the weights of what was added. If the cost itself will not
     do, the squares of the rows that are held are added, as in an augmented Lagrangian,
-    and then a multiple of the identity.
+    and then a multiple of the identity. If `is_firm`, these squares alone are added,
+    with a weight that makes the feedback keep the rows.
 
     Source: Waechter and Biegler, 2006 (how the multiple is found, from the `last`).
     """
     largest = jnp.max(jnp.abs(model.H))
     least = 1e-4 * largest
+    firm = jnp.where(is_firm, FIRM * largest, 0)
 
     def again(carry):
         k, weights, _ = carry
-        stiff = jnp.where(k > 0, STIFF * largest, 0)
+        stiff = jnp.where(k > 0, STIFF * largest, firm)
         weights = weights._replace(rows=stiff)
         convex = made_convex(limits, model, held, weights)
         wanted = jnp.where(last > 0, jnp.maximum(least, last / 3), least)
@@ -86,7 +95,7 @@ def convexified(
 
     def going(carry):
         k, _, convex = carry
-        return (k == 0) | ((k < _TRIES) & (convex.shift > 0))
+        return (k == 0) | ((k < _TRIES) & (convex.shift > 0) & ~jnp.asarray(is_firm))
 
     plain = Weights(jnp.zeros_like(least), jnp.zeros_like(least), controls)
     (T, n, N), dtype = model.F.shape, model.h.dtype

@@ -23,12 +23,11 @@ from ..qp._derivatives import warm
 from ..qp._embedding import Method, Outcome as Solved, Tolerances
 from ..qp._interior_point import minimise
 from ..qp._staged import StagedForm
-from ._convex import Convex, convexified, Held, held_rows, made_convex, Weights
+from ._convex import Convex, convexified, FIRM, Held, held_rows, made_convex, Weights
 from ._descent import first_accepted
 from ._problem import Problem
-from ._start import Start
+from ._start import controls_of, Start
 from ._transcription import (
-    empty_model,
     expanded,
     Iterate,
     Limits,
@@ -59,8 +58,6 @@ PATIENCE = 50
 """Iterations after which violations at a price are no longer left to the funnel."""
 GUESSES = 4
 MAX_STEPS = 60
-FIRM = 1e6
-"""The weight of the held rows in the gains, over the largest entry of the Hessian."""
 
 
 class Options(eqx.Module):
@@ -91,7 +88,6 @@ class _Progress(NamedTuple):
     """The state of the loop."""
 
     now: Outcome
-    model: Model
     price: Array
     """Of a violation in the program; infinite while its constraints are hard."""
     width: Array
@@ -100,6 +96,8 @@ class _Progress(NamedTuple):
     """The multiple of the identity that was last added to a Hessian."""
     near: Array
     """Whether the last error was small enough for the Hessian of the Lagrangian."""
+    stuck: Array
+    """Whether no step was accepted, however short."""
     done: Array
 
 
@@ -208,13 +206,13 @@ def started(
 ) -> Iterate:
     """The trajectory to start from: that of the controls, or, where it runs away, the
     first state held, whose steps do not meet. The one that violates less."""
-    _, states, controls, cost = start.cheapest(problem)
-    T, n = controls.shape[0], problem.x0.shape[0]
-    controls = _clipped(limits, controls)
     if options.states is not None:
+        controls = _clipped(limits, controls_of(start))
         states = options.states.at[0].set(problem.x0)
     else:
-        still = jnp.broadcast_to(problem.x0, (T + 1, n))
+        _, states, controls, cost = start.cheapest(problem)
+        controls = _clipped(limits, controls)
+        still = jnp.broadcast_to(problem.x0, states.shape)
         bad = lax.map(
             lambda x: infeasibility(limits, measured(problem, limits, x, controls)),
             jnp.stack([states, still]),
@@ -238,7 +236,6 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
     (T, m), n, dtype = at.controls.shape, at.states.shape[1], at.states.dtype
     eps = float(jnp.finfo(dtype).eps)
     zero, infinite = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
-    model = empty_model(limits, at)
     now = Outcome(
         at=at,
         gains=jnp.zeros((T, m, n), dtype),
@@ -250,7 +247,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         rollouts=jnp.zeros((), int),
         regularisation=zero,
     )
-    first = _Progress(now, model, infinite, infinite, zero, *[jnp.asarray(False)] * 2)
+    first = _Progress(now, infinite, infinite, zero, *[jnp.asarray(False)] * 3)
 
     def body(before: _Progress) -> _Progress:
         now = before.now
@@ -266,32 +263,36 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         low = (error <= NEAR) & ~feasible & jnp.isfinite(before.price)
         hopeless = settled & low & (before.price >= most)
         price = jnp.where(low, jnp.minimum(10 * before.price, most), before.price)
-        lost = ~jnp.isfinite(model.values.cost + slope + error + violation)
+        cost = model.values.cost + limits.penalty(model.values.rows)
+        lost = ~jnp.isfinite(cost + slope + error + violation)
         result = choose(settled & feasible, RESULTS.successful, now.result)
         result = choose(hopeless, RESULTS.no_feasible_point, result)
         result = choose(lost, RESULTS.diverged, result)
+        ended = (settled & feasible) | hopeless | lost | before.stuck
+        ended = ended | (now.iterations >= options.max_iterations)
+        # At the end the convex cost is that of the gains, in which hard rows are firm.
+        low, high = rows_left(limits, model.values.rows)
+        payable = priced(limits, jnp.where(ended, jnp.inf, price))
+        held = held_rows(payable, now.at.sides, low, high)
+        added = jnp.where(ended, 0, now.regularisation)
+        convex, weights = convexified(limits, model, held, before.shift, added, ended)
         now = now._replace(
-            trace=now.trace.at[now.iterations].set(model.values.cost),
+            gains=convex.K,
+            trace=now.trace.at[now.iterations].set(cost),
             residual=slope,
             violation=violation,
             result=result,
         )
-        ended = (settled & feasible) | hopeless | lost
-        ended = ended | (now.iterations >= options.max_iterations)
         near = error <= NEAR
-        after = before._replace(
-            now=now, model=model, price=price, near=near, done=ended
-        )
-        return lax.cond(ended, lambda progress: progress, step, after)
+        after = before._replace(now=now, price=price, near=near, done=ended)
+        program = model, payable, low, high, convex, weights
+        going = lambda after: step(after, program)
+        return lax.cond(ended, lambda after: after, going, after)
 
-    def step(before: _Progress) -> _Progress:
-        now, model, price = before.now, before.model, before.price
+    def step(before: _Progress, program: Any) -> _Progress:
+        now, price = before.now, before.price
+        model, payable, low, high, convex, weights = program
         at, values = now.at, model.values
-        low, high = rows_left(limits, values.rows)
-        payable = priced(limits, price)
-        held = held_rows(payable, at.sides, low, high)
-        controls = now.regularisation
-        convex, weights = convexified(limits, model, held, before.shift, controls)
         form = form_of(payable, model, convex, low, high)
         # The first multipliers are zero if none are given.
         guesses = jnp.where(now.iterations > 0, GUESSES, 2)
@@ -317,7 +318,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(p)), 0)
 
         def merit(values):
-            paid = payable.penalty(values.rows) - limits.penalty(values.rows)
+            paid = payable.penalty(values.rows)
             return values.cost + paid + firm * jnp.sum(jnp.abs(values.defects))
 
         falling = payable.penalty(values.rows) - payable.penalty(values.rows + change)
@@ -372,7 +373,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             price=jnp.where(impossible, start, price),
             width=pick(narrowed, width),
             shift=jnp.where(weights.variables > 0, weights.variables, before.shift),
-            done=stuck,
+            stuck=stuck,
         )
 
     out = lax.while_loop(lambda progress: ~progress.done, in_parts(body), first)
@@ -380,4 +381,4 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
     counts = jnp.arange(options.max_iterations + 1)
     last = now.trace[jnp.minimum(now.iterations, options.max_iterations)]
     trace = jnp.where(counts <= now.iterations, now.trace, last)
-    return now._replace(gains=gains_of(limits, now.at, out.model), trace=trace)
+    return now._replace(trace=trace)

@@ -80,7 +80,7 @@ class Limits(NamedTuple):
 class Values(NamedTuple):
     """The problem at a trajectory."""
 
-    cost: Array  # with that of violated soft rows
+    cost: Array  # without that of violated soft rows
     defects: Array  # (T+1, n), by how much each step misses the next state
     rows: Array  # (T+1, rows)
 
@@ -93,16 +93,6 @@ class Model(NamedTuple):
     F: Array  # (T, n, N)
     G: Array  # (T+1, p, N), of the constraints by functions
     H: Array  # (T+1, N, N), of the Lagrangian
-
-
-def empty_model(limits: Limits, at: Iterate) -> Model:
-    """A model of zeros."""
-    (T, m), n, dtype = at.controls.shape, at.states.shape[1], at.states.dtype
-    rows, N = limits.low.shape[1], n + m
-    zeros = lambda *shape: jnp.zeros(shape, dtype)
-    values = Values(zeros(), zeros(T + 1, n), zeros(T + 1, rows))
-    G = zeros(T + 1, rows - limits.own, N)
-    return Model(values, zeros(T + 1, N), zeros(T, n, N), G, zeros(T + 1, N, N))
 
 
 def limits_of(problem: Problem, horizon: int) -> Limits:
@@ -208,8 +198,7 @@ def measured(problem: Problem, limits: Limits, states: Array, controls: Array):
     if problem.constraints is not None:
         (stage, _), (final, _) = problem.constraints_along(states, controls)
     rows = _joined(problem, limits, _stacked(states, controls), stage, final)
-    cost = problem.total(states, controls) + limits.penalty(rows)
-    return Values(cost, defects, rows)
+    return Values(problem.total(states, controls), defects, rows)
 
 
 @full_precision
@@ -284,7 +273,7 @@ def expanded(
     defects = jax.vmap(problem.deviation)(reached, states[1:])
     defects = jnp.concatenate([problem.deviation(problem.x0, states[0])[None], defects])
     rows = _joined(problem, limits, _stacked(states, controls), c, c_end)
-    values = Values(jnp.sum(cost) + last + limits.penalty(rows), defects, rows)
+    values = Values(jnp.sum(cost) + last, defects, rows)
     N, size = z.shape[1], rows.shape[1] - limits.own
     pad = lambda a, *sizes: jnp.pad(
         a, [(0, s - k) for s, k in zip(sizes, a.shape, strict=True)]
