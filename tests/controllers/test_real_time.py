@@ -96,6 +96,13 @@ def test_without_a_solution():
         (mpc := controller())(0.0, FAST, mpc.init())
 
 
+def test_a_constraint_that_is_not_a_number():
+    log = dlx.planning.Constraints({"log": lambda t, x, u: jnp.log(-1 + 0 * x[0])})
+    mpc = controller(constraints=log, throw=False)
+    _, state = mpc(0.0, X0, mpc.init())
+    assert state.result == dlx.RESULTS.diverged and state.failures.count == 1
+
+
 def test_a_fallback():
     damper = dlx.controllers.Linear(jnp.array([[0.0, 0.5]]))
     mpc = controller(fallback=damper)

@@ -260,6 +260,14 @@ def test_bad_input():
         solve(Constraints(states=(jnp.zeros(3), 1.0)))
     with user_error(match=r"limit must return a number or a vector"):
         solve(Constraints({"limit": lambda t, x, u: (x, u)}))
+    for wrong in (lambda t, x, u: x[0] > 1, lambda t, x, u: jnp.ones((2, 3))):
+        with user_error(match=r"limit must return a number or a vector"):
+            solve(Constraints({"limit": wrong}))
+    with user_error(match="limit fails when it is called"):
+        solve(Constraints({"limit": lambda t, x: x}))
+    with user_error(match="entry 0 at stage 0 are at least 9.0 and at most 8.0"):
+        far = Constraints(controls=(9.0, 10.0))
+        SQP()(dynamics, cost, x0, U, bounds=(-8.0, 8.0), constraints=far)
     with user_error(match="states must have low <= high"):
         solve(Constraints(states=(1.0, -1.0)))
     with user_error(match="SQP: max_iterations"):

@@ -1,5 +1,6 @@
 """Errors name the argument, the stage and the entry."""
 
+import jax
 import numpy as np
 import pytest
 from helpers import once
@@ -32,7 +33,7 @@ def crossed():
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: Dense(np.ones((2, 3)), np.ones(2)), "Dense: P must have shape (2, 2)"),
+        (lambda: Dense(np.ones((2, 3)), np.ones(2)), "Dense: P must have shape (3, 3)"),
         (lambda: Dense(-Q, np.ones(2)), "not convex: P must be positive semidefinite"),
         (lambda: Dense([[1, 1], [0, 1]], np.ones(2)), "Dense: P must be symmetric"),
         (lambda: Dense(Q, [np.nan, 1]), "Dense: q must not be NaN, but its entry (0,)"),
@@ -40,6 +41,9 @@ def crossed():
         (lambda: Dense(Q, [1, 2], bounds=([0, 1], 0.5)), "those of entry 1 are 1.0"),
         (lambda: Dense(Q, [1, 2], rows=Rows(np.eye(3))), "C of rows must have shape"),
         (lambda: Dense(Q, [1, 2], equalities=(Q, [1.0])), "b must have shape (2,)"),
+        (lambda: Dense(np.eye(3), [1, 2]), "Dense: q must have shape (3,)"),
+        (lambda: Soft(1, 0), "Soft: bounds must have a finite number between"),
+        (lambda: Staged(A, B, None, R, horizon=3), "Staged: Q must be an array"),
         (lambda: Soft(0, 1, linear=-1), "Soft: linear must be at least 0"),
         (lambda: Staged(A, B, Q, R), "Staged: give the horizon"),
         (lambda: Staged(A, B, stages(Q), R, horizon=4), "differ in their stages"),
@@ -73,6 +77,35 @@ def test_an_infeasible_program_says_where():
         RuntimeError, match="The constraints cannot all hold.* at stage 1 weighs"
     ):
         dlx.qp.solve(problem)
+
+
+def test_equations_that_contradict_each_other_are_named():
+    problem = Dense(Q, [1, 2], equalities=(np.ones((2, 2)), [1.0, 2.0]))
+    with pytest.raises(RuntimeError, match="Row . of equalities weighs most"):
+        dlx.qp.solve(problem)
+
+
+def test_a_start_must_fit():
+    solution = dlx.qp.solve(Dense(Q, [1, 2]))
+    for problem in (
+        Dense(np.eye(3), np.ones(3)),
+        Dense(Q, [1, 2], bounds=(-1, 1)),
+        Staged(A, B, Q, R, horizon=3),
+    ):
+        with pytest.raises(ValueError, match="solve: start must be the solution"):
+            dlx.qp.solve(problem, start=solution)
+
+
+def test_what_a_trace_hides_has_a_status():
+    @jax.jit
+    def status(low, linear):
+        rows = Rows(np.ones((1, 2)), upper=1.0, linear=linear)
+        problem = Dense(Q, [-5.0, 0.0], bounds=(low, np.inf), rows=rows)
+        return dlx.qp.solve(problem, throw=False).result
+
+    assert status(-9.0, 1.0) == dlx.RESULTS.successful
+    for given in ((np.inf, 1.0), (np.nan, 1.0), (-9.0, np.nan), (-9.0, -1.0)):
+        assert status(*given) == dlx.RESULTS.ill_posed
 
 
 def test_an_unbounded_program_says_so():

@@ -203,7 +203,9 @@ class MPC(AbstractController):
         self.start = start.stacked(dynamics.state_size)
         self.real_time = check_bool(real_time, "real_time", where)
         self.max_qp_steps = check_count(max_qp_steps, "max_qp_steps", where)
-        self.planner = planner or (SQP() if real_time else ILQR())
+        if planner is None:
+            planner = SQP() if real_time else ILQR()
+        self.planner = planner
         self.fallback = fallback
         self.constraints, self.difference = constraints, difference
         self.throw = check_bool(throw, "throw", where)

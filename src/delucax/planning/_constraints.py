@@ -227,15 +227,24 @@ def rows_of(constraints: Constraints, final: bool, arguments: tuple) -> list[Row
     """What those values are, in their order."""
     rows = []
     for name, function, equal in _each(constraints, final):
-        like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *arguments)
+        try:
+            like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *arguments)
+        except TypeError as error:
+            given = "(t, x)" if final else "(t, x, u)"
+            raise ValueError(
+                f"Constraints: {name} fails when it is called with {given}: {error}"
+            ) from error
         leaves = jax.tree.leaves(like)
-        if len(leaves) != 1 or not hasattr(leaves[0], "shape"):
+        dtype = getattr(leaves[0], "dtype", None) if len(leaves) == 1 else None
+        is_real = dtype is not None and np.dtype(dtype).kind in "fiu"
+        is_number = len(leaves) == 1 and type(leaves[0]) in (int, float)
+        if not is_number and (not is_real or len(leaves[0].shape) > 1):
             raise ValueError(
                 f"Constraints: {name} must return a number or a vector, got {like}."
             )
         soft = isinstance(function, SoftConstraint)
         weights = (function.linear, function.quadratic) if soft else None
-        size = int(np.prod(leaves[0].shape))
+        size = int(np.prod(np.shape(leaves[0])))
         for weight in weights or ():
             if np.shape(weight) not in ((), (size,)):
                 raise ValueError(

@@ -6,6 +6,7 @@ Source: Diehl, Bock, Schloeder, Findeisen, Nagy and Allgoewer, 2002.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -75,10 +76,13 @@ def fed_back(problem: Problem, ready: Prepared, max_steps: int) -> Plan:
     controls = controls if ends is None else jnp.clip(controls, *ends)
     p = qp.p - jnp.einsum("tij,tj->ti", convex.P, qp.x[:, :n]) - convex.s
     solved, bad, _ = qp.errors
-    usable = jnp.all(jnp.isfinite(qp.x)) & (solved <= _USABLE)
+    # A NaN in the rows would be a row without bounds.
+    data = jnp.concatenate([jnp.ravel(a) for a in jax.tree.leaves(model)])
+    posed = jnp.all(jnp.isfinite(data))
+    usable = posed & jnp.all(jnp.isfinite(qp.x)) & (solved <= _USABLE)
     result = choose(bad <= 1, RESULTS.no_feasible_point, RESULTS.diverged)
     result = choose(usable, RESULTS.not_converged, result)
-    result = choose(solved <= 1, RESULTS.successful, result)
+    result = choose(posed & (solved <= 1), RESULTS.successful, result)
     return problem.plan(
         states,
         controls,

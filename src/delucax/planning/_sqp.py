@@ -2,11 +2,19 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._check import check_bool, check_count, check_range, finite_rows
+from .._check import (
+    check_bool,
+    check_count,
+    check_range,
+    finite_rows,
+    is_concrete,
+)
 from .._module import parameter
 from .._typing import PRNGKey
+from ..qp import Soft
 from ._multipliers import Multipliers, zeros_like_result
 from ._plan import Plan
 from ._planner import AbstractPlanner
@@ -122,6 +130,7 @@ class SQP(AbstractPlanner):
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         dtype, states = start.controls.dtype, self.states
+        _check_controls(problem, start.horizon)
         if states is not None:
             n, points = problem.dynamics.state_size, start.horizon + 1
             states = finite_rows(states, n, "states", "SQP", points).astype(dtype)
@@ -172,6 +181,32 @@ class SQP(AbstractPlanner):
         of the program.
         """
         return fed_back(problem, ready, max_steps)
+
+
+def _check_controls(problem: Problem, horizon: int) -> None:
+    """Raise if no control is between the bounds and those of the constraints."""
+    own = None if problem.constraints is None else problem.constraints.controls
+    if own is None or problem.bounds is None or isinstance(own, Soft):
+        return
+    if not all(map(is_concrete, (*own, *problem.bounds))):
+        return
+    shape = horizon, problem.dynamics.control_size
+    # Shapes that do not fit are refused where the limits are made.
+    if any(np.shape(end) not in ((), shape[1:], shape) for end in own):
+        return
+    low, high = (
+        np.broadcast_to(pick(np.asarray(a), np.asarray(b)), shape)
+        for pick, a, b in zip(
+            (np.maximum, np.minimum), own, problem.bounds, strict=True
+        )
+    )
+    if (low > high).any():
+        k, i = np.argwhere(low > high)[0]
+        raise ValueError(
+            "SQP: bounds and the bounds `controls` of the constraints must have a "
+            f"number between them, but those of entry {i} at stage {k} are at least "
+            f"{low[k, i]} and at most {high[k, i]}."
+        )
 
 
 @eqx.filter_jit

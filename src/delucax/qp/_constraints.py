@@ -48,6 +48,7 @@ class Soft(eqx.Module):
             _as_array(low, "low", "Soft"),
             _as_array(high, "high", "Soft"),
         )
+        _check_order(self.low, self.high, "bounds", "Soft")
         self.linear = _as_weight(linear, "linear", "Soft")
         self.quadratic = _as_weight(quadratic, "quadratic", "Soft")
 
@@ -211,7 +212,8 @@ def as_matrices(value: Any, name: str, where: str) -> Array:
     array = as_finite_array(value, name, where)
     if array.ndim not in (2, 3):
         raise ValueError(
-            f"{where}: {name} must be a matrix, or a stack of one for each stage, got "
+            f"{where}: {name} must be a matrix"
+            f"{'' if where == 'Dense' else ', or a stack of one for each stage'}, got "
             f"shape {array.shape}."
         )
     return array

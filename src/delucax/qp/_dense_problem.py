@@ -106,13 +106,18 @@ class Dense(eqx.Module):
         where = "Dense"
         # What is given is only checked here; `form` computes with it.
         P, q = as_matrices(P, "P", where), as_finite_array(q, "q", where)
-        n = q.shape[-1] if q.ndim else 0
-        _check_shape(q, (n,), "q", where)
+        n = P.shape[-1]
         _check_shape(P, (n, n), "P", where)
+        _check_shape(q, (n,), "q", where)
         self.P, self.q = symmetric_part(P, "P", where), q
         check_convex(self.P, "P", where)
         self.E = self.b = self.G = None
         if equalities is not None:
+            if not isinstance(equalities, tuple | list) or len(equalities) != 2:
+                raise ValueError(
+                    f"{where}: equalities must be a pair (E, b), got "
+                    f"{type(equalities).__name__}."
+                )
             E, b = equalities
             self.E, self.b = as_matrices(E, "E", where), as_finite_array(b, "b", where)
             _check_shape(self.E, (len(self.E), n), "E", where)
@@ -175,6 +180,10 @@ class Dense(eqx.Module):
         lower = jnp.concatenate([empty, *(part[0] for part in parts)])
         upper = jnp.concatenate([empty, *(part[1] for part in parts)])
         return x, multipliers.equalities, jnp.stack([upper, lower])
+
+    def equation(self, row: int) -> str:
+        """The words for an equation of the form."""
+        return f"row {row} of equalities"
 
     def place(self, side: int, row: int) -> str:
         """The words for a `side` (1 is the lower one) of a `row` of the form."""

@@ -127,7 +127,7 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     certificate = jnp.asarray(1e-8 if dtype == jnp.float64 else 1e-4, dtype)
     atol, rtol = jnp.asarray(atol, dtype), jnp.asarray(rtol, dtype)
     if start is not None:
-        start = problem.unknowns(*start)
+        start = _fitting(problem, form, start)
     tolerances = Tolerances(atol, rtol, certificate)
     options = lax.stop_gradient(Options(start, tolerances, max_steps, refinements))
     point = optimum(form, options)
@@ -145,6 +145,22 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     answer: Any = *problem.primal(x), multipliers, cost, *point.measured
     answers: Any = *answer, point.iterations, result
     return Solution(*answers)
+
+
+def _fitting(problem: Dense | Staged, form: AbstractForm, start: Any) -> Any:
+    """The unknowns of a start."""
+    wanted = [form.q.shape, form.f.shape, (2, *form.lower.shape)]
+    try:
+        unknowns = problem.unknowns(*start)
+        fits = [a.shape for a in unknowns] == wanted
+    except (AttributeError, IndexError, TypeError, ValueError):
+        fits, unknowns = False, None
+    if not fits:
+        raise ValueError(
+            "solve: start must be the solution of a problem of the same kind, sizes "
+            "and constraints."
+        )
+    return unknowns
 
 
 def _judged(point: Outcome, is_posed: Array) -> tuple[Result, Any]:
@@ -165,6 +181,10 @@ def _is_posed(problem: Dense | Staged, form: AbstractForm) -> Array:
     bounds = (jnp.where(jnp.isinf(b), 0, b) for b in (form.lower, form.upper))
     arrays = *problem.data(), form.q, form.f, *bounds
     posed = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(a) for a in arrays])))
+    # What a trace hides from the checks of the arguments.
+    posed = posed & jnp.all(form.lower < jnp.inf) & jnp.all(form.upper > -jnp.inf)
+    if form.soft is not None:
+        posed = posed & jnp.all(jnp.stack(form.soft) >= 0)
     for hessian in problem.hessians():
         n, size = hessian.shape[-1], jnp.max(jnp.abs(hessian), initial=0)
         # A product C'C is semidefinite up to this.
@@ -201,7 +221,18 @@ def _facts(problem: Dense | Staged, solution: Solution) -> str:
         return ""
     given: Any = solution.x, solution.u, solution.multipliers
     _, p, z = problem.unknowns(*given)
-    sides = problem.form().sides()
-    heights = np.abs(np.asarray(sides.h * z))
-    index = tuple(map(int, np.unravel_index(heights.argmax(), heights.shape)))
-    return f"{problem.place(*index).capitalize()} weighs most in the certificate."
+    form = problem.form()
+    sides = form.sides()
+
+    def largest(heights):
+        heights = np.abs(np.asarray(heights))
+        if not heights.size:
+            return 0.0, ()
+        index = np.unravel_index(heights.argmax(), heights.shape)
+        return heights[index], tuple(map(int, index))
+
+    (bound, side), (value, row) = largest(sides.h * z), largest(form.f * p)
+    # Equations, such as the steps of stages, are to blame if they alone contradict.
+    alone = bound <= 1e-6 * value
+    where = problem.equation(*row) if alone else problem.place(*side)
+    return f"{where[0].upper()}{where[1:]} weighs most in the certificate."

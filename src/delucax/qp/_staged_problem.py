@@ -182,7 +182,7 @@ class Staged(eqx.Module):
         given = {
             name: as_matrices(value, name, where)
             for name, value in matrices.items()
-            if value is not None
+            if value is not None or name != "S"
         }
         given |= {
             name: as_finite_array(value, name, where)
@@ -354,6 +354,10 @@ class Staged(eqx.Module):
             return jnp.concatenate([*parts, jnp.vstack([along, end])], axis=1)
 
         return x, y.costates, jnp.stack([side(1), side(0)])
+
+    def equation(self, stage: int, row: int) -> str:
+        """The words for an equation of the form."""
+        return f"entry {row} of the step to stage {stage}" if stage else "the start"
 
     def place(self, side: int, stage: int, row: int) -> str:
         """The words for a `side` (1 is the lower one) of a `row` of a `stage`."""
