@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, once, tolerance, user_error
 
 import delucax as dlx
 
@@ -38,6 +38,7 @@ def test_it_is_exact_for_a_linear_plant():
     assert state.result == dlx.RESULTS.successful
 
 
+@needs_x64
 def test_it_follows_the_converged_plans():
     one, whole = ran(controller()), ran(controller(real_time=False, planner=SQP()))
     assert_close(one.total_cost, whole.total_cost, rtol=1e-3)
@@ -45,6 +46,7 @@ def test_it_follows_the_converged_plans():
     assert not one.incident_counts["failed_plan"]
 
 
+@needs_x64
 def test_a_call_is_preparation_and_feedback():
     mpc = controller()
     state = mpc.prepare(0.0, mpc.init())
@@ -73,6 +75,7 @@ def test_its_derivative():
     assert_close(jax.grad(cost)(at)[0], central, rtol=1e-5)
 
 
+@needs_x64
 def test_a_batch():
     mpc = controller()
     starts = jnp.array([[0.3, 0.0], [-0.2, 0.1]])
@@ -85,6 +88,7 @@ def test_a_batch():
 FAST = jnp.array([0.3, 9.0])
 
 
+@needs_x64
 def test_without_a_solution():
     u, state = (mpc := controller(throw=False))(0.0, FAST, mpc.init())
     # The last plan under its gains, within the bounds.
@@ -96,6 +100,7 @@ def test_without_a_solution():
         (mpc := controller())(0.0, FAST, mpc.init())
 
 
+@once
 def test_a_constraint_that_is_not_a_number():
     log = dlx.planning.Constraints({"log": lambda t, x, u: jnp.log(-1 + 0 * x[0])})
     mpc = controller(constraints=log, throw=False)
@@ -103,6 +108,7 @@ def test_a_constraint_that_is_not_a_number():
     assert state.result == dlx.RESULTS.diverged and state.failures.count == 1
 
 
+@needs_x64
 def test_a_fallback():
     damper = dlx.controllers.Linear(jnp.array([[0.0, 0.5]]))
     mpc = controller(fallback=damper)
@@ -112,6 +118,7 @@ def test_a_fallback():
     assert_close(u, v)
 
 
+@once
 def test_wrong_use():
     with user_error(match="planner must be a `delucax.planning.SQP`"):
         controller(planner=dlx.planning.ILQR())

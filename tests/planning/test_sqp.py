@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, once, tolerance, user_error
 from hypothesis import given, settings, strategies as st
 
 import delucax as dlx
@@ -247,6 +247,7 @@ def test_a_convex_plan_is_its_quadratic_program(seed):
         assert total(moved) >= best - 1e-9
 
 
+@once
 def test_bad_input():
     dynamics, cost, x0, U = pendulum(4)
     solve = lambda c: SQP()(dynamics, cost, x0, U, constraints=c)
@@ -290,6 +291,7 @@ def test_bad_input():
         solve(Constraints({"log": lambda t, x, u: jnp.log(-1 - x[0] ** 2)}))
 
 
+@once
 def test_what_a_transformation_outside_traces_is_refused():
     dynamics, cost, x0, U = pendulum(4)
 
