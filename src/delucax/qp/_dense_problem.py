@@ -182,7 +182,7 @@ class Dense(eqx.Module):
         return x, multipliers.equalities, jnp.stack([upper, lower])
 
     def equation(self, row: int) -> str:
-        """The words for an equation of the form."""
+        """The words for the equation in `row` of the form."""
         return f"row {row} of equalities"
 
     def place(self, side: int, row: int) -> str:

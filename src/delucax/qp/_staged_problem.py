@@ -356,7 +356,7 @@ class Staged(eqx.Module):
         return x, y.costates, jnp.stack([side(1), side(0)])
 
     def equation(self, stage: int, row: int) -> str:
-        """The words for an equation of the form."""
+        """The words for the equation in `row` of a `stage` of the form."""
         return f"entry {row} of the step to stage {stage}" if stage else "the start"
 
     def place(self, side: int, stage: int, row: int) -> str:
