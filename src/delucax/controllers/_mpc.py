@@ -282,15 +282,8 @@ class MPC(AbstractController):
 
         **Returns:** the state for `feedback`.
         """
-        self._check_real_time("prepare")
-        return self._prepared(as_float_array(t), state)
-
-    @eqx.filter_jit
-    def _prepared(self, t: RealScalar, state: MPCState) -> MPCState:
-        last, planner = state.last, self.planner
-        assert last.states is not None and isinstance(planner, SQP)
-        problem = self._problem(t, last.states[0], last.controls.dtype)
-        return state._replace(prepared=planner.prepare(problem, last))
+        _check_real_time(self.real_time, "prepare")
+        return _prepared(self, as_float_array(t), state)
 
     def feedback(
         self, t: RealScalar, y: Observation, state: MPCState
@@ -308,25 +301,12 @@ class MPC(AbstractController):
         **Raises:** `ValueError` without `prepare`; an error at run time as `throw`
         says.
         """
-        self._check_real_time("feedback")
+        _check_real_time(self.real_time, "feedback")
         check_state(self, y, self.dynamics.state_size)
         if state.prepared is None:
             raise ValueError("MPC.feedback: state must come from prepare.")
-        u, lost, result, state = self._fed_back(as_float_array(t), y, state)
-        return self._checked(u, lost, result), state
-
-    @eqx.filter_jit
-    def _fed_back(self, t, y, state):
-        planner = self.planner
-        assert isinstance(planner, SQP)
-        problem = self._problem(t, y, state.last.controls.dtype)
-        plan = planner.feedback(problem, state.prepared, self.max_qp_steps)
-        u, lost, after = self._moved_on(t, y, plan, state)
-        return u, lost, plan.result, after._replace(prepared=None)
-
-    def _check_real_time(self, name: str):
-        if not self.real_time:
-            raise ValueError(f"MPC.{name}: real_time must be True.")
+        u, lost, result, state = _fed_back(self, as_float_array(t), y, state)
+        return _checked(self, u, lost, result), state
 
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         if self.real_time:
@@ -354,15 +334,7 @@ class MPC(AbstractController):
         u, lost, after = self._moved_on(
             as_float_array(t), y, plan, state._replace(key=key)
         )
-        return self._checked(u, lost, plan.result), after
-
-    def _checked(self, u: Control, lost: Array, result: Result) -> Control:
-        throw = self.throw and self.fallback is None
-        if throw and (isinstance(lost, Tracer) or lost):
-            # Attached to the control, which every caller uses: attached to the state it
-            # would be removed as dead code where the state is not read.
-            return result.error_if(u, lost)
-        return u
+        return _checked(self, u, lost, plan.result), after
 
     @eqx.filter_jit
     def _moved_on(
@@ -402,6 +374,39 @@ class MPC(AbstractController):
             return u
         low, high = self.bounds
         return jnp.minimum(jnp.maximum(u, low), high)
+
+
+# Functions, as a call of a module's method takes a tenth of a millisecond each.
+@eqx.filter_jit
+def _prepared(mpc: MPC, t: RealScalar, state: MPCState) -> MPCState:
+    last, planner = state.last, mpc.planner
+    assert last.states is not None and isinstance(planner, SQP)
+    problem = mpc._problem(t, last.states[0], last.controls.dtype)
+    return state._replace(prepared=planner.prepare(problem, last))
+
+
+@eqx.filter_jit
+def _fed_back(mpc: MPC, t: RealScalar, y: Observation, state: MPCState) -> Any:
+    planner = mpc.planner
+    assert isinstance(planner, SQP)
+    problem = mpc._problem(t, y, state.last.controls.dtype)
+    plan = planner.feedback(problem, state.prepared, mpc.max_qp_steps)
+    u, lost, after = mpc._moved_on(t, y, plan, state)
+    return u, lost, plan.result, after._replace(prepared=None)
+
+
+def _check_real_time(real_time: bool, name: str) -> None:
+    if not real_time:
+        raise ValueError(f"MPC.{name}: real_time must be True.")
+
+
+def _checked(mpc: MPC, u: Control, lost: Array, result: Result) -> Control:
+    throw = mpc.throw and mpc.fallback is None
+    if throw and (isinstance(lost, Tracer) or lost):
+        # Attached to the control, which every caller uses: attached to the state it
+        # would be removed as dead code where the state is not read.
+        return result.error_if(u, lost)
+    return u
 
 
 @host_unless_traced

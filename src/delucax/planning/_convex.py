@@ -40,6 +40,8 @@ class Held(NamedTuple):
 
     rows: Array
     target: Array
+    price: Array | float = 0.0
+    """Of the squared distance from the target, as part of the cost."""
 
 
 class Weights(NamedTuple):
@@ -123,12 +125,12 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
     (_, n, N), dtype = model.F.shape, model.h.dtype
     first, last = limits.bounded
     eye = jnp.eye(N, dtype=dtype)
-    own, general = jnp.split(held.rows.astype(dtype), [limits.own], axis=1)
-    at_own, at_general = jnp.split(held.target, [limits.own], axis=1)
     norm = jnp.sum(model.G**2, axis=2)
-    general = weights.rows * general / jnp.where(norm > 0, norm, 1)
-    own = weights.rows * jnp.pad(own, ((0, 0), (first, N - last)))
-    at_own = jnp.pad(at_own, ((0, 0), (first, N - last)))
+    norm = jnp.pad(norm, ((0, 0), (limits.own, 0)), constant_values=1)
+    weight = weights.rows * held.rows / jnp.where(norm > 0, norm, 1) + held.price
+    own, general = jnp.split(weight.astype(dtype), [limits.own], axis=1)
+    at_own, at_general = jnp.split(held.target, [limits.own], axis=1)
+    own, at_own = (jnp.pad(a, ((0, 0), (first, N - last))) for a in (own, at_own))
     over = weights.variables + weights.controls * (jnp.arange(N) >= n)
     H = model.H + (own + over)[:, :, None] * eye
     H = H + jnp.einsum("tpi,tp,tpj->tij", model.G, general, model.G)

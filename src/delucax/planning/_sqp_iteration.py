@@ -3,10 +3,10 @@
 Each iteration solves the quadratic program about the present trajectory, and takes the
 longest step that a funnel accepts: all that is violated stays within its width, and
 either the cost falls enough or the width does. If the program has no feasible point,
-its constraints may be violated at a price, which rises until they hold or no price
-makes them hold.
+the next one has the squares of the violations in its cost in place of the constraints,
+at a price that rises until a program is feasible again or no price makes it so.
 
-Source: Kiessling, Leyffer and Vanaret, 2024 (the funnel); Fletcher, 1985 (the price).
+Source: Kiessling, Leyffer and Vanaret, 2024 (the funnel).
 """
 
 from typing import Any, NamedTuple
@@ -89,7 +89,9 @@ class _Progress(NamedTuple):
 
     now: Outcome
     price: Array
-    """Of a violation in the program; infinite while its constraints are hard."""
+    """Of a squared violation; zero until a program had no feasible point."""
+    elastic: Array
+    """Whether the next program may violate constraints at that price."""
     width: Array
     """Of the funnel."""
     shift: Array
@@ -106,24 +108,33 @@ def rows_left(limits: Limits, rows: Array) -> tuple[Array, Array]:
     return limits.low - rows, limits.high - rows
 
 
-def priced(limits: Limits, price: Array) -> Limits:
-    """The limits whose hard rows may be violated at a price, if that is finite; hard
+def priced(limits: Limits, price: Array, on: Array) -> Limits:
+    """The limits whose hard rows may be violated at a price where this is on; hard
     bounds of controls may not."""
     index = jnp.arange(limits.low.shape[1])
     elastic = (index < limits.states) | (index >= limits.own)
-    elastic = elastic & limits.hard & jnp.isfinite(price)
+    elastic = elastic & limits.hard & on
     return limits._replace(
-        linear=jnp.where(elastic, price, limits.linear),
-        quadratic=jnp.where(elastic, 0, limits.quadratic),
+        linear=jnp.where(elastic, 0, limits.linear),
+        quadratic=jnp.where(elastic, price, limits.quadratic),
     )
+
+
+def without(paid: Array, price: Array, held: Held, low: Array, high: Array):
+    """What holds, and the bounds, without the rows that are paid for; the squares of
+    those that are violated are in the cost."""
+    over = paid & ((low > 0) | (high < 0))
+    target = jnp.where(over, jnp.where(low > 0, low, high), held.target)
+    held = Held(held.rows, target, jnp.where(over, price, 0))
+    return held, jnp.where(paid, -jnp.inf, low), jnp.where(paid, jnp.inf, high)
 
 
 def form_of(
     limits: Limits, model: Model, convex: Convex, low: Array, high: Array
 ) -> StagedForm:
     """The quadratic program."""
-    soft, rows = None, low.shape[1]
-    if rows > limits.own or limits.states or limits.is_soft:
+    soft = None
+    if limits.is_soft:
         v, W = limits.linear, limits.quadratic
         soft = jnp.stack([v, v]), jnp.stack([W, W])
     return StagedForm(
@@ -184,7 +195,7 @@ def solved(
     guess = warm(method, jnp.zeros_like(form.q), at.sides)
     left = jnp.asarray(guesses, guess.left.dtype)
     guess = guess._replace(left=left)
-    return minimise(method, guess, MAX_STEPS, 2, parted=True)
+    return minimise(method, guess, MAX_STEPS, 2, parted=method.is_soft)
 
 
 def curved(limits: Limits, at: Iterate, model: Model) -> Held:
@@ -248,7 +259,8 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         rollouts=jnp.zeros((), int),
         regularisation=zero,
     )
-    first = _Progress(now, infinite, infinite, zero, *[jnp.asarray(False)] * 3)
+    no = jnp.asarray(False)
+    first = _Progress(now, zero, no, infinite, zero, no, no, no)
 
     def body(before: _Progress) -> _Progress:
         now = before.now
@@ -260,8 +272,8 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         feasible = violation <= options.constraint_tolerance
         settled = error <= options.tolerance
         # Close to a point that is stationary but not feasible the price was too low.
-        most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
-        low = (error <= NEAR) & ~feasible & jnp.isfinite(before.price)
+        most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h))) / violation
+        low = (error <= NEAR) & ~feasible & before.elastic
         hopeless = settled & low & (before.price >= most)
         price = jnp.where(low, jnp.minimum(10 * before.price, most), before.price)
         cost = model.values.cost + limits.penalty(model.values.rows)
@@ -273,8 +285,9 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         ended = ended | (now.iterations >= options.max_iterations)
         # At the end the convex cost is that of the gains, in which hard rows are firm.
         low, high = rows_left(limits, model.values.rows)
-        payable = priced(limits, jnp.where(ended, jnp.inf, price))
+        payable = priced(limits, price, before.elastic & ~ended)
         held = held_rows(payable, now.at.sides, low, high)
+        held, low, high = without(limits.hard & ~payable.hard, price, held, low, high)
         added = jnp.where(ended, 0, now.regularisation)
         convex, weights = convexified(limits, model, held, before.shift, added, ended)
         now = now._replace(
@@ -286,15 +299,15 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         )
         near = error <= NEAR
         after = before._replace(now=now, price=price, near=near, done=ended)
-        program = model, payable, low, high, convex, weights
+        program = model, payable, low, high, held, convex, weights
         going = lambda after: step(after, program)
         return lax.cond(ended, lambda after: after, going, after)
 
     def step(before: _Progress, program: Any) -> _Progress:
         now, price = before.now, before.price
-        model, payable, low, high, convex, weights = program
+        model, payable, low, high, held, convex, weights = program
         at, values = now.at, model.values
-        form = form_of(payable, model, convex, low, high)
+        form = form_of(limits, model, convex, low, high)
         # The first multipliers are zero if none are given.
         guesses = jnp.where(now.iterations > 0, GUESSES, 2)
         qp = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
@@ -302,7 +315,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         dx, du = dz[:, :n], dz[:-1, n:]
         p = qp.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
         usable = jnp.all(jnp.isfinite(dz)) & (qp.errors[0] <= 1e3)
-        impossible = ~usable & jnp.isinf(price)
+        impossible = ~usable & ~before.elastic
         # The width of the funnel, and by how much the cost should fall.
         missed = infeasibility(limits, values)
         first = jnp.maximum(WIDTH, TIMES * missed)
@@ -314,15 +327,19 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             ],
             axis=1,
         )
+        # What is paid for has multipliers too.
+        push = held.price * (change - held.target)
+        sides = qp.z + jnp.maximum(jnp.stack([push, -push]), 0)
         # The funnel may cycle at a price; then the exact penalty function must fall.
-        elastic = jnp.isfinite(price) & (now.iterations >= PATIENCE)
+        elastic = before.elastic & (now.iterations >= PATIENCE)
         firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(p)), 0)
 
         def merit(values):
             paid = payable.penalty(values.rows)
             return values.cost + paid + firm * jnp.sum(jnp.abs(values.defects))
 
-        falling = payable.penalty(values.rows) - payable.penalty(values.rows + change)
+        falling = limits.penalty(values.rows) - limits.penalty(values.rows + change)
+        falling = falling + jnp.sum(held.price * held.target * change)
         decrease = falling - jnp.sum(model.h * dz)
         decrease = decrease + firm * jnp.sum(jnp.abs(values.defects))
         now_at = merit(values)
@@ -351,11 +368,14 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             states,
             controls,
             at.costates + length * (p - at.costates),
-            at.sides + length * (qp.z - at.sides),
+            at.sides + length * (sides - at.sides),
         )
         pick = lambda new, old: jnp.where(accepted, new, old)
         scale = jnp.max(jnp.abs(model.H))
-        failed = ~accepted & ~impossible
+        # From a point where constraints had to be paid for, a program that has a
+        # feasible point again may still lead nowhere.
+        lost = ~accepted & ~before.elastic & (price > 0)
+        failed = ~accepted & ~impossible & ~lost
         mu = now.regularisation
         mu = jnp.where(failed, jnp.maximum(10 * mu, 1e-4 * scale), mu / 10)
         mu = jnp.where(mu < 1e-8 * scale, 0, mu)
@@ -369,9 +389,11 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             result=choose(stuck, failure, now.result),
         )
         start = FIRST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
+        start = start / jnp.maximum(now.violation, NEAR)
         return before._replace(
             now=after,
-            price=jnp.where(impossible, start, price),
+            price=jnp.where(impossible & (price == 0), start, price),
+            elastic=impossible | lost | (before.elastic & ~accepted),
             width=pick(narrowed, width),
             shift=jnp.where(weights.variables > 0, weights.variables, before.shift),
             stuck=stuck,
