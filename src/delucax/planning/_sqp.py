@@ -44,9 +44,10 @@ class SQP(AbstractPlanner):
     A step `1, 1/2, ..., 1/2048` is accepted by a funnel: the sum of all violations
     stays below its width, and either the cost falls by 1e-4 of the predicted decrease,
     or the violations fall below 0.9 of the width, which then narrows.
-    Where the linearised constraints have no feasible point, they may be violated at a
-    price, that of an exact penalty; it rises near each stationary point that is not
-    feasible, and if no price makes them hold, the result is `no_feasible_point`.
+    Where the linearised constraints have no feasible point, the squares of their
+    violations are added to the cost instead, at a price. Near a stationary point the
+    constraints are tried again and the price rises; if no price makes them hold, the
+    result is `no_feasible_point`.
 
     It has converged if the gradient of the Lagrangian and the complementarity are at
     most `tolerance` times one plus the size of the terms that cancel in them, the

@@ -50,8 +50,8 @@ SWITCH = 1e-3
 """The cost must fall where its predicted decrease is at least this share of the
 violation."""
 NEAR = 0.01
-"""At this error the Hessian of the cost gives way to that of the Lagrangian, and the
-price of violations that are left rises."""
+"""At this error the Hessian of the cost gives way to that of the Lagrangian, the price
+of violations that are left rises, and the constraints are tried without them."""
 FIRST_PRICE = 10.0
 MOST_PRICE = 1e7
 PATIENCE = 50
@@ -330,7 +330,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         # What is paid for has multipliers too.
         push = held.price * (change - held.target)
         sides = qp.z + jnp.maximum(jnp.stack([push, -push]), 0)
-        # The funnel may cycle at a price; then the exact penalty function must fall.
+        # The funnel may cycle at a price; then a penalty function must fall.
         elastic = before.elastic & (now.iterations >= PATIENCE)
         firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(p)), 0)
 
@@ -338,8 +338,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             paid = payable.penalty(values.rows)
             return values.cost + paid + firm * jnp.sum(jnp.abs(values.defects))
 
-        falling = limits.penalty(values.rows) - limits.penalty(values.rows + change)
-        falling = falling + jnp.sum(held.price * held.target * change)
+        falling = payable.penalty(values.rows) - payable.penalty(values.rows + change)
         decrease = falling - jnp.sum(model.h * dz)
         decrease = decrease + firm * jnp.sum(jnp.abs(values.defects))
         now_at = merit(values)
@@ -352,7 +351,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             there = measured(problem, limits, states, controls)
             far = infeasibility(limits, there)
             by_cost = elastic | (length * decrease >= SWITCH * missed)
-            enough = now_at - LEAST_SHARE * length * decrease + slack
+            enough = now_at - LEAST_SHARE * length * jnp.maximum(decrease, 0) + slack
             closer = jnp.maximum(SHRINK * width, 100 * eps)
             good = jnp.where(by_cost, merit(there) <= enough, far <= closer)
             good = good & (elastic | (far <= width)) & jnp.isfinite(there.cost)
@@ -372,8 +371,8 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         )
         pick = lambda new, old: jnp.where(accepted, new, old)
         scale = jnp.max(jnp.abs(model.H))
-        # From a point where constraints had to be paid for, a program that has a
-        # feasible point again may still lead nowhere.
+        # Where constraints had to be paid for, a program that has a feasible point
+        # again may still lead nowhere.
         lost = ~accepted & ~before.elastic & (price > 0)
         failed = ~accepted & ~impossible & ~lost
         mu = now.regularisation
@@ -389,11 +388,14 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             result=choose(stuck, failure, now.result),
         )
         start = FIRST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
-        start = start / jnp.maximum(now.violation, NEAR)
+        # In units of the constraints: little at first, as it only rises.
+        start = start / jnp.maximum(now.violation, 1)
         return before._replace(
             now=after,
             price=jnp.where(impossible & (price == 0), start, price),
-            elastic=impossible | lost | (before.elastic & ~accepted),
+            # It pays until it is near a solution at that price: sooner the hard
+            # program is mostly not feasible, and with it the way there is longer.
+            elastic=impossible | lost | (before.elastic & ~(accepted & before.near)),
             width=pick(narrowed, width),
             shift=jnp.where(weights.variables > 0, weights.variables, before.shift),
             stuck=stuck,
