@@ -29,8 +29,12 @@ pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8 --di
 kept := JAX_COMPILATION_CACHE_DIR="$${JAX_COMPILATION_CACHE_DIR:-$(CURDIR)/.cache/programs}" \
 	JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-# The same in both precisions: the examples of docs and docstrings.
-examples := --ignore tests/contracts/test_public.py --ignore tests/test_docs.py
+# The examples of docs and docstrings. They run once, in single precision, compiled as a
+# user's programs are; all other tests are compiled lightly, which takes half of the time.
+examples := tests/contracts/test_public.py tests/test_docs.py
+no_examples := $(addprefix --ignore=,$(examples))
+# An expression may select no test of a part.
+or_none := || [ $$? -eq 5 ]
 # What meets other packages, and the spine: what all else is made of.
 spine := tests/contracts/test_controllers.py tests/contracts/test_systems.py tests/simulation \
 	tests/planning/test_ilqr.py tests/riccati/test_dare.py tests/riccati/test_care.py \
@@ -65,17 +69,22 @@ test: test-float32 test-float64 notebooks ## the tests in both precisions, then 
 
 .PHONY: test-float32
 test-float32: $(VENV)/.tests ## the tests in single precision
-	JAX_ENABLE_X64=0 $(pytest) $(PYTEST_ARGS)
+	JAX_ENABLE_X64=0 $(pytest) $(examples) $(PYTEST_ARGS) $(or_none)
+	$(lightly) JAX_ENABLE_X64=0 $(pytest) $(no_examples) $(PYTEST_ARGS) $(or_none)
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
-		$(PYTEST_ARGS)
+	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(no_examples) --ignore tests/plotting \
+		$(PYTEST_ARGS) $(or_none)
+
+.PHONY: test-optimised
+test-optimised: $(VENV)/.tests ## the tests in single precision, compiled as for users
+	JAX_ENABLE_X64=0 $(pytest) $(PYTEST_ARGS)
 
 .PHONY: thorough
 thorough: $(VENV)/.tests ## the few tests that take minutes by their nature
 	JAX_ENABLE_X64=0 $(pytest) -m minutes $(PYTEST_ARGS)
-	JAX_ENABLE_X64=1 $(pytest) -m minutes $(examples) $(PYTEST_ARGS)
+	JAX_ENABLE_X64=1 $(pytest) -m minutes $(no_examples) $(PYTEST_ARGS)
 
 .PHONY: test-oldest
 test-oldest: $(VENV)-oldest/.tests ## the spine, with the oldest Python and dependencies allowed
