@@ -194,8 +194,7 @@ def solved(
     method = Method.of(form, Tolerances(tolerance, tolerance, certificate))
     guess = warm(method, jnp.zeros_like(form.q), at.sides)
     left = jnp.asarray(guesses, guess.left.dtype)
-    guess = guess._replace(left=left)
-    return minimise(method, guess, MAX_STEPS, 2, parted=method.is_soft)
+    return minimise(method, guess._replace(left=left), MAX_STEPS, 2)
 
 
 def curved(limits: Limits, at: Iterate, model: Model) -> Held:

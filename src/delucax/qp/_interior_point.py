@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._jax import in_parts
 from .._typing import Array
 from ._active_set import active_at, Guess, PASSES, tried
 from ._embedding import evaluated, Iterate, Method, Outcome, Residuals
@@ -198,20 +197,10 @@ def begun(method: Method, along: Array) -> Iterate:
     return Iterate(method.joined(x, p, z, s, t, m), one, one)
 
 
-def minimise(
-    method: Method,
-    guess: Guess,
-    max_steps: int,
-    refinements: int,
-    parted: bool = False,
-) -> Outcome:
+def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> Outcome:
     """Try a guess of the active sides and what follows from it; then, if none of them
     gives the solution, run the method from its own start. With the sides that are
-    active at its end one more linear system gives the solution up to rounding.
-
-    If `parted`, the loop compiles in parts: a program with soft sides in two thirds of
-    the time, but each of its steps then takes a quarter longer.
-    """
+    active at its end one more linear system gives the solution up to rounding."""
     sides, dtype = method.sides, method.form.q.dtype
     count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
     rounding = jnp.finfo(dtype).eps
@@ -265,7 +254,7 @@ def minimise(
     no = jnp.asarray(False)
     passes = jnp.ones((), int)
     carry = at, left, at, known, k, jnp.zeros((), int), passes, no, guess, no
-    out = lax.while_loop(going, in_parts(body) if parted else body, carry)
+    out = lax.while_loop(going, body, carry)
     _, _, best, (measured, errors, gains), k, *_ = out
     return Outcome(*method.point(best), best, measured, errors, gains, k)
 
