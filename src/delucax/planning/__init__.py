@@ -14,3 +14,4 @@ from ._problem import Problem as Problem
 from ._sampling import CEM as CEM, MPPI as MPPI
 from ._sqp import SQP as SQP
 from ._start import Start as Start
+from ._unknowns import Unknowns as Unknowns

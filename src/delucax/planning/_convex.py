@@ -6,9 +6,10 @@ before, changes the cost of no trajectory, and leaves a cost of stages that is c
 wherever the problem is convex along its dynamics.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from .._typing import Array
@@ -141,32 +142,51 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
         P, s = carry
         F, H, h, d = here
         M = H + product(F.T, product(P, F))
-        g = h + apply(F.T, s + apply(P, d))
-        Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
-        solved, added = _definite(Quu, jnp.concatenate([Qux, Qu[:, None]], axis=1))
-        K, k = solved[:, :n], solved[:, n]
-        before = M[:n, :n] - product(Qux.T, K)
-        s = g[:n] - apply(Qux.T, k)
-        whole = jnp.concatenate([K, jnp.eye(N - n, dtype=dtype)], axis=1)
-        weighted = product(Quu + jnp.diag(added), whole)
-        cost = product(whole.T, weighted), apply(weighted.T, k)
-        before = (before + before.T) / 2
-        return (before, s), (*cost, before, s, K, jnp.max(added))
+        (P, s), cost, K, added = _chosen(M, h + apply(F.T, s + apply(P, d)), n)
+        return (P, s), (*cost, P, s, K, added)
 
-    P, s = H[-1, :n, :n], h[-1, :n]
+    end = H[-1, :n, :n], h[-1, :n]
     xs = model.F, H[:-1], h[:-1], model.values.defects[1:]
-    _, (H, h, Ps, ss, K, shift) = lax.scan(back, (P, s), xs, reverse=True)
+    begun, (H, h, Ps, ss, K, shift) = lax.scan(back, end, xs, reverse=True)
+    if limits.free:
+        # The first state is in part chosen too, at the cost-to-go from it.
+        order = np.array([i for i in range(n) if i not in limits.free])
+        given, order = len(order), np.array([*order, *limits.free], int)
+        P, s = begun[0][order][:, order], begun[1][order]
+        (P0, s0), (H0, h0), _, added = _chosen(P, s, given)
+        at = order[:given]
+        H = H.at[0, order[:, None], order].add(H0)
+        h = h.at[0, order].add(h0)
+        Ps = Ps.at[0].set(0).at[0, at[:, None], at].set(P0)
+        ss = ss.at[0].set(0).at[0, at].set(s0)
+        shift = jnp.maximum(jnp.max(shift), added)
     stack = lambda a, b: jnp.concatenate([a, b[None]])
     ends = stack(H, jnp.zeros((N, N), dtype)), stack(h, jnp.zeros(N, dtype))
-    return Convex(*ends, stack(Ps, P), stack(ss, s), K, jnp.max(shift))
+    return Convex(*ends, stack(Ps, end[0]), stack(ss, end[1]), K, jnp.max(shift))
+
+
+def _chosen(M: Array, g: Array, n: int) -> tuple[Any, Any, Array, Array]:
+    """Of the cost `1/2 z'M z + g'z`: what is left of it in the first `n` entries once
+    the others are chosen; the cost of another choice, convex; the gain; and the largest
+    that was added to a pivot."""
+    Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
+    solved, added = _definite(Quu, jnp.concatenate([Qux, Qu[:, None]], axis=1))
+    K, k = solved[:, :n], solved[:, n]
+    P, s = M[:n, :n] - product(Qux.T, K), g[:n] - apply(Qux.T, k)
+    whole = jnp.concatenate([K, jnp.eye(len(Quu), dtype=M.dtype)], axis=1)
+    weighted = product(Quu + jnp.diag(added), whole)
+    cost = product(whole.T, weighted), apply(weighted.T, k)
+    return ((P + P.T) / 2, s), cost, K, jnp.max(added, initial=0)
 
 
 def _definite(matrix: Array, right: Array) -> tuple[Array, Array]:
     """`(matrix + diag(added))^-1 right` and `added`: each pivot is as large as its
     magnitude, and well positive."""
     m = matrix.shape[0]
-    largest = jnp.max(jnp.abs(matrix))
+    largest = jnp.max(jnp.abs(matrix), initial=0)
     least = jnp.finfo(matrix.dtype).eps ** 0.5 * jnp.where(largest > 0, largest, 1)
+    if m == 0:
+        return right, jnp.zeros(0, matrix.dtype)
     rows = list(jnp.concatenate([matrix, right], axis=1))
     added = []
     for i in range(m):

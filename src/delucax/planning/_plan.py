@@ -52,6 +52,8 @@ class Plan(AbstractController):
     - `dt`: the control interval.
     - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` if there are none.
     - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
+    - `parameters`: what [`delucax.planning.Unknowns`][] chose, by paths, with a
+        duration as the step `dt` of the dynamics; `None` without.
 
     !!! example
 
@@ -84,12 +86,18 @@ class Plan(AbstractController):
     low: Array | None = parameter()
     high: Array | None = parameter()
     difference: Callable[[Any, Any], Any] | None = function_field()
+    parameters: dict[str, Array] | None = None
 
     def __check_init__(self):
         check_step(self.dt, "Plan")
         if self.low is not None or self.high is not None:
             bounds, size = (self.low, self.high), self.controls.shape[-1]
             as_bounds(bounds, "Plan", "low and high", size)
+
+    @property
+    def duration(self) -> Array:
+        """The time from the first state to the last."""
+        return self.controls.shape[-2] * self.dt
 
     @property
     def is_usable(self) -> Array:

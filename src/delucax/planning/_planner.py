@@ -34,6 +34,7 @@ from ._multipliers import Multipliers
 from ._plan import Plan
 from ._problem import Problem
 from ._start import operating_point, Start
+from ._unknowns import solved_problem, Unknowns
 
 
 def checked_plan(
@@ -56,8 +57,9 @@ def checked_plan(
         )
         if problem is None or problem.constraints is None:
             return words
-        path = plan.states, plan.controls
-        return f"{words} {worst_of(problem.constraints, problem, *path)}".rstrip()
+        found = solved_problem(problem, plan)
+        worst = worst_of(problem.constraints, found, plan.states, plan.controls)
+        return f"{words} {worst}".rstrip()
 
     return raise_on_failure(plan, where, throw, "the plan", facts)
 
@@ -108,6 +110,8 @@ class AbstractPlanner(eqx.Module):
 
     is_stochastic: ClassVar[bool] = False
     """Whether it draws random numbers, and so needs a key."""
+    takes_unknowns: ClassVar[bool] = False
+    """Whether it plans with [`delucax.planning.Unknowns`][]."""
 
     @property
     def starts_from_states(self) -> bool:
@@ -149,6 +153,7 @@ class AbstractPlanner(eqx.Module):
         *,
         constraints: Constraints | None = None,
         difference: Callable[[Array, Array], Array] | None = None,
+        unknowns: Unknowns | None = None,
         fallback: Start | Plan | None = None,
         key: PRNGKey | None = None,
         throw: bool = True,
@@ -172,6 +177,8 @@ class AbstractPlanner(eqx.Module):
             planners that take them; none by default.
         - `difference`: `(x, x_ref) -> deviation`, such as `system.difference`, which
             wraps angles, for dynamics that wrap them; subtraction by default.
+        - `unknowns`: [`delucax.planning.Unknowns`][], what is chosen besides the
+            controls, by [`delucax.planning.SQP`][]; none by default.
         - `fallback`: feedback of the same horizon, with states and gains, used in place
             of the plan's own if planning fails: every start diverges, or the
             constraints cannot hold. `result` and `cost` stay those of the failed plan.
@@ -220,13 +227,22 @@ class AbstractPlanner(eqx.Module):
         if constraints is not None:
             hint = " (`delucax.planning.Constraints`)"
             check_instance(constraints, Constraints, "constraints", where, hint)
+        if unknowns is not None:
+            check_instance(unknowns, Unknowns, "unknowns", where)
+            if not self.takes_unknowns:
+                raise ValueError(
+                    f"{where}: unknowns must be left to `delucax.planning.SQP`, the "
+                    "one planner that takes them."
+                )
         ends: Any = check_control_bounds(bounds, m, where)
         if ends is not None:
             ends = tuple(_cast(end, dtype, (m,)) for end in ends)
         # One precision for all: the loops of the planners carry it unchanged.
         x0, begin = _cast(x0, dtype), _cast(begin, dtype)
         distance = as_module(difference)
-        problem = Problem(dynamics, cost, x0, begin, w, ends, distance, constraints)
+        problem = Problem(
+            dynamics, cost, x0, begin, w, ends, distance, constraints, unknowns=unknowns
+        )
         start = jax.tree.map(lambda a: _cast(a, dtype), start)
         if fallback is not None:
             T = start.horizon

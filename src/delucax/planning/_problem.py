@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._jax import by_components, join_state, split_state, stack_steps
@@ -59,6 +60,15 @@ def violated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
     return jnp.where(equal, jnp.abs(c), jnp.abs(slack))
 
 
+class FreeStart(eqx.Module):
+    """The entries of the first state that are unknown, and their bounds, which may be
+    infinite."""
+
+    low: Array
+    high: Array
+    entries: tuple[int, ...] = eqx.field(static=True)
+
+
 class Problem(eqx.Module):
     """A planning problem, as [`delucax.planning.AbstractPlanner`][] gives it to the
     `solve` of a planner: with arguments that are checked, of one precision.
@@ -75,6 +85,8 @@ class Problem(eqx.Module):
     - `constraints`: [`delucax.planning.Constraints`][]; `None` without.
     - `multipliers`: those of the augmented Lagrangian, which is then the cost; `None`
         without.
+    - `unknowns`: [`delucax.planning.Unknowns`][]; `None` without.
+    - `free`: the entries of the first state that `x0` only guesses; `None` without.
 
     !!! example
 
@@ -98,6 +110,8 @@ class Problem(eqx.Module):
     difference: Callable[[Array, Array], Array] | None = None
     constraints: Constraints | None = None
     multipliers: Augmentation | None = None
+    unknowns: Any = None
+    free: FreeStart | None = None
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
         """The deviation of `x` from `x_ref`, by `difference`.
@@ -105,6 +119,14 @@ class Problem(eqx.Module):
         **Arguments:** `x`, `x_ref`: states.
         """
         return x - x_ref if self.difference is None else self.difference(x, x_ref)
+
+    def missed_start(self, x: Array) -> Array:
+        """By how much a trajectory from `x` misses the first state, where that is
+        given."""
+        missed = self.deviation(self.x0, x)
+        if self.free is None:
+            return missed
+        return missed.at[np.array(self.free.entries)].set(0)
 
     def times(self, horizon: int) -> Array:
         """The times of the states, shape `(T+1,)`.

@@ -62,7 +62,7 @@ def fed_back(problem: Problem, ready: Prepared, max_steps: int) -> Plan:
     at, model, convex = ready
     (T, n, _), dtype = model.F.shape, model.h.dtype
     limits = limits_of(problem, T)
-    off = problem.deviation(problem.x0, at.states[0])
+    off = problem.missed_start(at.states[0])
     defects = model.values.defects.at[0].set(off)
     model = model._replace(values=model.values._replace(defects=defects))
     low, high = rows_left(limits, model.values.rows)

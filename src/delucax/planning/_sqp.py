@@ -1,5 +1,8 @@
 """Sequential quadratic programming with hard constraints."""
 
+import dataclasses
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +18,7 @@ from .._check import (
 from .._module import parameter
 from .._typing import PRNGKey
 from ..qp import Soft
+from ._carried import with_carried
 from ._multipliers import Multipliers, zeros_like_result
 from ._plan import Plan
 from ._planner import AbstractPlanner
@@ -24,6 +28,7 @@ from ._sqp_derivatives import solution
 from ._sqp_iteration import Options
 from ._start import Start
 from ._transcription import Iterate, limits_of, multipliers_of
+from ._unknowns import check_unknowns
 
 
 class SQP(AbstractPlanner):
@@ -107,6 +112,8 @@ class SQP(AbstractPlanner):
         ```
     """
 
+    takes_unknowns: ClassVar[bool] = True
+
     max_iterations: int = eqx.field(default=200, static=True)
     tolerance: Array | None = parameter(None)
     constraint_tolerance: Array | None = parameter(None)
@@ -131,6 +138,7 @@ class SQP(AbstractPlanner):
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         dtype, states = start.controls.dtype, self.states
+        check_unknowns(problem, start.horizon)
         _check_controls(problem, start.horizon)
         if states is not None:
             n, points = problem.dynamics.state_size, start.horizon + 1
@@ -212,13 +220,22 @@ def _check_controls(problem: Problem, horizon: int) -> None:
 
 @eqx.filter_jit
 def _solve(problem: Problem, start: Start, options: Options) -> Plan:
-    out = solution(problem, start, options)
+    n, whole, carried = problem.x0.shape[0], problem, None
+    if problem.unknowns is not None:
+        whole, start, states, carried = with_carried(problem, start, options.states)
+        options = dataclasses.replace(options, states=states)
+    out = solution(whole, start, options)
     fields = out._asdict()
-    at = fields.pop("at")
-    limits = limits_of(problem, start.horizon)
-    fields["multipliers"] = multipliers_of(problem, limits, at)
-    cost = problem.total(at.states, at.controls)
-    return problem.plan(at.states, at.controls, cost, **fields)
+    at, gains = fields.pop("at"), fields.pop("gains")
+    limits = limits_of(whole, start.horizon)
+    fields["multipliers"] = multipliers_of(whole, limits, at)
+    cost = whole.total(at.states, at.controls)
+    if carried is not None:
+        values = carried.values(at.states[0, n:])
+        parts, *_ = carried.opened(0, at.states[0])
+        fields |= dict(dt=parts["dynamics"].dt, parameters=values)
+    states, gains = at.states[:, :n], gains[:, :, :n]
+    return problem.plan(states, at.controls, cost, gains=gains, **fields)
 
 
 def _zero_multipliers(problem: Problem, horizon: int) -> Multipliers:

@@ -110,9 +110,10 @@ def rows_left(limits: Limits, rows: Array) -> tuple[Array, Array]:
 
 def priced(limits: Limits, price: Array, on: Array) -> Limits:
     """The limits whose hard rows may be violated at a price where this is on; hard
-    bounds of controls may not."""
-    index = jnp.arange(limits.low.shape[1])
-    elastic = (index < limits.states) | (index >= limits.own)
+    bounds of controls and of unknowns may not."""
+    steps, size = limits.low.shape
+    index, stage = jnp.arange(size), jnp.arange(steps)[:, None]
+    elastic = ((index < limits.states) & (stage > 0)) | (index >= limits.own)
     elastic = elastic & limits.hard & on
     return limits._replace(
         linear=jnp.where(elastic, 0, limits.linear),
@@ -147,7 +148,7 @@ def form_of(
         upper=high,
         soft=soft,
         bounded=limits.bounded,
-        is_free=False,
+        free=limits.free,
     )
 
 
@@ -219,7 +220,8 @@ def started(
     first state held, whose steps do not meet. The one that violates less."""
     if options.states is not None:
         controls = _clipped(limits, controls_of(start))
-        states = options.states.at[0].set(problem.x0)
+        states = options.states
+        states = states.at[0].add(problem.missed_start(states[0]))
     else:
         _, states, controls, cost = start.cheapest(problem)
         controls = _clipped(limits, controls)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._jax import by_components, join_state, split_state, with_stores
 from .._typing import Array
@@ -41,6 +42,8 @@ class Limits(NamedTuple):
     is_soft: bool
     states: int
     """How many rows are bounds of states."""
+    free: tuple[int, ...] = ()
+    """The entries of the first state that are unknown."""
 
     @property
     def own(self) -> int:
@@ -103,8 +106,11 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
     own = given and given.states, given and given.controls
     has_states, has_controls = own[0] is not None, own[1] is not None
     has_controls = has_controls or problem.bounds is not None
-    if has_states:
-        parts.append(_bounds(own[0], "states", T, n, dtype))
+    free = () if problem.free is None else problem.free.entries
+    begin = 0 if has_states else min(free, default=n)
+    if begin < n:
+        ends = _bounds(own[0], "states", T, n, dtype)
+        parts.append(tuple(a[:, begin:] for a in _from_start(problem, ends)))
     if has_controls:
         low, high, *weights = _bounds(own[1], "controls", T, m, dtype)
         if problem.bounds is not None:
@@ -130,9 +136,23 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
         parts.append(tuple(jnp.concatenate([each, pad(final)[:, None]], axis=1)))
     blank = jnp.zeros((4, T + 1, 0), dtype)
     joined = [jnp.concatenate(a, axis=1) for a in zip(blank, *parts, strict=True)]
-    bounded = (0 if has_states else n), (n + m if has_controls else n)
-    states = n if has_states else 0
-    return Limits(*joined, bounded=bounded, is_soft=soft, states=states)
+    bounded = begin, (n + m if has_controls else n)
+    return Limits(*joined, bounded=bounded, is_soft=soft, states=n - begin, free=free)
+
+
+def _from_start(problem: Problem, ends: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Bounds of the states at the stages, of the first state only where that is free;
+    those of unknowns are hard."""
+    none = -jnp.inf, jnp.inf, jnp.inf, jnp.inf
+    if problem.free is None:
+        return tuple(a.at[0].set(end) for a, end in zip(ends, none, strict=True))
+    free, at = problem.free, np.array(problem.free.entries)
+    low, high = jnp.maximum(ends[0][0, at], free.low), ends[1][0, at]
+    first = low, jnp.minimum(high, free.high), jnp.inf, jnp.inf
+    return tuple(
+        a.at[0].set(end).at[0, at].set(own)
+        for a, end, own in zip(ends, none, first, strict=True)
+    )
 
 
 def _functions(rows: list[Row], dtype: Any) -> Array:
@@ -166,8 +186,7 @@ def _bounds(value: Any, name: str, T: int, size: int, dtype: Any) -> tuple[Array
         arrays += [jnp.full((points, size), jnp.inf, dtype)] * 2
     ends = -jnp.inf, jnp.inf, jnp.inf, jnp.inf
     if name == "states":
-        # The first state is given.
-        return tuple(a.at[0].set(end) for a, end in zip(arrays, ends, strict=True))
+        return tuple(arrays)
     pad = ((0, 1), (0, 0))
     return tuple(
         jnp.pad(a, pad, constant_values=end)
@@ -193,7 +212,7 @@ def measured(problem: Problem, limits: Limits, states: Array, controls: Array):
     times = problem.times(controls.shape[0])
     reached = jax.vmap(problem.step)(times[:-1], states[:-1], controls, problem.w)
     defects = jax.vmap(problem.deviation)(reached, states[1:])
-    defects = jnp.concatenate([problem.deviation(problem.x0, states[0])[None], defects])
+    defects = jnp.concatenate([problem.missed_start(states[0])[None], defects])
     stage, final = jnp.zeros_like(states[:-1, :0]), jnp.zeros_like(states[0, :0])
     if problem.constraints is not None:
         (stage, _), (final, _) = problem.constraints_along(states, controls)
@@ -271,7 +290,7 @@ def expanded(
 
     (G_end, V), (c_end, v, last) = jax.jacfwd(final, has_aux=True)(states[-1])
     defects = jax.vmap(problem.deviation)(reached, states[1:])
-    defects = jnp.concatenate([problem.deviation(problem.x0, states[0])[None], defects])
+    defects = jnp.concatenate([problem.missed_start(states[0])[None], defects])
     rows = _joined(problem, limits, _stacked(states, controls), c, c_end)
     values = Values(jnp.sum(cost) + last, defects, rows)
     N, size = z.shape[1], rows.shape[1] - limits.own
@@ -318,7 +337,7 @@ def multipliers_of(problem: Problem, limits: Limits, at: Iterate) -> Multipliers
     return Multipliers(
         by_name(problem.constraints, False, args, z[:-1]),
         by_name(problem.constraints, True, args[:2], z[-1]),
-        (lower[:, :n], upper[:, :n]) if n else None,
+        (lower[:, :n], upper[:, :n]) if limits.bounded[0] == 0 else None,
         (lower[:-1, n:own], upper[:-1, n:own]) if own > n else None,
         at.costates,
     )

@@ -3,7 +3,7 @@ horizon.
 
 The unknowns are `z_k = (x_k, u_k)`, shape `(T+1, n+m)`; the last control is zero. The
 equations are `x_0 = f_0` and `x_{k+1} - A_k x_k - B_k u_k = f_{k+1}`, and their
-multipliers the costates. A start that is free has no equation.
+multipliers the costates. An entry of the start that is free has no equation.
 """
 
 import dataclasses
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Float
 
@@ -50,7 +51,12 @@ class StagedForm(AbstractForm):
     upper: Float[Array, "steps rows"]
     soft: tuple[Array, Array] | None
     bounded: tuple[int, int] = eqx.field(static=True)
-    is_free: bool = eqx.field(static=True)
+    free: tuple[int, ...] = eqx.field(static=True)
+    """The entries of the start that are free."""
+
+    def given(self, p):
+        """The costates, or what is like them, with zeros where the start is free."""
+        return p.at[0, np.array(self.free)].set(0) if self.free else p
 
     def hessian(self, x):
         # Symmetric: this order of the sum runs along the rows.
@@ -68,15 +74,13 @@ class StagedForm(AbstractForm):
 
     def equations(self, x):
         n = self.f.shape[1]
-        at_start = jnp.zeros_like(x[0, :n]) if self.is_free else x[0, :n]
-        return jnp.concatenate([at_start[None], x[1:, :n] - _each(self.F, x[:-1])])
+        steps = x[1:, :n] - _each(self.F, x[:-1])
+        return self.given(jnp.concatenate([x[:1, :n], steps]))
 
     def equations_transposed(self, p):
         n, N = self.f.shape[1], self.q.shape[1]
-        if self.is_free:
-            p = p.at[0].set(0)
         pulled = jnp.pad(_each_transposed(self.F, p[1:]), ((0, 1), (0, 0)))
-        return jnp.pad(p, ((0, 0), (0, N - n))) - pulled
+        return jnp.pad(self.given(p), ((0, 0), (0, N - n))) - pulled
 
     def factorise(self, weight):
         first, last = self.bounded
@@ -119,9 +123,11 @@ class StagedForm(AbstractForm):
 
         v, after = lax.scan(back, -r[-1], (closed, pushed[1:], added), reverse=True)
         k = _each(pivots, A_t(after + pushed[1:])[:, n:] - s)
-        at_start = p[0]
-        if self.is_free:
-            at_start = -solve(V[0], v[:, None])[:, 0]
+        at_start = self.given(p)[0]
+        if self.free:
+            free = np.array(self.free)
+            slope = (v + _applied(V[0], at_start))[free, None]
+            at_start = at_start.at[free].set(-solve(V[0][free][:, free], slope)[:, 0])
         reached = p[1:] - _each(self.F[:, :, n:], k)
 
         def forward(x, here):
@@ -132,10 +138,8 @@ class StagedForm(AbstractForm):
         controls = -_each(K, states) - k
         states = jnp.concatenate([states, last[None]])
         costates = -_each(V, states) - jnp.concatenate([v[None], after])
-        if self.is_free:
-            costates = costates.at[0].set(0)
         controls = jnp.pad(controls, ((0, 1), (0, 0)))
-        return jnp.concatenate([states, controls], axis=1), costates
+        return jnp.concatenate([states, controls], axis=1), self.given(costates)
 
     def equilibrated(self):
         n, N = self.f.shape[1], self.q.shape[1]
@@ -175,7 +179,7 @@ class StagedForm(AbstractForm):
 
     def admissible(self, x, p):
         n = self.f.shape[1]
-        return x.at[-1, n:].set(0), p.at[0].set(0) if self.is_free else p
+        return x.at[-1, n:].set(0), self.given(p)
 
 
 def _eliminated(matrix: Array, right: Array) -> Array:

@@ -260,7 +260,8 @@ class Staged(eqx.Module):
         bounded = first, n if self.controls is None else n + m
         soft = stacked_weights(limits, 1)
         sides = lower, upper, soft, bounded
-        parts: Any = H, q, F, f, G, *sides, self.start is None
+        free = tuple(range(n)) if self.start is None else ()
+        parts: Any = H, q, F, f, G, *sides, free
         return StagedForm(*parts)
 
     def _sides(self, stages: Any) -> tuple[Array, list[Limits]]:

@@ -1,0 +1,204 @@
+"""What a plan may choose besides the controls: the first state, parameters, the
+duration.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_float_array, check_finite, is_concrete
+from .._message import did_you_mean, shortened
+from .._module import get_path
+from ..dynamics import AbstractDiscretization, AbstractDynamics
+from ._plan import Plan
+from ._problem import Problem
+
+
+Bounds = tuple[Array, Array]
+
+
+def _as_bounds(value: Any) -> Any:
+    """Bounds as arrays."""
+    if isinstance(value, Mapping):
+        return {str(name): _as_bounds(pair) for name, pair in value.items()}
+    if isinstance(value, tuple | list) and len(value) == 2:
+        return tuple(as_float_array(end) for end in value)
+    return value
+
+
+class Unknowns(eqx.Module):
+    """What [`delucax.planning.SQP`][] chooses besides the controls, between bounds.
+    Bounds may be infinite. The iteration starts from the values that the problem has.
+
+    **Arguments:**
+
+    - `start`: of the first state, a dictionary from names of states to pairs
+        `(low, high)`. The states that it does not name are given by `x0`. None by
+        default.
+    - `parameters`: a dictionary from paths to pairs `(low, high)`, each a number or of
+        the shape of the parameter. A path starts with `dynamics`, `cost` or
+        `constraints`: `{"dynamics.system.length": (0.5, 2.0)}`. None by default.
+    - `duration`: a pair `(low, high)` of positive numbers, the bounds of the time from
+        the first state to the last. The steps are of equal length. The dynamics must
+        come from a system in continuous time, such as [`delucax.Discretized`][].
+        Costs and constraints are given the true times, so that the cost
+        `final(t, x) = t` minimises the time. The stage cost is not multiplied by the
+        step. `T dt` by default.
+
+    **Raises:** `ValueError` if nothing is unknown, on a name that is not there, bounds
+    that are not a pair of numbers with `low <= high`, a duration that may be zero or
+    negative, a parameter without a finite value to start from.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        cart = dlx.systems.LinearSystem([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+        plan = dlx.planning.SQP()(
+            dlx.Discretized(cart, dt=0.1),
+            dlx.costs.Function(lambda t, x, u: 0.0, lambda t, x: t),  # least time
+            jnp.array([-1.0, 0.0]),
+            jnp.zeros((20, 1)),
+            bounds=(-1.0, 1.0),
+            constraints=dlx.planning.Constraints(final_equality=lambda t, x: x),
+            unknowns=dlx.planning.Unknowns(duration=(0.5, 10.0)),
+        )
+        plan.duration  # 2, by full acceleration, then full deceleration
+        ```
+    """
+
+    start: dict[str, Bounds] = eqx.field(default_factory=dict, converter=_as_bounds)
+    parameters: dict[str, Bounds] = eqx.field(
+        default_factory=dict, converter=_as_bounds
+    )
+    duration: Bounds | None = eqx.field(default=None, converter=_as_bounds)
+
+    def __check_init__(self):
+        where = "Unknowns"
+        for field in ("start", "parameters"):
+            value = getattr(self, field)
+            if not isinstance(value, dict):
+                raise ValueError(
+                    f"{where}: {field} must be a dictionary from names to pairs "
+                    f"(low, high), got {shortened(value)}."
+                )
+            for name, pair in value.items():
+                _check_pair(pair, f"{field}[{name!r}]", where)
+        if self.duration is not None:
+            low, _ = _check_pair(self.duration, "duration", where)
+            if np.shape(low) or is_concrete(low) and not low > 0:
+                raise ValueError(
+                    f"{where}: duration must have positive bounds, because time does "
+                    f"not run backwards, got a lower bound of {shortened(low)}."
+                )
+        if self.duration is None and not self.start and not self.parameters:
+            raise ValueError(f"{where}: at least one unknown must be given.")
+
+
+def _check_pair(pair: Any, name: str, where: str) -> Bounds:
+    """The pair, or an error."""
+    if not isinstance(pair, tuple):
+        raise ValueError(
+            f"{where}: {name} must be a pair (low, high), got {shortened(pair)}."
+        )
+    if all(map(is_concrete, pair)):
+        low, high = map(np.asarray, pair)
+        if low.dtype.kind not in "iuf" or high.dtype.kind not in "iuf":
+            raise ValueError(f"{where}: {name} must be numbers, got {pair}.")
+        if not np.all(low <= high):
+            raise ValueError(
+                f"{where}: {name} must have low <= high, got {low} and {high}."
+            )
+    return pair
+
+
+def check_unknowns(problem: Problem, horizon: int) -> None:
+    """Raise unless the names are there, and have values to start from."""
+    if problem.unknowns is None:
+        return
+    where, names = "SQP", problem.dynamics.state_names
+    for name, pair in problem.unknowns.start.items():
+        if name not in names:
+            raise ValueError(
+                f"{where}: start of unknowns names the state {name!r}; "
+                f"{did_you_mean(name, names)}"
+            )
+        if any(np.shape(end) for end in pair):
+            raise ValueError(
+                f"{where}: the bounds of the state {name!r} must be numbers, got shape "
+                f"{max(map(np.shape, pair))}."
+            )
+    parts = parts_of(problem)
+    for path, pair in bounds_by_path(problem, horizon).items():
+        try:
+            value = get_path(parts, path)
+        except ValueError as error:
+            raise ValueError(f"{where}: parameters of unknowns: {error}") from error
+        if not eqx.is_inexact_array(value):
+            raise ValueError(
+                f"{where}: {path!r} of unknowns must have a number in the problem to "
+                f"start from, got {shortened(value)}."
+            )
+        check_finite(value, f"{path} (to start from)", where)
+        for end in pair:
+            if np.shape(end) not in ((), value.shape):
+                raise ValueError(
+                    f"{where}: the bounds of {path!r} must be numbers or have shape "
+                    f"{value.shape}, got shape {np.shape(end)}."
+                )
+
+
+def parts_of(problem: Problem) -> dict[str, Any]:
+    """The parts of the problem in which the paths of parameters begin."""
+    return {name: getattr(problem, name) for name in _PARTS}
+
+
+_PARTS = "dynamics", "cost", "constraints"
+
+
+def bounds_by_path(problem: Problem, horizon: int) -> dict[str, Bounds]:
+    """The bounds of parameters by their paths, and those of the step."""
+    unknowns = problem.unknowns
+    named = dict(unknowns.parameters)
+    if unknowns.duration is not None:
+        path = _path_of_step(problem.dynamics)
+        if path in named:
+            raise ValueError(
+                f"SQP: unknowns must name {path!r} or a duration, got both."
+            )
+        named[path] = tuple(end / horizon for end in unknowns.duration)
+    return named
+
+
+def _path_of_step(dynamics: AbstractDynamics) -> str:
+    """The path of the step of a discretised system, through what wraps it."""
+    path = "dynamics"
+    inside: Any = dynamics
+    while not isinstance(inside, AbstractDiscretization) and hasattr(
+        inside, "dynamics"
+    ):
+        path, inside = f"{path}.dynamics", inside.dynamics
+    if not isinstance(inside, AbstractDiscretization):
+        raise ValueError(
+            "SQP: with a duration among the unknowns, dynamics must be a system in "
+            "continuous time, such as delucax.Discretized, got "
+            f"{type(inside).__name__}."
+        )
+    return f"{path}.dt"
+
+
+def solved_problem(problem: Problem, plan: Plan) -> Problem:
+    """The problem with the values that a plan found."""
+    values = plan.parameters
+    if not values:
+        return problem
+    parts = parts_of(problem)
+    at = lambda parts: [get_path(parts, path) for path in values]
+    parts = eqx.tree_at(at, parts, list(values.values()))
+    return dataclasses.replace(problem, **parts)
