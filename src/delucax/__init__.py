@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         math as math,
         planning as planning,
         plotting as plotting,
+        problems as problems,
         qp as qp,
         references as references,
         riccati as riccati,
@@ -79,8 +80,8 @@ del TYPE_CHECKING
 
 _PACKAGES = """
     analysis controllers costs disturbances dynamics environments estimators experiments
-    interop lung math planning plotting qp references riccati simulation studies systems
-    training
+    interop lung math planning plotting problems qp references riccati simulation
+    studies systems training
 """.split()
 _name, _names = _lazily(
     __name__,

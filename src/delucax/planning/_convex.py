@@ -81,7 +81,8 @@ def convexified(
 
     Source: Waechter and Biegler, 2006 (how the multiple is found, from the `last`).
     """
-    largest = jnp.max(jnp.abs(model.H))
+    # A cost that is linear has no Hessian before there are multipliers.
+    largest = jnp.maximum(jnp.max(jnp.abs(model.H)), jnp.max(jnp.abs(model.h)))
     least = 1e-4 * largest
     firm = jnp.where(is_firm, FIRM * largest, 0)
 
@@ -90,7 +91,7 @@ def convexified(
         stiff = jnp.where(k > 0, STIFF * largest, firm)
         weights = weights._replace(rows=stiff)
         convex = made_convex(limits, model, held, weights)
-        wanted = jnp.where(last > 0, jnp.maximum(least, last / 3), least)
+        wanted = jnp.where(last > 0, jnp.maximum(1e-6 * least, last / 3), least)
         delta = weights.variables
         more = jnp.where(k == 0, 0, jnp.where(delta > 0, 8 * delta, wanted))
         delta = jnp.where(convex.shift > 0, more, delta)
@@ -117,6 +118,33 @@ def convexified(
     return convex, weights
 
 
+def weight_of(limits: Limits, model: Model, held: Held, weights: Weights) -> Array:
+    """Of the squared distance of each row from its target."""
+    norm = jnp.sum(model.G**2, axis=2)
+    norm = jnp.pad(norm, ((0, 0), (limits.own, 0)), constant_values=1)
+    weight = weights.rows * held.rows / jnp.where(norm > 0, norm, 1) + held.price
+    return weight.astype(model.h.dtype)
+
+
+def with_squares(
+    limits: Limits,
+    model: Model,
+    held: Held,
+    weights: Weights,
+    sides: Array,
+    change: Array,
+) -> Array:
+    """The multipliers of the rows without the squares in the cost, which push too where
+    the `change` of a row misses its target."""
+    weight = weight_of(limits, model, held, weights)
+    push = sides[0] - sides[1]
+    total = push + weight * (change - held.target)
+    # That of an inequality has the sign of its side.
+    free = (limits.low == limits.high) | (held.price > 0)
+    total = jnp.where(free | (push * total > 0), total, 0)
+    return jnp.where(weight > 0, jnp.maximum(jnp.stack([total, -total]), 0), sides)
+
+
 def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> Convex:
     """The convex cost, the Hessian of the controls made definite at the expense of its
     directions of negative curvature.
@@ -126,10 +154,8 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
     (_, n, N), dtype = model.F.shape, model.h.dtype
     first, last = limits.bounded
     eye = jnp.eye(N, dtype=dtype)
-    norm = jnp.sum(model.G**2, axis=2)
-    norm = jnp.pad(norm, ((0, 0), (limits.own, 0)), constant_values=1)
-    weight = weights.rows * held.rows / jnp.where(norm > 0, norm, 1) + held.price
-    own, general = jnp.split(weight.astype(dtype), [limits.own], axis=1)
+    weight = weight_of(limits, model, held, weights)
+    own, general = jnp.split(weight, [limits.own], axis=1)
     at_own, at_general = jnp.split(held.target, [limits.own], axis=1)
     own, at_own = (jnp.pad(a, ((0, 0), (first, N - last))) for a in (own, at_own))
     over = weights.variables + weights.controls * (jnp.arange(N) >= n)

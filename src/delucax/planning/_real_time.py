@@ -16,7 +16,7 @@ from ..qp._embedding import Tolerances
 from ._convex import Convex, convexified, held_rows, made_convex
 from ._plan import Plan
 from ._problem import Problem
-from ._sqp_iteration import form_of, rows_left
+from ._sqp_program import form_of, rows_left
 from ._start import Start
 from ._transcription import (
     expanded,

@@ -43,7 +43,8 @@ class SQP(AbstractPlanner):
     iteration solves the quadratic program about the current trajectory, as
     [`delucax.qp.solve`][] does, first by guesses of the active sides. Its Hessian is
     that of the cost far from a solution, and that of the Lagrangian from a relative
-    error of 0.01 on. Where it is not convex along the dynamics, the squares of the
+    error of 0.01 on, or always if the Hessian of the cost alone has no unique minimum
+    along the dynamics. Where it is not convex along the dynamics, the squares of the
     constraints that hold with equality are added, and then a multiple of the identity.
 
     A step `1, 1/2, ..., 1/2048` is accepted by a funnel: the sum of all violations

@@ -16,14 +16,8 @@ from ..math._small import products_whole
 from ..qp._derivatives import moved_with
 from ._convex import convexified, made_convex
 from ._implicit_rule import implicit
-from ._sqp_iteration import (
-    curved,
-    form_of,
-    gains_of,
-    iterated,
-    Outcome,
-    rows_left,
-)
+from ._sqp_iteration import gains_of, iterated, Outcome
+from ._sqp_program import curved, form_of, rows_left
 from ._transcription import expanded, Iterate, limits_of, slopes
 
 

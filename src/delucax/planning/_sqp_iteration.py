@@ -19,13 +19,26 @@ from jax import lax
 from .._jax import in_parts
 from .._results import choose, Result, RESULTS
 from .._typing import Array
-from ..qp._derivatives import warm
-from ..qp._embedding import Method, Outcome as Solved, Tolerances
-from ..qp._interior_point import minimise
-from ..qp._staged import StagedForm
-from ._convex import Convex, convexified, FIRM, Held, held_rows, made_convex, Weights
+from ._convex import (
+    convexified,
+    FIRM,
+    held_rows,
+    made_convex,
+    Weights,
+    with_squares,
+)
 from ._descent import first_accepted
 from ._problem import Problem
+from ._sqp_program import (
+    curved,
+    form_of,
+    infeasibility,
+    optimality,
+    priced,
+    rows_left,
+    solved,
+    without,
+)
 from ._start import controls_of, Start
 from ._transcription import (
     expanded,
@@ -41,7 +54,7 @@ from ._transcription import (
 HALVINGS = 12
 LEAST_SHARE = 1e-4
 """Of the predicted decrease, the share that the cost falls by (Armijo)."""
-WIDTH, TIMES = 1e4, 15.0
+WIDTH, TIMES = 1.0, 5.0
 """The first width of the funnel: the first constant, or the second one times the first
 violation, whichever is larger."""
 SHRINK = 0.9
@@ -57,7 +70,6 @@ MOST_PRICE = 1e7
 PATIENCE = 50
 """Iterations after which violations at a price are no longer left to the funnel."""
 GUESSES = 4
-MAX_STEPS = 60
 
 
 class Options(eqx.Module):
@@ -98,109 +110,11 @@ class _Progress(NamedTuple):
     """The multiple of the identity that was last added to a Hessian."""
     near: Array
     """Whether the last error was small enough for the Hessian of the Lagrangian."""
+    flat: Array
+    """Whether the Hessian of the cost was too flat to do without that."""
     stuck: Array
     """Whether no step was accepted, however short."""
     done: Array
-
-
-def rows_left(limits: Limits, rows: Array) -> tuple[Array, Array]:
-    """The bounds of a change of the rows."""
-    return limits.low - rows, limits.high - rows
-
-
-def priced(limits: Limits, price: Array, on: Array) -> Limits:
-    """The limits whose hard rows may be violated at a price where this is on; hard
-    bounds of controls and of unknowns may not."""
-    steps, size = limits.low.shape
-    index, stage = jnp.arange(size), jnp.arange(steps)[:, None]
-    elastic = ((index < limits.states) & (stage > 0)) | (index >= limits.own)
-    elastic = elastic & limits.hard & on
-    return limits._replace(
-        linear=jnp.where(elastic, 0, limits.linear),
-        quadratic=jnp.where(elastic, price, limits.quadratic),
-    )
-
-
-def without(paid: Array, price: Array, held: Held, low: Array, high: Array):
-    """What holds, and the bounds, without the rows that are paid for; the squares of
-    those that are violated are in the cost."""
-    over = paid & ((low > 0) | (high < 0))
-    target = jnp.where(over, jnp.where(low > 0, low, high), held.target)
-    held = Held(held.rows, target, jnp.where(over, price, 0))
-    return held, jnp.where(paid, -jnp.inf, low), jnp.where(paid, jnp.inf, high)
-
-
-def form_of(
-    limits: Limits, model: Model, convex: Convex, low: Array, high: Array
-) -> StagedForm:
-    """The quadratic program."""
-    soft = None
-    if limits.is_soft:
-        v, W = limits.linear, limits.quadratic
-        soft = jnp.stack([v, v]), jnp.stack([W, W])
-    return StagedForm(
-        H=convex.H,
-        q=convex.h,
-        F=model.F,
-        f=model.values.defects,
-        G=model.G,
-        lower=low,
-        upper=high,
-        soft=soft,
-        bounded=limits.bounded,
-        free=limits.free,
-    )
-
-
-def infeasibility(limits: Limits, values: Any) -> Array:
-    """The sum of all that is violated."""
-    broken = jnp.sum(limits.broken(values.rows))
-    return jnp.sum(jnp.abs(values.defects)) + broken
-
-
-def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
-    """The largest entry of the gradient of the Lagrangian; the largest relative error
-    of the optimality conditions without the constraints; and the largest violation."""
-    n, rows = at.states.shape[1], model.values.rows
-    p, z = at.costates, at.sides[0] - at.sides[1]
-    first, last = limits.bounded
-    pulled = jnp.pad(jnp.einsum("tij,ti->tj", model.F, p[1:]), ((0, 1), (0, 0)))
-    pushed = jnp.einsum("tpi,tp->ti", model.G, z[:, limits.own :])
-    pushed = pushed.at[:, first:last].add(z[:, : limits.own])
-    gradient = (model.h - pulled + pushed).at[:, :n].add(p)
-    # The controls have no last row; that of the array is padding.
-    slope = jnp.max(jnp.abs(gradient.at[-1, n:].set(0)))
-    scale = 1 + jnp.maximum(jnp.max(jnp.abs(model.h)), jnp.max(jnp.abs(pulled)))
-    # A multiplier is zero where there is slack, and the price where a soft row is
-    # violated.
-    slack = jnp.stack([limits.high - rows, rows - limits.low])
-    slack = jnp.where(jnp.isfinite(slack), slack, 0)
-    products = jnp.maximum(slack, 0) * at.sides
-    over = jnp.where(limits.hard, 0, jnp.maximum(-slack, 0))
-    price = jnp.where(limits.hard, 0, limits.linear + limits.quadratic * over)
-    unpaid = over * jnp.abs(price - at.sides)
-    product = jnp.max(jnp.maximum(products, unpaid), initial=0)
-    missed = jnp.max(jnp.abs(model.values.defects))
-    missed = missed / (1 + jnp.max(jnp.abs(at.states)))
-    error = jnp.maximum(jnp.maximum(slope, product) / scale, missed)
-    return slope, error, jnp.max(limits.broken(rows), initial=0)
-
-
-def solved(
-    form: StagedForm, at: Iterate, guesses: Array | int, tolerance: Array
-) -> Solved:
-    """The solution of the program; the first guess of its active sides is that of the
-    multipliers."""
-    certificate = jnp.asarray(1e-6, form.q.dtype)
-    method = Method.of(form, Tolerances(tolerance, tolerance, certificate))
-    guess = warm(method, jnp.zeros_like(form.q), at.sides)
-    left = jnp.asarray(guesses, guess.left.dtype)
-    return minimise(method, guess._replace(left=left), MAX_STEPS, 2)
-
-
-def curved(limits: Limits, at: Iterate, model: Model) -> Held:
-    """The rows that are held at an iterate."""
-    return held_rows(limits, at.sides, *rows_left(limits, model.values.rows))
 
 
 def gains_of(limits: Limits, at: Iterate, model: Model) -> Array:
@@ -261,15 +175,15 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         regularisation=zero,
     )
     no = jnp.asarray(False)
-    first = _Progress(now, zero, no, infinite, zero, no, no, no)
+    first = _Progress(now, zero, no, infinite, zero, no, no, no, no)
 
     def body(before: _Progress) -> _Progress:
         now = before.now
         # Far from a solution the curvature of the constraints, weighted by multipliers
         # that are far off too, is worse than none.
-        share = jnp.where(before.near, 1, 0).astype(dtype)
+        share = jnp.where(before.near | before.flat, 1, 0).astype(dtype)
         model = expanded(problem, limits, now.at, options.second_order, share)
-        slope, error, violation = optimality(limits, now.at, model)
+        gradient, slope, error, violation = optimality(limits, now.at, model)
         feasible = violation <= options.constraint_tolerance
         settled = error <= options.tolerance
         # Close to a point that is stationary but not feasible the price was too low.
@@ -284,6 +198,8 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         result = choose(lost, RESULTS.diverged, result)
         ended = (settled & feasible) | hopeless | lost | before.stuck
         ended = ended | (now.iterations >= options.max_iterations)
+        # The costates of the program are changes, so that rounding is that of a change.
+        h, model = model.h, model._replace(h=gradient)
         # At the end the convex cost is that of the gains, in which hard rows are firm.
         low, high = rows_left(limits, model.values.rows)
         payable = priced(limits, price, before.elastic & ~ended)
@@ -299,14 +215,15 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             result=result,
         )
         near = error <= NEAR
-        after = before._replace(now=now, price=price, near=near, done=ended)
-        program = model, payable, low, high, held, convex, weights
+        flat = before.flat | ((share == 0) & (weights.variables > 0))
+        after = before._replace(now=now, price=price, near=near, flat=flat, done=ended)
+        program = model, h, payable, low, high, held, convex, weights
         going = lambda after: step(after, program)
         return lax.cond(ended, lambda after: after, going, after)
 
     def step(before: _Progress, program: Any) -> _Progress:
         now, price = before.now, before.price
-        model, payable, low, high, held, convex, weights = program
+        model, h, payable, low, high, held, convex, weights = program
         at, values = now.at, model.values
         form = form_of(limits, model, convex, low, high)
         # The first multipliers are zero if none are given.
@@ -314,7 +231,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         qp = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
         dz = qp.x
         dx, du = dz[:, :n], dz[:-1, n:]
-        p = qp.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
+        dp = qp.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
         usable = jnp.all(jnp.isfinite(dz)) & (qp.errors[0] <= 1e3)
         impossible = ~usable & ~before.elastic
         # The width of the funnel, and by how much the cost should fall.
@@ -328,19 +245,17 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             ],
             axis=1,
         )
-        # What is paid for has multipliers too.
-        push = held.price * (change - held.target)
-        sides = qp.z + jnp.maximum(jnp.stack([push, -push]), 0)
+        sides = with_squares(limits, model, held, weights, qp.z, change)
         # The funnel may cycle at a price; then a penalty function must fall.
         elastic = before.elastic & (now.iterations >= PATIENCE)
-        firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(p)), 0)
+        firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(at.costates + dp)), 0)
 
         def merit(values):
             paid = payable.penalty(values.rows)
             return values.cost + paid + firm * jnp.sum(jnp.abs(values.defects))
 
         falling = payable.penalty(values.rows) - payable.penalty(values.rows + change)
-        decrease = falling - jnp.sum(model.h * dz)
+        decrease = falling - jnp.sum(h * dz)
         decrease = decrease + firm * jnp.sum(jnp.abs(values.defects))
         now_at = merit(values)
         slack = 10 * eps * jnp.abs(now_at)
@@ -367,7 +282,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         moved = Iterate(
             states,
             controls,
-            at.costates + length * (p - at.costates),
+            at.costates + length * dp,
             at.sides + length * (sides - at.sides),
         )
         pick = lambda new, old: jnp.where(accepted, new, old)
@@ -388,7 +303,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             regularisation=mu,
             result=choose(stuck, failure, now.result),
         )
-        start = FIRST_PRICE * (1 + jnp.max(jnp.abs(model.h)))
+        start = FIRST_PRICE * (1 + jnp.max(jnp.abs(h)))
         # In units of the constraints: little at first, as it only rises.
         start = start / jnp.maximum(now.violation, 1)
         return before._replace(
@@ -402,7 +317,9 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             stuck=stuck,
         )
 
-    out = lax.while_loop(lambda progress: ~progress.done, in_parts(body), first)
+    # XLA loses what the call is beside arrays without entries.
+    loop = in_parts(body) if m else body
+    out = lax.while_loop(lambda progress: ~progress.done, loop, first)
     now = out.now
     counts = jnp.arange(options.max_iterations + 1)
     last = now.trace[jnp.minimum(now.iterations, options.max_iterations)]

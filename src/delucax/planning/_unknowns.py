@@ -92,7 +92,7 @@ class Unknowns(eqx.Module):
                 _check_pair(pair, f"{field}[{name!r}]", where)
         if self.duration is not None:
             low, _ = _check_pair(self.duration, "duration", where)
-            if np.shape(low) or is_concrete(low) and not low > 0:
+            if np.shape(low) or is_concrete(low) and not np.asarray(low) > 0:
                 raise ValueError(
                     f"{where}: duration must have positive bounds, because time does "
                     f"not run backwards, got a lower bound of {shortened(low)}."

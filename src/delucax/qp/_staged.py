@@ -187,6 +187,8 @@ def _eliminated(matrix: Array, right: Array) -> Array:
     m = matrix.shape[0]
     eye = jnp.eye(m, dtype=matrix.dtype)
     right = jnp.concatenate([right, eye], axis=1)
+    if m == 0:
+        return right
     if m > _ELIMINATED:
         L = jnp.linalg.cholesky(matrix, symmetrize_input=False)
         return jax.scipy.linalg.cho_solve((L, True), right)

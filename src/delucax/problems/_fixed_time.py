@@ -1,0 +1,122 @@
+"""Problems over a fixed interval: a mixture of catalysts, a chain that hangs."""
+
+import jax.numpy as jnp
+
+from .._check import check_count
+from .._module import parameter, positive
+from .._typing import Control, Disturbance, Real, State, Time
+from ..dynamics import Discretized
+from ..planning import Constraints
+from ..systems import AbstractSystem
+from ._base import FinalState, line, OptimalControl, Reach
+
+
+class CatalystMixing(AbstractSystem):
+    r"""A tube with two catalysts, whose mixture `u` varies along it:
+
+    `x_1' = u (k x_2 - x_1)`, `x_2' = u (x_1 - k x_2) - (1 - u) x_2`.
+
+    **Arguments:** `rate`: k, 10 by default.
+
+    Source: von Stryk, 1999; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.CatalystMixing(rate=9.0)
+        ```
+    """
+
+    rate: Real = parameter(10.0, constraint=positive)
+
+    state_names, control_names = ("x_1", "x_2"), ("mixture",)
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        back = u[0] * (self.rate * x[1] - x[0])
+        return jnp.stack([back, -back - (1 - u[0]) * x[1]])
+
+
+def catalyst_mixing(steps: int = 100) -> OptimalControl:
+    r"""The least `-1 + x_1 + x_2` at time 1 from `(1, 0)`, with `0 <= u <= 1`. It is
+    -0.0480556.
+
+    It starts from a mixture of 0.5.
+
+    **Arguments:** `steps`: T, 100 by default.
+
+    Source: von Stryk, 1999; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.catalyst_mixing().bounds
+        ```
+    """
+    T = check_count(steps, "steps", "catalyst_mixing")
+    return OptimalControl(
+        Discretized(CatalystMixing(), 1.0 / T),
+        FinalState(jnp.ones(2), -1.0),
+        jnp.array([1.0, 0.0]),
+        jnp.full((T, 1), 0.5),
+        -0.0480556,
+        bounds=(0.0, 1.0),
+    )
+
+
+class HangingChain(AbstractSystem):
+    r"""The height `x` of a chain, its length and its potential energy along the ground,
+    with the slope `u` as the control:
+
+    `x' = u`, `length' = sqrt(1 + u^2)`, `energy' = x sqrt(1 + u^2)`.
+
+    Source: Cesari, 1983; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.HangingChain()
+        ```
+    """
+
+    state_names, control_names = ("height", "length", "energy"), ("slope",)
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        length = jnp.sqrt(1 + u[0] ** 2)
+        return jnp.stack([u[0], length, x[0] * length])
+
+
+def hanging_chain(steps: int = 100) -> OptimalControl:
+    r"""The least potential energy of a chain of length 4 between the heights 1 at 0 and
+    3 at 1. It is 5.06848, that of a catenary; the benchmark gives 5.06891.
+
+    It starts from a line between the ends, with its slope.
+
+    **Arguments:** `steps`: T, 100 by default.
+
+    Source: Cesari, 1983; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.hanging_chain().states[-1]
+        ```
+    """
+    T = check_count(steps, "steps", "hanging_chain")
+    begin = [1.0, 0.0, 0.0]
+    return OptimalControl(
+        Discretized(HangingChain(), 1.0 / T),
+        FinalState(jnp.array([0.0, 0.0, 1.0])),
+        jnp.array(begin),
+        jnp.full((T, 1), 2.0),
+        5.06891,
+        line(begin, [3.0, 4.0, 8.0], T),
+        constraints=Constraints(final_equality=Reach(jnp.array([3.0, 4.0]), (0, 1))),
+    )

@@ -1,0 +1,269 @@
+"""Problems of estimation: the rates of chemical reactions from measurements.
+
+The problems are least squares along a differential equation: the rates are unknown, and
+there is no control.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._module import indexed_names, parameter
+from .._results import Result
+from .._typing import Control, Disturbance, RealScalar, State, Time
+from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics, Discretized
+from ..planning import Unknowns
+from ..systems import AbstractSystem
+from ._base import OptimalControl
+
+
+class Reactions(AbstractSystem):
+    """A system without controls, `dy/dt = f(rates, y)`.
+
+    **Arguments:**
+
+    - `rates`: shape `(p,)`.
+    - `function`: `f(rates, y)`, which returns a vector of the size of `y`.
+    - `size`: of `y`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        decay = dlx.problems.Reactions(jnp.ones(1), lambda rates, y: -rates * y, 1)
+        decay.vector_field(0.0, jnp.ones(1), jnp.zeros(0), None)
+        ```
+    """
+
+    rates: Float[Array, " p"] = parameter()
+    function: Callable[..., Any] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+
+    control_names = ()
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return indexed_names("y", self.size)
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        return self.function(self.rates, x)
+
+
+class Sampled(AbstractDynamics):
+    """A discretised system whose step `k` takes the time `widths[k]`; its own time
+    counts the steps.
+
+    **Arguments:**
+
+    - `inner`: a [`delucax.Discretized`][], whose `dt` does not matter.
+    - `widths`: of the steps, shape `(T,)`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=1.0)
+        sampled = dlx.problems.Sampled(pendulum, jnp.array([0.1, 0.3]))
+        dlx.open_loop(sampled, jnp.array([0.1, 0.0]), jnp.zeros((2, 1)))
+        ```
+    """
+
+    inner: Discretized
+    widths: Float[Array, " T"] = parameter()
+    dt: Array = parameter(1.0)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return self.inner.state_names
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        return self.inner.control_names
+
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
+        k = jnp.round(jnp.asarray(t / self.dt)).astype(int)
+        at = lambda inner: inner.dt
+        inner = eqx.tree_at(at, self.inner, self.widths[k].astype(x.dtype))
+        return inner.advance(jnp.zeros_like(x[0]), x, u, None)
+
+    def refined(self, points: int, inner: Callable[[Any], Any]) -> "Sampled":
+        """With each step cut into `points`, and another discretisation.
+
+        **Arguments:** `points`: a whole number. `inner`: from the old one to the new.
+        """
+        widths = jnp.repeat(self.widths / points, points)
+        return Sampled(inner(self.inner), widths)
+
+
+class Residuals(AbstractCost):
+    """The squares of the differences of the states and measurements."""
+
+    data: Float[Array, "points n"] = parameter()
+
+    def __call__(self, t: Any, x: Array, u: Array) -> Array:
+        return self._at(t, x)
+
+    def final(self, t: Any, x: Array) -> Array:
+        return self._at(t, x)
+
+    def _at(self, t: Any, x: Array) -> Array:
+        return jnp.sum((x - self.data[jnp.round(jnp.asarray(t)).astype(int)]) ** 2)
+
+
+def _estimated(
+    function: Callable[..., Any],
+    times: list[float],
+    data: Any,
+    rates: list[float],
+    substeps: int,
+    reference: float,
+) -> OptimalControl:
+    """The problem of the rates, which are not negative, from the first values and
+    measurements after them, which are the states to start from too."""
+    data = jnp.asarray(np.asarray(data, float))
+    system = Reactions(jnp.array(rates), function, data.shape[1])
+    inner = Discretized(system, 1.0, substeps=substeps)
+    return OptimalControl(
+        Sampled(inner, jnp.asarray(np.diff(times))),
+        Residuals(data),
+        data[0],
+        jnp.zeros((len(times) - 1, 0)),
+        reference,
+        data,
+        unknowns=Unknowns(parameters={"dynamics.inner.system.rates": (0.0, np.inf)}),
+    )
+
+
+def gas_oil_cracking() -> OptimalControl:
+    r"""The rates of the cracking of gas oil, from 20 measurements:
+
+    `y_1' = -(a + c) y_1^2`, `y_2' = a y_1^2 - b y_2` from `(1, 0)`.
+
+    The sum of squares is 5.2366e-3. It starts from the measurements and rates of 1.
+
+    Source: Tjoa and Biegler, 1991; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.gas_oil_cracking().unknowns.parameters
+        ```
+    """
+    times = [0.0, 0.025, 0.05, 0.075, 0.1, 0.125, 0.15, 0.175, 0.2, 0.225, 0.25, 0.3]
+    times += [0.35, 0.4, 0.45, 0.5, 0.55, 0.65, 0.75, 0.85, 0.95]
+    y_1 = [1.0, 0.8105, 0.6208, 0.5258, 0.4345, 0.3903, 0.3342, 0.3034, 0.2735, 0.2405]
+    y_1 += [0.2283, 0.2071, 0.1669, 0.1530, 0.1339, 0.1265, 0.1200, 0.0990, 0.0870]
+    y_1 += [0.0770, 0.0690]
+    y_2 = [0.0, 0.2, 0.2886, 0.3010, 0.3215, 0.3123, 0.2716, 0.2551, 0.2258, 0.1959]
+    y_2 += [0.1789, 0.1457, 0.1198, 0.0909, 0.0719, 0.0561, 0.0460, 0.0280, 0.0190]
+    y_2 += [0.0140, 0.0100]
+    data = np.stack([y_1, y_2], axis=1)
+    return _estimated(_gas_oil, times, data, [1.0, 1.0, 1.0], 4, 5.2366e-3)
+
+
+def _gas_oil(rates: Array, y: Array) -> Array:
+    a, b, c = rates
+    return jnp.stack([-(a + c) * y[0] ** 2, a * y[0] ** 2 - b * y[1]])
+
+
+def methanol_to_hydrocarbons() -> OptimalControl:
+    r"""The rates of the conversion of methanol, from 16 measurements. With
+    `q = (b + e) y_1 + y_2`,
+
+    `y_1' = -(2 b - a y_2 / q + c + d) y_1`, `y_2' = a y_1 (b y_1 - y_2) / q + c y_1`,
+    `y_3' = a y_1 (y_2 + e y_1) / q + d y_1` from `(1, 0, 0)`.
+
+    The sum of squares is 9.02229e-3. It starts from the measurements and rates of 1.
+
+    Source: Maria, 1989; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.methanol_to_hydrocarbons().dynamics.widths
+        ```
+    """
+    times = [0.0, 0.05, 0.065, 0.08, 0.123, 0.233, 0.273, 0.354, 0.397, 0.418, 0.502]
+    times += [0.553, 0.681, 0.75, 0.916, 0.937, 1.122]
+    y_1 = [1.0, 0.7085, 0.5971, 0.5537, 0.3684, 0.1712, 0.1198, 0.0747, 0.0529, 0.0415]
+    y_1 += [0.0261, 0.0208, 0.0085, 0.0053, 0.0019, 0.0018, 0.0006]
+    y_2 = [0.0, 0.1621, 0.1855, 0.1989, 0.2845, 0.3491, 0.3098, 0.3576, 0.3347, 0.3388]
+    y_2 += [0.3557, 0.3483, 0.3836, 0.3611, 0.3609, 0.3485, 0.3698]
+    y_3 = [0.0, 0.0811, 0.0965, 0.1198, 0.1535, 0.2097, 0.2628, 0.2467, 0.2884, 0.2757]
+    y_3 += [0.3167, 0.2954, 0.2950, 0.2937, 0.2831, 0.2846, 0.2899]
+    data = np.stack([y_1, y_2, y_3], axis=1)
+    return _estimated(_methanol, times, data, [1.0] * 5, 4, 9.02229e-3)
+
+
+def _methanol(rates: Array, y: Array) -> Array:
+    a, b, c, d, e = rates
+    q = (b + e) * y[0] + y[1]
+    return jnp.stack(
+        [
+            -(2 * b - a * y[1] / q + c + d) * y[0],
+            a * y[0] * (b * y[0] - y[1]) / q + c * y[0],
+            a * y[0] * (y[1] + e * y[0]) / q + d * y[0],
+        ]
+    )
+
+
+def alpha_pinene() -> OptimalControl:
+    r"""The rates of the thermal isomerisation of alpha-pinene, from 8 measurements:
+
+    `y_1' = -(a + b) y_1`, `y_2' = a y_1`, `y_3' = b y_1 - (c + d) y_3 + e y_5`,
+    `y_4' = c y_3`, `y_5' = d y_3 - e y_5` from `(100, 0, 0, 0, 0)`.
+
+    The sum of squares is 19.8721. It starts from the measurements and rates of 1e-5 per
+    minute.
+
+    Source: Box, Hunter, MacGregor and Erjavec, 1973; Dolan, More and Munson, 2004.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.problems.alpha_pinene().states
+        ```
+    """
+    times = [0.0, 1230.0, 3060.0, 4920.0, 7800.0, 10680.0, 15030.0, 22620.0, 36420.0]
+    data = [
+        [100.0, 0.0, 0.0, 0.0, 0.0],
+        [88.35, 7.3, 2.3, 0.4, 1.75],
+        [76.4, 15.6, 4.5, 0.7, 2.8],
+        [65.1, 23.1, 5.3, 1.1, 5.8],
+        [50.4, 32.9, 6.0, 1.5, 9.3],
+        [37.5, 42.7, 6.0, 1.9, 12.0],
+        [25.9, 49.1, 5.9, 2.2, 17.0],
+        [14.0, 57.4, 5.1, 2.6, 21.0],
+        [4.5, 63.1, 3.8, 2.9, 25.7],
+    ]
+    return _estimated(_pinene, times, data, [1e-5] * 5, 8, 19.8721)
+
+
+def _pinene(rates: Array, y: Array) -> Array:
+    a, b, c, d, e = rates
+    return jnp.stack(
+        [
+            -(a + b) * y[0],
+            a * y[0],
+            b * y[0] - (c + d) * y[2] + e * y[4],
+            c * y[2],
+            d * y[2] - e * y[4],
+        ]
+    )
