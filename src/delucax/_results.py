@@ -71,6 +71,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         'An estimate of the controller failed. Where "incidents" are in `keep`, as by '
         "default, `trajectory.incident_counts` says how many did."
     )
+    filter_failed = (
+        "A safety filter found no control that keeps its barriers. Where "
+        '"incidents" are in `keep`, as by default, `trajectory.incident_counts` says '
+        "how often."
+    )
     update_refused = (
         'An update of a learner was not finite and was not made. Where "incidents" '
         "are in `keep`, as by default, `trajectory.incident_counts` says how many were "
@@ -106,6 +111,7 @@ INCIDENTS = {
     "refused_update": RESULTS.update_refused,
     "failed_plan": RESULTS.plan_failed,
     "failed_estimate": RESULTS.estimate_failed,
+    "failed_filter": RESULTS.filter_failed,
 }
 """The status of a rollout in which a controller counted an incident of this name."""
 

@@ -150,6 +150,33 @@ def drawn(size):
     return receding(size, planner=planner, start=start)
 
 
+class Below(eqx.Module):
+    """A barrier on the first state and the speed."""
+
+    level: jax.Array = dlx.parameter()
+
+    def __call__(self, t, x):
+        return self.level + 0.1 * t - x[0] - 0.3 * x[1]
+
+
+def filtered(size):
+    plant = dlx.systems.LinearSystem([[0.0, 1.0], [0.3, -0.2]], [[0.0], [1.0]])
+    options = dict(decay=2 * size, price=50 * size, bounds=(-20.0, 20.0))
+    options["degrees"] = 1  # it is made while it is traced
+    return c.SafetyFilter(c.Linear(FEEDBACK), plant, Below(0.1 * size), **options)
+
+
+def filtered_in_steps(size):
+    plant = dlx.LinearDynamics(A, B, dt=DT)
+    barriers = {"below": Below(0.2 * size), "above": above}
+    options = dict(decay=0.3 * size, disturbance=0.01 * size, weight=size, degrees=1)
+    return c.SafetyFilter(c.Linear(FEEDBACK), plant, barriers, **options)
+
+
+def above(t, x):
+    return x[1] + 0.3
+
+
 def features(y):
     return jnp.stack([y[0], y[1], y[0] * y[1]])
 
@@ -209,6 +236,8 @@ CASES = {
     "Explore": Case(explorer),
     "MPC": Case(receding),
     "MPC that samples": Case(drawn),
+    "SafetyFilter": Case(filtered),
+    "SafetyFilter in steps": Case(filtered_in_steps),
 }
 
 

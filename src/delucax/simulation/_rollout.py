@@ -104,9 +104,9 @@ def rollout(
 
     **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first failure of a
     step, else `diverged`, else `update_refused` if a learner's update was not finite,
-    else `plan_failed` or `estimate_failed` if a plan or an estimate of the controller
-    did not succeed. `throw` raises on all but these two, which the controller handles
-    (`throw=` of [`delucax.controllers.MPC`][]).
+    else `plan_failed`, `estimate_failed` or `filter_failed` if a plan, an estimate or a
+    filter of the controller did not succeed. `throw` raises on all but these three,
+    which the controller handles (`throw=` of [`delucax.controllers.MPC`][]).
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
     time as `throw` says.

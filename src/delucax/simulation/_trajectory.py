@@ -46,8 +46,9 @@ class Trajectory(eqx.Module):
         steps at which it did, booleans of shape `(T,)`. `"clipped_control"`: the
         environment's bounds changed the control. `"failed_plan"`: a plan of
         [`delucax.controllers.MPC`][] did not succeed. `"failed_estimate"`: nor did an
-        estimator. `"refused_update"`: what a learner would have learned was not finite.
-        Others are those that a controller counts with
+        estimator. `"failed_filter"`: a [`delucax.controllers.SafetyFilter`][] found no
+        control that keeps its barriers. `"refused_update"`: what a learner would have
+        learned was not finite. Others are those that a controller counts with
         [`delucax.controllers.Tally`][].
     - `controller_state`: the arrays of the controller's state at the end.
     - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
@@ -138,8 +139,14 @@ class Trajectory(eqx.Module):
     @property
     def failed(self) -> Array:
         """Whether a step failed, the run diverged, or a learner refused an update:
-        `result` is not `successful`, `plan_failed` or `estimate_failed`."""
-        handled = RESULTS.successful, RESULTS.plan_failed, RESULTS.estimate_failed
+        `result` is not `successful`, `plan_failed`, `estimate_failed` or
+        `filter_failed`."""
+        handled = (
+            RESULTS.successful,
+            RESULTS.plan_failed,
+            RESULTS.estimate_failed,
+            RESULTS.filter_failed,
+        )
         return _is_none_of(self.result._value, [np.asarray(r._value) for r in handled])
 
     @property

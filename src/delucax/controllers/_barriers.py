@@ -1,0 +1,310 @@
+"""Barrier conditions along a plant: how they are made, and what a control does to them.
+
+In continuous time a barrier `b(t, x)` of relative degree one becomes the condition
+`db/dt + decay b >= 0`, and one of degree two the same of `db/dt + decay b`. In discrete
+time the change over a step takes the place of the derivative.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._check import as_float_array, is_concrete
+from .._jax import value_and_jacobians
+from .._message import shortened
+from .._module import check_function
+from .._typing import Array
+from ..dynamics import AbstractDynamics
+from ..systems import AbstractPlant
+
+
+_ROUNDING = 100.0
+"""Of a derivative by the control: in units of rounding, what counts as zero."""
+_SAMPLES = 16
+
+Psi = Callable[[Array, Array], Array]
+
+
+class Conditions(eqx.Module):
+    """The barriers of a plant, and what their conditions are made of."""
+
+    plant: AbstractPlant
+    functions: dict[str, Callable[..., Any]]
+    decay: Array
+    disturbance: Array | None
+    degrees: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def flow(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
+        """The time derivative of the state, or the next state."""
+        plant: Any = self.plant
+        if isinstance(plant, AbstractDynamics):
+            return plant.advance(t, x, u, w)[0]
+        return plant.vector_field(t, x, u, w)
+
+    def calm(self, dtype: Any) -> Array | None:
+        """The disturbance of zero, as the plant takes it."""
+        if self.disturbance is None and not self.plant.disturbance_names:
+            return None
+        return jnp.zeros(self.plant.disturbance_size, dtype)
+
+    def values(self, t: Array, x: Array) -> Array:
+        """The barriers, one after the other."""
+        parts = [jnp.ravel(jnp.asarray(f(t, x))) for f in self.functions.values()]
+        whole = parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+        return whole.astype(x.dtype)
+
+    def along(self, psi: Psi, order: int) -> Callable[[Array, Array, Array], Array]:
+        """The least change of `psi` along the plant, and what it may fall by: their sum
+        must not be negative."""
+        decay = self.decay[:, order]
+
+        def condition(t, x, u):
+            rates = decay.astype(x.dtype)
+
+            def under(w):
+                arrived = self.flow(t, x, u, w)
+                if isinstance(self.plant, AbstractDynamics):
+                    now = psi(t, x)
+                    later = psi(t + self.plant.dt.astype(x.dtype), arrived)
+                    return later - now + rates * now
+                moved = jnp.ones_like(t), arrived.astype(x.dtype)
+                now, slope = jax.jvp(psi, (t, x), moved)
+                return slope + rates * now
+
+            calm = self.calm(x.dtype)
+            if self.disturbance is None or calm is None:
+                return under(calm)
+            value, (E,) = value_and_jacobians(under, calm)
+            bound = jnp.broadcast_to(self.disturbance.astype(x.dtype), calm.shape)
+            return value - jnp.abs(E) @ bound
+
+        return condition
+
+    def first(self, t: Array, x: Array) -> Array:
+        """The condition of the first order where no control is in it."""
+        return self.along(self.values, 0)(t, x, jnp.zeros(self.control_size, x.dtype))
+
+    @property
+    def control_size(self) -> int:
+        """The number of controls."""
+        return self.plant.control_size
+
+    def __call__(self, t: Array, x: Array, u: Array) -> Array:
+        """The conditions, each of the order of its barrier."""
+        if set(self.degrees) == {2}:
+            return self.along(self.first, 1)(t, x, u)
+        first = self.along(self.values, 0)(t, x, u)
+        if 2 not in self.degrees:
+            return first
+        second = self.along(self.first, 1)(t, x, u)
+        return jnp.where(np.array(self.degrees) == 2, second, first)
+
+
+def sizes_of(
+    functions: Mapping[str, Callable[..., Any]], state_size: int, where: str
+) -> tuple[int | None, ...]:
+    """How many values each barrier returns; `None` for a number."""
+    dtype, sizes = jnp.result_type(float), []
+    given = [jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (state_size,))]
+    for name, function in functions.items():
+        check_function(function, f"barriers[{name!r}]", where, " of (t, x)")
+        try:
+            like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *given)
+        except (TypeError, IndexError) as error:
+            raise ValueError(
+                f"{where}: barriers[{name!r}] fails when it is called with (t, x), x "
+                f"of shape ({state_size},): {error}"
+            ) from error
+        shape = getattr(like, "shape", () if isinstance(like, int | float) else None)
+        if shape is None or len(shape) > 1 or 0 in shape:
+            raise ValueError(
+                f"{where}: barriers[{name!r}] must return a number or a vector, got "
+                f"{like}."
+            )
+        sizes.append(shape[0] if shape else None)
+    return tuple(sizes)
+
+
+def entry_names(names: Iterable[str], sizes: Iterable[int | None]) -> tuple[str, ...]:
+    """A name for each value that the barriers return."""
+    entries = []
+    for name, size in zip(names, sizes, strict=True):
+        each = [name] if size is None else [f"{name}[{i}]" for i in range(size)]
+        entries += each
+    return tuple(entries)
+
+
+def by_entry(
+    value: Any,
+    name: str,
+    like: tuple[int, ...],
+    sizes: Mapping[str, int | None],
+    default: float | None,
+    where: str,
+) -> Array:
+    """A number for each value of the barriers, given for all or by the barrier. `like`
+    is the shape that one may have besides that of a number."""
+    by_name = isinstance(value, Mapping)
+    if by_name and (unknown := sorted(set(map(str, value)) - set(sizes))):
+        raise ValueError(
+            f"{where}: {name} must be by the names of barriers, {sorted(sizes)}, got "
+            f"{unknown}."
+        )
+    rows = []
+    for of, size in sizes.items():
+        one = value.get(of, default) if by_name else value
+        if one is None:
+            raise ValueError(f"{where}: {name} must have a value for {of!r}.")
+        array = as_float_array(one)
+        if not eqx.is_inexact_array(array) or array.shape not in ((), like):
+            pair = " or a pair" if like else ""
+            raise ValueError(
+                f"{where}: {name} must be a number{pair}, or a dictionary of them by "
+                f"barrier, got {shortened(one)}."
+            )
+        rows += [array] * (size or 1)
+    # What is known stays known while other things are traced.
+    with jax.ensure_compile_time_eval():
+        return jnp.stack([jnp.broadcast_to(row, like) for row in rows])
+
+
+def as_degrees(
+    value: Any, sizes: Mapping[str, int | None], where: str
+) -> tuple[int, ...]:
+    """Relative degrees as they were given, one for each value of the barriers."""
+    given = np.asarray(by_entry(value, "degrees", (), sizes, None, where))
+    if not np.all((given == 1) | (given == 2)):
+        raise ValueError(f"{where}: degrees must be 1 or 2, got {value}.")
+    return tuple(int(degree) for degree in given)
+
+
+def sample_states(plant: AbstractPlant) -> np.ndarray:
+    """States about the equilibrium, or about zero, that fill a box of half-width 1."""
+    n = plant.state_size
+    try:
+        centre = np.asarray(plant.equilibrium()[0])
+    except (ValueError, TypeError, jax.errors.JAXTypeError):
+        centre = np.zeros(n)
+    return centre + 2 * _scattered(_SAMPLES, n) - 1
+
+
+def _scattered(count: int, size: int) -> np.ndarray:
+    """Points of the unit cube: multiples of roots of primes, modulo 1 (Weyl)."""
+    primes, candidate = [], 2
+    while len(primes) < size:
+        if all(candidate % prime for prime in primes):
+            primes.append(candidate)
+        candidate += 1
+    return np.outer(np.arange(1, count + 1), np.sqrt(primes)) % 1
+
+
+def relative_degrees(
+    plant: AbstractPlant,
+    functions: dict[str, Callable[..., Any]],
+    names: tuple[str, ...],
+    states: Any,
+    where: str,
+) -> tuple[int, ...]:
+    """The relative degree of each barrier, found at sample states."""
+    # It does not depend on the decay, which may be traced.
+    ones: Any = np.ones((len(names), 2))
+    conditions = Conditions(plant, functions, ones, None)
+    seen, known = _at_samples(_sees_control, conditions, states, where, 0)
+    if not np.all(known):
+        raise ValueError(
+            f"{where}: barriers must be finite at one of the sample states, and "
+            f"{names[int(np.argmin(known))]!r} is not at any: give `states` at which "
+            "it is."
+        )
+    degrees = np.where(seen, 1, 2)
+    if not np.all(seen):
+        seen_later, _ = _at_samples(_sees_control, conditions, states, where, 1)
+        if not np.all(seen | seen_later):
+            name = names[int(np.argmin(seen | seen_later))]
+            is_discrete = isinstance(plant, AbstractDynamics)
+            when = "two steps later" if is_discrete else "by its second derivative"
+            raise ValueError(
+                f"{where}: barriers must see the control at relative degree 1 or 2, "
+                f"and {name!r} does not, not even {when}, at any sample state."
+            )
+    return tuple(int(degree) for degree in degrees)
+
+
+def check_affine(
+    plant: AbstractPlant, states: Any, is_disturbed: bool, where: str
+) -> None:
+    """Raise unless the field is affine in the control, and in a bounded disturbance."""
+    none: Any = np.ones((0, 2))
+    conditions = Conditions(plant, {}, none, None)
+    for argument, with_disturbance in (("control", False), ("disturbance", True)):
+        if with_disturbance and not is_disturbed:
+            continue
+        curved, known = _at_samples(
+            _is_curved, conditions, states, where, with_disturbance
+        )
+        if not known:
+            raise ValueError(
+                f"{where}: plant must have a finite vector field at one of the sample "
+                "states: give `states` at which it has."
+            )
+        if curved:
+            raise ValueError(
+                f"{where}: plant must have a vector field that is affine in the "
+                f"{argument}, f(t, x) + g(t, x) u, and that of "
+                f"{type(conditions.plant).__name__} is not. Discretise it: in discrete "
+                "time the filter linearises."
+            )
+
+
+def _at_samples(test, conditions: Conditions, states: Any, where: str, option: Any):
+    """Two booleans for each barrier, or of the plant: whether `test` holds at any of
+    the states, and whether any of them told."""
+    with jax.ensure_compile_time_eval():
+        holds, known = _tested(test, conditions, jnp.asarray(states, float), option)
+        if not is_concrete(holds):
+            raise ValueError(
+                f"{where}: degrees must be given where plant or barriers are traced."
+            )
+    holds, known = np.asarray(holds), np.asarray(known)
+    return np.any(holds & known, 0), np.any(known, 0)
+
+
+@eqx.filter_jit
+def _tested(test, conditions, states, option):
+    t = jnp.zeros((), states.dtype)
+    return jax.vmap(lambda x: test(conditions, t, x, option))(states)
+
+
+def _sees_control(conditions: Conditions, t: Array, x: Array, order: int):
+    """Whether the derivative of `order` depends on the control, beyond rounding."""
+    psi = conditions.first if order else conditions.values
+    u = jnp.zeros(conditions.control_size, x.dtype)
+    A = jax.jacfwd(conditions.along(psi, order), 2)(t, x, u)
+    flow = lambda u: conditions.flow(t, x, u, conditions.calm(x.dtype))
+    moved, g = flow(u), jax.jacfwd(flow)(u)
+    place = moved if isinstance(conditions.plant, AbstractDynamics) else x
+    slope = jax.jacfwd(psi, 1)(t, place)
+    least = _ROUNDING * jnp.finfo(x.dtype).eps * (jnp.abs(slope) @ jnp.abs(g))
+    known = jnp.all(jnp.isfinite(A), 1) & jnp.isfinite(psi(t, x))
+    return jnp.any(jnp.abs(A) > least, 1), known
+
+
+def _is_curved(conditions: Conditions, t: Array, x: Array, with_disturbance: bool):
+    """Whether the field of a sum of inputs is not the sum of those of each."""
+    m = conditions.control_size
+    k = conditions.plant.disturbance_size if with_disturbance else 0
+    one, two = jnp.asarray(4 * _scattered(2, m + k) - 2, x.dtype)
+    calm = conditions.calm(x.dtype)
+
+    def field(z):
+        w = z[m:] if with_disturbance else calm
+        return conditions.flow(t, x, z[:m], w)
+
+    terms = [field(one + two), field(jnp.zeros_like(one)), -field(one), -field(two)]
+    size = sum(map(jnp.abs, terms))
+    off = jnp.abs(sum(terms)) > _ROUNDING * jnp.finfo(x.dtype).eps * size
+    return jnp.any(off), jnp.all(jnp.isfinite(size))

@@ -1,0 +1,198 @@
+"""The least change of a control under affine conditions and bounds.
+
+`minimise 1/2 sum_i weight_i (u_i - n_i)^2` such that `s + A (u - n) >= 0` and
+`low <= u <= high`. Where one condition is active, the solution is where an increasing,
+piecewise linear function of one multiplier is zero. Otherwise it is that of a small
+quadratic program.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .. import qp
+from .._jax import value_and_jacobians
+from .._typing import Array
+from ..math._small import dot, matvec
+
+
+_ELASTIC = 0.4
+"""The linear price of a hard condition in the quadratic program is rounding to minus
+this power: above the multipliers of a program that has a solution, unless two
+conditions are opposed to about as many digits."""
+
+
+_LEAST, _MOST = 0.3, 30.0
+"""The curvature of a Lagrangian, in units of that of the cost, is kept between them."""
+
+
+class Task(NamedTuple):
+    """What may be changed, and at what price.
+
+    A condition without a `price` is hard; one with a price may be missed by `d`, which
+    costs `1/2 price d^2`.
+    """
+
+    nominal: Array
+    low: Array | None
+    high: Array | None
+    weight: Array
+    price: Array | None
+
+
+def least_change(task: Task, s: Array, A: Array) -> Array:
+    """The control for conditions whose values at the nominal one are `s`."""
+    if len(s) == 1:
+        price = None if task.price is None else task.price[0]
+        return _for_one(task, s[0], A[0], price)
+    return _for_several(task, s, A)
+
+
+def missed(task: Task, s: Array, A: Array, u: Array) -> tuple[Array, Array]:
+    """By how much conditions are missed, and the size of the terms in them."""
+    change = u - task.nominal
+    over = jnp.maximum(-(s + matvec(A, change)), 0)
+    return over, jnp.abs(s) + matvec(jnp.abs(A), jnp.abs(change))
+
+
+def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
+    """The control for one condition, in closed form."""
+    n, low, high, weight, _ = task
+    give = jnp.zeros((), s.dtype) if price is None else 1 / price
+    way = a / weight
+    if low is None or high is None:
+        # Negated comparisons, so that a NaN is passed on.
+        push = jnp.where(s >= 0, 0, -s) / _unless_zero(dot(a, way) + give)
+        return n + push * way
+    # The multiplier at which each control enters the box, and that at which it leaves.
+    ahead, moves = jnp.where(way > 0, high, low), way != 0
+    behind = jnp.where(way > 0, low, high)
+    pace = jnp.where(moves, way, 1)
+    enters, leaves = (jnp.maximum((end - n) / pace, 0) for end in (behind, ahead))
+    marks = jnp.concatenate([jnp.where(moves, m, 0) for m in (enters, leaves)])
+    marks = lax.stop_gradient(jnp.where(jnp.isfinite(marks), marks, 0))
+
+    def inside(push):
+        return jnp.clip(n + push * way, low, high)
+
+    def value(push):
+        return s + dot(a, inside(push) - n) + push * give
+
+    short = ~(jax.vmap(value)(marks) >= 0)
+    last = lax.stop_gradient(jnp.max(jnp.where(short, marks, 0)))
+    rest = inside(0.0)
+    held = jnp.where(last >= leaves, ahead, behind)
+    free = moves & (enters <= last) & (last < leaves)
+    held = jnp.where(moves, held, rest)
+    level = s + dot(a, jnp.where(free, 0, held - n))
+    slope = dot(a, jnp.where(free, way, 0)) + give
+    push = jnp.maximum(-level / _unless_zero(slope), 0)
+    u = jnp.where(free, n + push * way, held)
+    at_rest = s + dot(a, rest - n)
+    return jnp.where(at_rest >= 0, rest, u + 0 * at_rest)
+
+
+def _unless_zero(size: Array) -> Array:
+    """A divisor that is 1 where it would be zero."""
+    return jnp.where(size > jnp.finfo(size.dtype).tiny, size, 1)
+
+
+def _for_several(task: Task, s: Array, A: Array) -> Array:
+    """The control for several conditions: that for one of them, if it meets the others,
+    else of a quadratic program."""
+    price = task.price
+    one = lambda s, a, p: _for_one(task, s, a, p)
+    tried = jax.vmap(one, in_axes=(0, 0, None if price is None else 0))(s, A, price)
+    over, size = jax.vmap(lambda u: missed(task, s, A, u))(tried)
+    met = over <= 16 * jnp.finfo(s.dtype).eps * size
+    if price is not None:
+        met = met | (jnp.eye(len(s), dtype=bool) & jnp.isfinite(price))
+    optimal = jnp.all(met, 1)
+    chosen = tried[jnp.argmax(optimal)]
+    u = lax.cond(jnp.any(optimal), lambda: chosen, lambda: _by_program(task, s, A))
+    return jnp.where(jnp.all(jnp.isfinite(s)), u, jnp.nan)
+
+
+def _by_program(task: Task, s: Array, A: Array) -> Array:
+    """The control by a quadratic program that always has a solution: a hard condition
+    may be missed at a linear price that no other solution is worth."""
+    n, low, high, weight, price = task
+    root = jnp.sqrt(weight)
+    A = A / root
+    size = jnp.sum(A * A, 1)
+    is_seen = size > jnp.finfo(size.dtype).tiny
+    length = jnp.sqrt(jnp.where(is_seen, size, 1))
+    # In units of the largest change that a condition alone asks for. The solution does
+    # not depend on the unit.
+    far = lax.stop_gradient(jnp.max(jnp.where(is_seen, -s / length, 0)))
+    far = jnp.where(far > 0, far, 1)
+    lower = jnp.where(is_seen, -s / (length * far), -jnp.inf)
+    linear: Any = jnp.full_like(s, jnp.finfo(s.dtype).eps ** -_ELASTIC)
+    quadratic = jnp.zeros_like(s)
+    if price is not None:
+        soft = jnp.isfinite(price)
+        linear = jnp.where(soft, 0, linear)
+        quadratic = jnp.where(soft, jnp.where(soft, price, 0) * size, 0)
+    rows = qp.Rows(A / length[:, None], lower=lower, linear=linear, quadratic=quadratic)
+    bounds = None
+    if low is not None and high is not None:
+        bounds = root * (low - n) / far, root * (high - n) / far
+    P, q = jnp.eye(len(n), dtype=s.dtype), jnp.zeros(len(n), s.dtype)
+    solution = qp.solve(qp.Dense(P, q, bounds=bounds, rows=rows), throw=False)
+    u = n + far * solution.x / root
+    return u if low is None else jnp.clip(u, low, high)
+
+
+def least_change_sequentially(
+    task: Task, conditions: Callable[[Array], Array], most: int
+) -> Any:
+    """The control under conditions that are not affine in it: a fixed point of
+    linearising them at a control and solving for the next one.
+
+    The curvature of the Lagrangian is a multiple of the weights, which the last two
+    steps tell; 1 would be that of the cost alone, and need not converge.
+    """
+    n, dtype = task.nominal, task.nominal.dtype
+    close = jnp.finfo(dtype).eps ** 0.75
+
+    def next_of(u, curvature):
+        c, (A,) = value_and_jacobians(conditions, u)
+        aim = u + (n - u) / curvature
+        price = None if task.price is None else task.price / curvature
+        now = task._replace(nominal=aim, price=price)
+        return least_change(now, c + A @ (aim - u), A)
+
+    def is_on(carry):
+        u, step, _, _, count = carry
+        moves = ~(jnp.max(jnp.abs(step)) <= close * (1 + jnp.max(jnp.abs(u))))
+        return (count == 0) | (moves & (count < most) & jnp.all(jnp.isfinite(u)))
+
+    def another(carry):
+        u, last, curvature, pull, count = carry
+        after = next_of(u, curvature)
+        step = after - u
+        # How the pull to the nominal control changes along the last step.
+        size = dot(last, last)
+        found = dot(pull - curvature * step, last) / jnp.where(size > 0, size, 1)
+        new = jnp.where(size > 0, jnp.clip(found, _LEAST, _MOST), 1)
+        return after, step, new.astype(dtype), curvature * step, count + 1
+
+    def iterated(_, start):
+        none = jnp.zeros_like(start)
+        first = start, none, jnp.ones((), dtype), none, jnp.zeros((), int)
+        u, step, _, _, count = lax.while_loop(is_on, another, first)
+        return u, (count, jnp.max(jnp.abs(step)))
+
+    def tangent(linear, y):
+        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(y)), y)
+
+    start = lax.stop_gradient(n)
+    change = lambda u: next_of(u, 1.0) - u
+    u, (count, step) = lax.custom_root(change, start, iterated, tangent, has_aux=True)
+    converged = step <= jnp.sqrt(close) * (1 + jnp.max(jnp.abs(u)))
+    c, (A,) = value_and_jacobians(conditions, u)
+    size = jnp.abs(c) + jnp.abs(A) @ (jnp.abs(u) + jnp.abs(n))
+    return u, jnp.maximum(-c, 0), size, count, converged
