@@ -193,17 +193,23 @@ def test_the_margin_covers_the_hold():
 
 @needs_x64
 def test_the_margin_by_hand():
-    """Of `1 - x` with `x' = u` and `|u| <= 1`: between margin and zero `c = 1 - x - u`
-    falls by `u`, at most 1."""
+    """Of a point whose speed is held, a barrier at rest falls evenly, and one that
+    moves by `sin t` is bent as `sin t` is. Of a mass, the change moves by the force."""
     plant = dlx.system(lambda t, x, u, w: u, states=1, controls=1)
-    safe = c.SafetyFilter(c.Zero(1), plant, lambda t, x: 1 - x[0], bounds=(-1.0, 1.0))
-    assert_close(safe.held(0.05, ([-1.0], [1.0])).margin, [0.05], atol=1e-12)
-    # A wall that comes closer by cos(t) adds what its speed changes by, at most 1 here.
-    wall = lambda t, x: 3 + jnp.sin(t) - x[0]
-    safe = c.SafetyFilter(c.Zero(1), plant, wall, bounds=(-1.0, 1.0))
-    margin = safe.held(0.05, ([-1.0], [4.0]), times=(0.0, 6.3), points=41).margin
-    # c = 3 + sin t - x + cos t - u falls by u + sin t - cos t, at most 1 + sqrt 2.
-    assert_close(margin, [0.05 * (1 + np.sqrt(2))], rtol=0.02)
+    made = lambda plant, barrier: c.SafetyFilter(
+        c.Zero(1), plant, barrier, bounds=(-1.0, 1.0)
+    )
+    still, moving = lambda t, x: 1 - x[0], lambda t, x: 3 + jnp.sin(t) - x[0]
+    assert_close(made(plant, still).held(0.05, ([-1.0], [1.0])).margin, [0.0])
+    with user_error(match="times must be given"):
+        made(plant, moving).held(0.05, ([-1.0], [4.0]))
+    box = dict(times=(0.0, 6.3), points=41)
+    margin = made(plant, moving).held(0.05, ([-1.0], [4.0]), **box).margin
+    assert_close(margin, [0.05 / 2], rtol=0.02)
+    mass = dlx.systems.DoubleIntegrator()
+    margin = made(mass, still).held(0.05, ([0.0, -0.1], [1.0, 0.1])).margin
+    # The force is near -v, and at most 0.1 and what a step adds to it.
+    assert 0.05 * 0.1 / 2 < margin < 0.05 * 0.4 / 2
 
 
 @once
@@ -213,6 +219,7 @@ def test_the_margin_by_hand():
         (lambda: around().held(0.1, ([0, 0], [1, 1])), "plant must be in continuous"),
         (lambda: limited(bounds=None).held(0.1, BOX), "bounds of the controls must"),
         (lambda: limited().held(0.0, BOX), "dt must be positive"),
+        (lambda: limited().held(0.5, BOX), "dt must be at most 1 / decay"),
         (lambda: limited().held(0.1, BOX, points=2), "points must be a whole number"),
         (lambda: limited().held(0.1, BOX, points=999), "points must give a grid"),
         (lambda: limited().held(0.1, ([0.0], [1.0])), "states must have shape"),

@@ -89,6 +89,18 @@ class Conditions(eqx.Module):
         return self.along(self.values, 0)(t, x, jnp.zeros(self.control_size, x.dtype))
 
     @property
+    def last_decay(self) -> Array:
+        """The decay of the last order of each condition."""
+        return self.decay[np.arange(len(self.degrees)), np.array(self.degrees) - 1]
+
+    def last(self, t: Array, x: Array) -> Array:
+        """What the last order of each condition keeps positive."""
+        values = self.values(t, x)
+        if 2 not in self.degrees:
+            return values
+        return jnp.where(np.array(self.degrees) == 2, self.first(t, x), values)
+
+    @property
     def control_size(self) -> int:
         """The number of controls."""
         return self.plant.control_size

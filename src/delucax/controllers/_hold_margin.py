@@ -9,28 +9,63 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from .._check import as_bounds, check_count, check_step, finite_vector
 from .._jax import is_constant
 from .._typing import Array
+from ..systems import AbstractSystem
 from ._barriers import Conditions
 
 
 _MOST = 2_000_000
 _AT_ONCE = 4096
-_ROUNDS = 200
-"""In which the margin grows; each takes in more cells of the grid, or is the last."""
+_ROUNDS = 100
+"""In which the limits grow; each takes in more cells of the grid, or is the last."""
+_FEW = 5
+"""Rounds in which they shrink; each is valid."""
 
 
 def hold_margin(
     conditions: Conditions,
+    bounds: Any,
+    dt: Any,
+    states: Any,
+    points: int,
+    times: tuple[Any, Any] | None,
+    where: str,
+) -> Array:
+    """Half of `dt` times the fastest fall of the change of each barrier, where it may
+    come to zero within a step."""
+    if not isinstance(conditions.plant, AbstractSystem):
+        raise ValueError(f"{where}: plant must be in continuous time.")
+    check_step(dt, where)
+    check_count(points, "points", where, 3)
+    n, m = conditions.plant.state_size, conditions.control_size
+    if bounds is None or not all(np.all(np.isfinite(end)) for end in bounds):
+        raise ValueError(f"{where}: bounds of the controls must be given and finite.")
+    if not isinstance(states, tuple | list) or len(states) != 2:
+        raise ValueError(f"{where}: states must be a pair (low, high).")
+    ends = [finite_vector(end, n, "states", where) for end in states]
+    as_bounds(tuple(ends), where, "states", n)
+    whole = lambda end, size: np.broadcast_to(np.asarray(end, float), (size,))
+    controls = tuple(whole(end, m) for end in bounds)
+    with jax.ensure_compile_time_eval():
+        decay = np.asarray(conditions.last_decay)
+        if not dt * np.max(decay) <= 1:
+            raise ValueError(f"{where}: dt must be at most 1 / decay, got {dt}.")
+        box = tuple(whole(end, n) for end in ends)
+        found = _margins(conditions, float(dt), box, controls, times, points, where)
+        return jnp.asarray(found, conditions.decay.dtype)
+
+
+def _margins(
+    conditions: Conditions,
     dt: float,
-    states: tuple[Any, Any],
-    controls: tuple[Any, Any],
+    states: tuple[Any, ...],
+    controls: tuple[Any, ...],
     times: tuple[Any, Any] | None,
     points: int,
     where: str,
 ) -> np.ndarray:
-    """The least margin of each condition that is `dt` times its fastest fall between
-    that margin and zero."""
     dtype = jnp.result_type(float)
     x, u = (jnp.asarray((low + high) / 2, dtype) for low, high in (states, controls))
     zero = jnp.zeros((), dtype)
@@ -58,52 +93,86 @@ def hold_margin(
         most = np.broadcast_to(np.asarray(conditions.disturbance), size)
         corners = np.array(list(itertools.product(*((-b, b) for b in most))))
     found = _falls(conditions, jnp.asarray(flat, dtype), jnp.asarray(corners, dtype))
-    fall, c, holds = (np.asarray(a).reshape(*shape, *a.shape[1:]) for a in found)
-    safe = _in_cells(holds & np.all(c >= 0, -1), np.logical_or)
+    fall, change, psi, holds = (
+        np.asarray(a).reshape(*shape, *a.shape[1:]) for a in found
+    )
+    safe = _in_cells(holds, np.logical_or)
     if not safe.any():
         raise ValueError(f"{where}: states must hold a point at which barriers hold.")
-    each = [_least(fall[..., j], c[..., j], safe, dt) for j in range(c.shape[-1])]
-    if not np.all(np.isfinite(each)):
+    rates = [
+        _fastest(fall[..., j], change[..., j], psi[..., j], safe, decay, dt)
+        for j, decay in enumerate(np.asarray(conditions.last_decay))
+    ]
+    if not np.all(np.isfinite(rates)):
         raise ValueError(
             f"{where}: states must be a box in which the conditions have derivatives "
             "wherever the barriers hold; one is not finite there."
         )
-    return np.array(each)
+    return dt * np.array(rates) / 2
 
 
 @eqx.filter_jit
 def _falls(conditions: Conditions, flat: Array, corners: Array) -> Any:
-    """How fast each condition falls at points of time, state and control, for each of
-    the disturbances; the conditions; and whether the barriers hold."""
+    """At points of time, state and control: how fast the change of what must stay
+    positive falls, for each of the disturbances; the change; what must stay positive;
+    and whether all barriers hold."""
     n = conditions.plant.state_size
-    second = np.array(conditions.degrees) == 2
 
     def at(z):
         t, x, u = z[0], z[1 : 1 + n], z[1 + n :]
-        value, push = jax.linearize(lambda t, x: conditions(t, x, u), t, x)
+        decay = conditions.last_decay.astype(x.dtype)
+        changed = lambda t, x: conditions(t, x, u) - decay * conditions.last(t, x)
+        change, push = jax.linearize(changed, t, x)
 
         def fall(w):
             w = w if conditions.disturbance is not None else conditions.calm(x.dtype)
             return -push(jnp.ones_like(t), conditions.flow(t, x, u, w))
 
-        holds = conditions.values(t, x) >= 0
-        if second.any():
-            holds = holds & (~second | (conditions.first(t, x) >= 0))
-        return jax.vmap(fall)(corners), value, jnp.all(holds)
+        values, psi = conditions.values(t, x), conditions.last(t, x)
+        return jax.vmap(fall)(corners), change, psi, jnp.all((values >= 0) & (psi >= 0))
 
     return lax.map(at, flat, batch_size=min(_AT_ONCE, len(flat)))
 
 
-def _least(fall: np.ndarray, c: np.ndarray, safe: np.ndarray, dt: float) -> float:
-    """The margin of one condition, from zero up."""
-    lowest, margin = _in_cells(c, np.minimum), 0.0
+def _fastest(
+    fall: np.ndarray,
+    change: np.ndarray,
+    psi: np.ndarray,
+    safe: np.ndarray,
+    decay: float,
+    dt: float,
+) -> float:
+    """The fastest fall of the change of `psi`, on the way to `psi = 0` within a step.
+
+    Back from there, `psi` is at most `dt` times its own fastest fall, and its change at
+    most `dt` times the fall that is sought: both are raised from zero until they hold.
+    On from the sample, the change is at least `-decay psi`, less the same. This limit
+    lowers both, and they stay valid.
+    """
+    low, high = (_in_cells(change, join) for join in (np.minimum, np.maximum))
+    near = _in_cells(psi, np.minimum)
+
+    def measured(rate, reach, least):
+        cells = safe & ~(near > reach) & ~(low > dt * rate) & ~(high < least)
+        inside = _corners_of(cells, change.shape)
+        return max(_highest(fall, inside), 0.0), dt * max(
+            _highest(-change, inside), 0.0
+        )
+
+    rate = reach = 0.0
     for _ in range(_ROUNDS):
-        met = _corners_of(safe & ~(lowest > margin), c.shape)
-        needed = dt * max(_highest(fall, met), 0.0)
-        if not needed > margin:
-            return needed if np.isnan(needed) else margin
-        margin = needed
-    return dt * max(_highest(fall, _corners_of(safe, c.shape)), 0.0)
+        found = measured(rate, reach, -np.inf)
+        if not (found[0] > rate or found[1] > reach):
+            break
+        rate, reach = max(found[0], rate), max(found[1], reach)
+    else:
+        rate, reach = measured(np.inf, np.inf, -np.inf)
+    found = rate, reach
+    for _ in range(_FEW):
+        found = measured(rate, reach, -decay * reach - dt * rate)
+        rate, reach = min(found[0], rate), min(found[1], reach)
+    # A NaN is not greater than what came before it.
+    return rate if np.all(np.isfinite(found)) else np.nan
 
 
 def _in_cells(values: np.ndarray, join: Any) -> np.ndarray:

@@ -72,26 +72,25 @@ def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
     behind = jnp.where(way > 0, low, high)
     pace = jnp.where(moves, way, 1)
     enters, leaves = (jnp.maximum((end - n) / pace, 0) for end in (behind, ahead))
-    marks = jnp.concatenate([jnp.where(moves, m, 0) for m in (enters, leaves)])
-    marks = lax.stop_gradient(jnp.where(jnp.isfinite(marks), marks, 0))
 
-    def inside(push):
-        return jnp.clip(n + push * way, low, high)
+    def is_short(push):
+        """Whether the condition is not met yet at a multiplier."""
+        value = s + dot(a, jnp.clip(n + push * way, low, high) - n) + push * give
+        return ~(value >= 0)
 
-    def value(push):
-        return s + dot(a, inside(push) - n) + push * give
-
-    short = ~(jax.vmap(value)(marks) >= 0)
-    last = lax.stop_gradient(jnp.max(jnp.where(short, marks, 0)))
-    rest = inside(0.0)
-    held = jnp.where(last >= leaves, ahead, behind)
-    free = moves & (enters <= last) & (last < leaves)
-    held = jnp.where(moves, held, rest)
+    # By the sign at its own two multipliers: the place of the solution among all would
+    # be lost where rounding differs between copies of them.
+    finite = jnp.isfinite(leaves)
+    has_entered = moves & jax.vmap(is_short)(enters)
+    has_left = moves & finite & jax.vmap(is_short)(jnp.where(finite, leaves, 0))
+    free = has_entered & ~has_left
+    rest = jnp.clip(n, low, high)
+    held = jnp.where(has_left, ahead, jnp.where(moves, behind, rest))
     level = s + dot(a, jnp.where(free, 0, held - n))
     slope = dot(a, jnp.where(free, way, 0)) + give
     push = jnp.maximum(-level / _unless_zero(slope), 0)
-    u = jnp.where(free, n + push * way, held)
     at_rest = s + dot(a, rest - n)
+    u = jnp.where(free, jnp.clip(n + push * way, low, high), held)
     return jnp.where(at_rest >= 0, rest, u + 0 * at_rest)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Int, PyTree
 
 from .._check import (
-    as_bounds,
     as_entries,
     as_rows,
     bounds_field,
@@ -20,8 +19,6 @@ from .._check import (
     check_instance,
     check_positive,
     check_range,
-    check_step,
-    finite_vector,
     is_concrete,
 )
 from .._controller import AbstractController, check_controller, Tally
@@ -286,23 +283,23 @@ class SafetyFilter(AbstractController):
         times: tuple[float, float] | None = None,
         points: int = 11,
     ) -> "SafetyFilter":
-        r"""The filter with a margin for a control that is held over `dt`.
+        """The filter with a margin for a control that is held over `dt`.
 
-        Let `c >= margin` at each sample. A condition that fell to zero before the next
-        one would go through every value between, within `dt`. So `c >= 0`, and with it
-        `b >= 0`, holds at all times if
+        A condition is `c = d + decay psi`: `psi` is what it keeps positive, the barrier
+        or `db/dt + decay b`, and `d` its least change. Let `c >= margin` at a sample,
+        and `-dd/dt <= M` until the next one. Then `s` after the sample
 
-        `margin >= dt max(-dc/dt)`,
+        `psi >= (1 - decay s) psi_0 + s (margin - s M / 2)`,
 
-        where the maximum is over the states at which all barriers hold, the controls
-        between the bounds for which `0 <= c <= margin`, and the disturbances. The least
-        margin for which this is true is found by raising it from zero.
+        which is not negative with `margin = dt M / 2` and `decay dt <= 1`. So barriers
+        that hold at first hold at all times.
 
-        The maximum is over the corners of the cells of a grid that have such points in
-        them, and adds the second differences of its values, for what is between the
-        points. It is a bound where these tell the curvature of `dc/dt`: see that more
-        points change it little. It supposes that the states stay in the box, and that
-        the filter does not fail.
+        `M` is a maximum over the controls between the bounds, the disturbances, and the
+        states at which all barriers hold and from which `psi` can fall to zero within
+        `dt`. It is taken at the corners of the cells of a grid that have such points in
+        them, with an allowance for what is between them from its second differences:
+        see that more points change it little. It supposes that the states stay in the
+        box, and that the filter does not fail.
 
         **Arguments:**
 
@@ -317,9 +314,8 @@ class SafetyFilter(AbstractController):
         **Raises:** `ValueError` in discrete time, without finite bounds, on a box of
         the wrong shape, or on a grid that is too large.
 
-        Source: Cortez et al., 2019; Breeden, Garg and Panagou, 2022 (the theorem on
-        sampled-data barriers with one margin for all states). The limit of `c` in the
-        maximum is ours.
+        Source: Breeden, Garg and Panagou, 2022 (the margin by the second derivative
+        along a step); Cortez et al., 2019.
 
         !!! example
 
@@ -335,31 +331,9 @@ class SafetyFilter(AbstractController):
             safe.held(0.01, ([-3.2, -2.0], [3.2, 2.0])).margin
             ```
         """
-        where, n, m = "SafetyFilter.held", self.plant.state_size, self._controls
-        if not isinstance(self.plant, AbstractSystem):
-            raise ValueError(f"{where}: plant must be in continuous time.")
-        check_step(dt, where)
-        check_count(points, "points", where, 3)
-        if self.bounds is None or not np.all(np.isfinite(_as_box(self.bounds, m))):
-            raise ValueError(
-                f"{where}: bounds of the controls must be given and finite."
-            )
-        if not isinstance(states, tuple | list) or len(states) != 2:
-            raise ValueError(f"{where}: states must be a pair (low, high).")
-        ends = [finite_vector(end, n, "states", where) for end in states]
-        box = as_bounds(tuple(ends), where, "states", n)
-        assert box is not None
-        with jax.ensure_compile_time_eval():
-            found = hold_margin(
-                self.conditions,
-                float(dt),
-                _as_box(box, n),
-                _as_box(self.bounds, m),
-                times,
-                points,
-                where,
-            )
-        margin = self.margin + jnp.asarray(found, self.margin.dtype)
+        where = "SafetyFilter.held"
+        given = self.conditions, self.bounds, dt, states, points
+        margin = self.margin + hold_margin(*given, times, where)
         return eqx.tree_at(lambda safe: safe.margin, self, margin)
 
     @property
@@ -448,8 +422,3 @@ def _check_plant(plant: Any, where: str) -> None:
         check_instance(plant, AbstractSystem, "plant", where, hint)
     if plant.control_size == 0:
         raise ValueError(f"{where}: plant must have a control, got none.")
-
-
-def _as_box(box: Any, size: int) -> Any:
-    """The ends of a box as vectors of NumPy."""
-    return tuple(np.broadcast_to(np.asarray(end, float), (size,)) for end in box)
