@@ -18,11 +18,11 @@ import delucax as dlx
 c = dlx.controllers
 AHEAD = 0.15
 """From the axle of the unicycle to the point that is steered, in m."""
-DISCS = jnp.array([[0.75, 0.35, 0.25], [-0.55, 0.65, 0.3], [0.0, -0.8, 0.25]])
+DISCS = jnp.array([[0.9, 0.42, 0.3], [-0.38, 0.48, 0.3], [0.1, -0.98, 0.3]])
 """The centres and radii of the discs, in m."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Task:
     """A plant, a controller that does not know of barriers, and these."""
 
@@ -57,10 +57,10 @@ class Follow(dlx.AbstractController):
         return self.law(t, y), state
 
 
-def projected(n, value, a, low, high):
+def projected(n, value, a, weight, low, high):
     """The nearest control to `n` with `value + a (u - n) >= 0`, clipped."""
-    push = jnp.maximum(-value, 0) / jnp.maximum(jnp.sum(a * a), 1e-9)
-    return jnp.clip(n + push * a, low, high)
+    push = jnp.maximum(-value, 0) / jnp.sum(a * a / weight)
+    return jnp.clip(n + push * a / weight, low, high)
 
 
 def mass_before_a_wall() -> Task:
@@ -126,7 +126,8 @@ def unicycle_among_discs() -> Task:
     aside = lambda x: AHEAD * jnp.stack([-jnp.sin(x[2]), jnp.cos(x[2])])
     point = lambda x: x[:2] + AHEAD * forward(x)
     goal = lambda t: 0.8 * jnp.stack([jnp.cos(0.8 * t), jnp.sin(0.8 * t)])
-    top = np.array([1.0, 4.0])
+    # A change of the control costs what it changes the speed of the point by.
+    top, weight = np.array([1.0, 4.0]), np.array([1.0, AHEAD**2])
 
     def field(t, x, u, w):
         return jnp.concatenate([u[0] * forward(x) + w, u[1:]])
@@ -157,13 +158,13 @@ def unicycle_among_discs() -> Task:
     def by_hand(t, x, n, decay, margin):
         out, b = nearest(x)
         a = jnp.stack([out @ forward(x), out @ aside(x)])
-        return projected(n, a @ n + decay * b - margin, a, -top, top)
+        return projected(n, a @ n + decay * b - margin, a, weight, -top, top)
 
     return Task(
         system=dlx.system(field, states=3, controls=2, disturbances=2),
         controller=Follow(steered),
         barriers=far,
-        options=dict(decay=3.0, bounds=(-top, top), disturbance=0.1),
+        options=dict(decay=3.0, bounds=(-top, top), disturbance=0.1, weight=weight),
         dt=0.02,
         states=([-1.5, -1.5, -np.pi], [1.5, 1.5, np.pi]),
         times=None,
