@@ -18,7 +18,7 @@ import delucax as dlx
 c = dlx.controllers
 AHEAD = 0.15
 """From the axle of the unicycle to the point that is steered, in m."""
-DISCS = jnp.array([[0.9, 0.42, 0.3], [-0.38, 0.48, 0.3], [0.1, -0.98, 0.3]])
+DISCS = np.array([[0.9, 0.42, 0.3], [-0.38, 0.48, 0.3], [0.1, -0.98, 0.3]])
 """The centres and radii of the discs, in m."""
 
 
@@ -152,8 +152,9 @@ def unicycle_among_discs() -> Task:
     def nearest(x):
         away = point(x) - DISCS[:, :2]
         distance = jnp.sqrt(jnp.sum(away**2, 1))
-        i = jnp.argmin(distance - DISCS[:, 2])
-        return away[i] / distance[i], distance[i] - DISCS[i, 2]
+        b = distance - DISCS[:, 2]
+        i = jnp.argmin(b)
+        return away[i] / distance[i], b[i]
 
     def by_hand(t, x, n, decay, margin):
         out, b = nearest(x)

@@ -140,6 +140,20 @@ def test_several_conditions_are_a_program():
 
 
 @needs_x64
+def test_little_is_missed_at_the_bounds():
+    """Changes of a millionth, from controls that are mostly at their bounds."""
+    rows, level, n = drawn(400, 2, rows=3, seed=2)
+    n = np.clip(3 * n, -2, 2)
+    level = -np.einsum("npm,nm->np", rows, n) + 1e-6 * level
+    u, state = batch(made(3, bounds=(-2.0, 2.0)))(rows, level, n)
+    known = [by_enumeration(*z, -2.0, 2.0) for z in zip(rows, level, n, strict=True)]
+    kept = np.array([k is not None for k in known])
+    expected = np.stack([k for k in known if k is not None])
+    assert_close(np.asarray(u)[kept], expected, atol=3e-9)
+    assert 100 < kept.sum() < 400 and not np.any(np.asarray(state.failures.count)[kept])
+
+
+@needs_x64
 def test_what_is_missed_is_least():
     """Two conditions that contradict each other, and one that can hold."""
     rows, level = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]]), jnp.full(3, -1.0)

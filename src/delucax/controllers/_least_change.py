@@ -53,9 +53,10 @@ def least_change(task: Task, s: Array, A: Array) -> Array:
 
 def missed(task: Task, s: Array, A: Array, u: Array) -> tuple[Array, Array]:
     """By how much conditions are missed, and the size of the terms in them."""
-    change = u - task.nominal
-    over = jnp.maximum(-(s + matvec(A, change)), 0)
-    return over, jnp.abs(s) + matvec(jnp.abs(A), jnp.abs(change))
+    n = task.nominal
+    over = jnp.maximum(-(s + matvec(A, u - n)), 0)
+    size = jnp.abs(s - matvec(A, n)) + matvec(jnp.abs(A), jnp.abs(u) + jnp.abs(n))
+    return over, size
 
 
 def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
@@ -140,7 +141,10 @@ def _by_program(task: Task, s: Array, A: Array) -> Array:
     if low is not None and high is not None:
         bounds = root * (low - n) / far, root * (high - n) / far
     P, q = jnp.eye(len(n), dtype=s.dtype), jnp.zeros(len(n), s.dtype)
-    solution = qp.solve(qp.Dense(P, q, bounds=bounds, rows=rows), throw=False)
+    # Tighter than the default: bounds may be large in the unit of the change.
+    tol = float(jnp.finfo(s.dtype).eps) ** 0.625
+    problem = qp.Dense(P, q, bounds=bounds, rows=rows)
+    solution = qp.solve(problem, rtol=tol, atol=tol, throw=False)
     u = n + far * solution.x / root
     return u if low is None else jnp.clip(u, low, high)
 

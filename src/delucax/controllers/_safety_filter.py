@@ -396,7 +396,7 @@ class SafetyFilter(AbstractController):
 
     def _judged(self, over: Array, size: Array, converged: Any, dtype: Any) -> Result:
         eps = float(jnp.finfo(dtype).eps)
-        slack = 10 * eps**0.5 * size + 100 * eps
+        slack = eps**0.5 * size + 100 * eps
         # Negated, so that a NaN is a failure.
         fails = ~(over <= slack)
         if self.price is not None:
