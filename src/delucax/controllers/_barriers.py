@@ -19,7 +19,7 @@ from .._message import shortened
 from .._module import check_function
 from .._typing import Array
 from ..dynamics import AbstractDynamics
-from ..systems import AbstractPlant
+from ..systems import AbstractPlant, AbstractSystem
 
 
 _ROUNDING = 100.0
@@ -114,6 +114,17 @@ class Conditions(eqx.Module):
             return first
         second = self.along(self.first, 1)(t, x, u)
         return jnp.where(np.array(self.degrees) == 2, second, first)
+
+
+def check_plant(plant: Any, where: str) -> None:
+    """Raise unless the plant is a system or dynamics, with a control."""
+    if not isinstance(plant, AbstractSystem | AbstractDynamics):
+        raise ValueError(
+            f"{where}: plant must be an AbstractSystem or an AbstractDynamics (of an "
+            f"environment give its `dynamics`), got {type(plant).__name__}."
+        )
+    if plant.control_size == 0:
+        raise ValueError(f"{where}: plant must have a control, got none.")
 
 
 def sizes_of(

@@ -101,7 +101,7 @@ def _margins(
         raise ValueError(f"{where}: states must hold a point at which barriers hold.")
     rates = [
         _fastest(fall[..., j], change[..., j], psi[..., j], safe, decay, dt)
-        for j, decay in enumerate(np.asarray(conditions.last_decay))
+        for j, decay in enumerate(np.asarray(conditions.last_decay).tolist())
     ]
     if not np.all(np.isfinite(rates)):
         raise ValueError(

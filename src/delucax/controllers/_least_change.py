@@ -15,6 +15,7 @@ from jax import lax
 
 from .. import qp
 from .._jax import value_and_jacobians
+from .._results import choose, Result, RESULTS
 from .._typing import Array
 from ..math._small import dot, matvec
 
@@ -57,6 +58,19 @@ def missed(task: Task, s: Array, A: Array, u: Array) -> tuple[Array, Array]:
     over = jnp.maximum(-(s + matvec(A, u - n)), 0)
     size = jnp.abs(s - matvec(A, n)) + matvec(jnp.abs(A), jnp.abs(u) + jnp.abs(n))
     return over, size
+
+
+def judged(task: Task, over: Array, size: Array, converged: Any) -> Result:
+    """The status of a control that misses conditions by `over`."""
+    eps = float(jnp.finfo(over.dtype).eps)
+    # Negated, so that a NaN is a failure.
+    fails = ~(over <= eps**0.5 * size + 100 * eps)
+    if task.price is not None:
+        fails = fails & ~jnp.isfinite(task.price)
+    result = choose(jnp.any(fails), RESULTS.no_feasible_point, RESULTS.successful)
+    if converged is not True:
+        result = choose(jnp.any(fails) & ~converged, RESULTS.not_converged, result)
+    return choose(jnp.any(jnp.isnan(over)), RESULTS.ill_posed, result)
 
 
 def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:

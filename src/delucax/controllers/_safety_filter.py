@@ -16,7 +16,6 @@ from .._check import (
     check_control_bounds,
     check_count,
     check_finite,
-    check_instance,
     check_positive,
     check_range,
     is_concrete,
@@ -24,7 +23,7 @@ from .._check import (
 from .._controller import AbstractController, check_controller, Tally
 from .._jax import value_and_jacobians
 from .._module import as_module
-from .._results import choose, Result, RESULTS
+from .._results import Result, RESULTS
 from .._typing import Array, PRNGKey, RealScalar
 from ..dynamics import AbstractDynamics
 from ..systems import AbstractPlant, AbstractSystem
@@ -32,6 +31,7 @@ from ._barriers import (
     as_degrees,
     by_entry,
     check_affine,
+    check_plant,
     Conditions,
     entry_names,
     relative_degrees,
@@ -40,6 +40,7 @@ from ._barriers import (
 )
 from ._hold_margin import hold_margin
 from ._least_change import (
+    judged,
     least_change,
     least_change_sequentially,
     missed,
@@ -189,7 +190,7 @@ class SafetyFilter(AbstractController):
     ):
         where = "SafetyFilter"
         self.controller, self.plant = controller, plant
-        _check_plant(plant, where)
+        check_plant(plant, where)
         n, m = plant.state_size, plant.control_size
         given = barriers if isinstance(barriers, Mapping) else {"barrier": barriers}
         if not given:
@@ -238,7 +239,7 @@ class SafetyFilter(AbstractController):
     def __check_init__(self):
         where = "SafetyFilter"
         check_controller(self.controller, "controller", where)
-        _check_plant(self.plant, where)
+        check_plant(self.plant, where)
         p, m = len(self.names), self.plant.control_size
         shapes = {"decay": (p, 2), "margin": (p,), "price": (p,), "weight": (m,)}
         for name, shape in shapes.items():
@@ -250,12 +251,11 @@ class SafetyFilter(AbstractController):
                 )
         most = 1 if isinstance(self.plant, AbstractDynamics) else np.inf
         check_range(self.decay, "decay", where, 0, most)
-        check_finite(self.decay, "decay", where)
-        check_finite(self.margin, "margin", where)
-        check_positive(self.weight, "weight", where)
         if self.disturbance is not None:
             check_range(self.disturbance, "disturbance", where)
-            check_finite(self.disturbance, "disturbance", where)
+        for name in ("decay", "margin", "disturbance"):
+            check_finite(getattr(self, name), name, where)
+        check_positive(self.weight, "weight", where)
         if self.price is not None and is_concrete(self.price):
             if not np.all(np.asarray(self.price) > 0):
                 raise ValueError(
@@ -336,10 +336,6 @@ class SafetyFilter(AbstractController):
         margin = self.margin + hold_margin(*given, times, where)
         return eqx.tree_at(lambda safe: safe.margin, self, margin)
 
-    @property
-    def _controls(self) -> int:
-        return self.plant.control_size
-
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return SafetyFilterState(
             controller=self.controller.init(key=key),
@@ -352,10 +348,11 @@ class SafetyFilter(AbstractController):
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.plant.state_size)
         nominal, memory = self.controller(t, y, state.controller)
-        if jnp.shape(nominal) != (self._controls,):
+        m = self.plant.control_size
+        if jnp.shape(nominal) != (m,):
             raise ValueError(
-                "SafetyFilter: controller must return a control of shape "
-                f"({self._controls},), as the plant takes, got {jnp.shape(nominal)}."
+                f"SafetyFilter: controller must return a control of shape ({m},), as "
+                f"the plant takes, got {jnp.shape(nominal)}."
             )
         task, conditions = self._task(nominal.astype(y.dtype)), self._above(t, y)
         if isinstance(self.plant, AbstractDynamics):
@@ -367,7 +364,7 @@ class SafetyFilter(AbstractController):
             u = least_change(task, s, A)
             over, size = missed(task, s, A, u)
             count, converged = 1, True
-        result = self._judged(over, size, converged, y.dtype)
+        result = judged(task, over, size, converged)
         after = SafetyFilterState(
             controller=memory,
             result=result,
@@ -387,24 +384,12 @@ class SafetyFilter(AbstractController):
         return lambda u: self.conditions(time, x, u) - margin
 
     def _task(self, nominal: Array) -> Task:
-        dtype, m = nominal.dtype, self._controls
+        dtype, m = nominal.dtype, self.plant.control_size
         low, high = (None, None) if self.bounds is None else self.bounds
         whole = lambda end: jnp.broadcast_to(end, (m,)).astype(dtype)
         low, high = (None if end is None else whole(end) for end in (low, high))
         price = None if self.price is None else self.price.astype(dtype)
         return Task(nominal, low, high, self.weight.astype(dtype), price)
-
-    def _judged(self, over: Array, size: Array, converged: Any, dtype: Any) -> Result:
-        eps = float(jnp.finfo(dtype).eps)
-        slack = eps**0.5 * size + 100 * eps
-        # Negated, so that a NaN is a failure.
-        fails = ~(over <= slack)
-        if self.price is not None:
-            fails = fails & ~jnp.isfinite(self.price) | jnp.isnan(over)
-        kept = choose(jnp.any(fails), RESULTS.no_feasible_point, RESULTS.successful)
-        if converged is not True:
-            kept = choose(jnp.any(fails) & ~converged, RESULTS.not_converged, kept)
-        return choose(jnp.any(jnp.isnan(over)), RESULTS.ill_posed, kept)
 
     def _named(self, values: Array) -> dict[str, Array]:
         """Values of the conditions by the names of their barriers."""
@@ -414,11 +399,3 @@ class SafetyFilter(AbstractController):
             named[name] = part.astype(float)
             start += size or 1
         return named
-
-
-def _check_plant(plant: Any, where: str) -> None:
-    if not isinstance(plant, AbstractSystem | AbstractDynamics):
-        hint = ""
-        check_instance(plant, AbstractSystem, "plant", where, hint)
-    if plant.control_size == 0:
-        raise ValueError(f"{where}: plant must have a control, got none.")
