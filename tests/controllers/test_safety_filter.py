@@ -219,6 +219,23 @@ def test_a_hundred_thousand_states():
     assert not np.any(state.failures.count)
 
 
+def test_a_hundred_thousand_states_between_bounds():
+    """Where a control meets the condition, it does; where none does, it is said."""
+    a, level, n = drawn(100_000, 2, seed=5)
+    kind = jnp.zeros(()).dtype
+    given = [jnp.asarray(z, kind) for z in (a, level, 2 * n)]
+    u, state = batch(made(0, bounds=(-1.0, 1.5)))(*given)
+    a, level, n, u = (np.asarray(z, float) for z in (*given, u))
+    assert np.all((u >= -1) & (u <= 1.5))
+    value = np.sum(a * u, -1) + level
+    most = np.sum(np.where(a > 0, 1.5 * a, -a), -1) + level
+    failed = np.asarray(state.failures.count) == 1
+    tol = tolerance(1e-5, 1e-14) * (1 + np.sum(np.abs(a), -1) + np.abs(level))
+    assert np.all(value >= np.minimum(most, 0) - tol)
+    assert np.all(failed[most < -1e-2]) and not np.any(failed[most > 1e-2])
+    assert 0.05 < failed.mean() < 0.5
+
+
 class Lean(eqx.Module):
     most: jax.Array = dlx.parameter(0.5)
 

@@ -84,8 +84,8 @@ class SafetyFilter(AbstractController):
     If no barrier is at risk, that is one linearisation.
 
     **Disturbances.** With `disturbance`, the condition holds for the worst
-    `|w_i| <= disturbance_i`: of continuous time exactly, as `f` must be affine in `w`;
-    of discrete time to the first order.
+    `|w_i| <= disturbance_i`, in both orders of degree two: of continuous time exactly,
+    as `f` must be affine in `w`; of discrete time to the first order.
 
     **A control that is held.** Between two samples a condition falls.
     [`held`][delucax.controllers.SafetyFilter.held] computes a margin that covers it.
