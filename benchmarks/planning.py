@@ -58,13 +58,15 @@ PEERS = {
 class Worker:
     """A process in a virtual environment of its own; `ask` sends it one request."""
 
-    def __init__(self, name: str, *requirements: str) -> None:
+    def __init__(
+        self, name: str, *requirements: str, worker: str | None = None
+    ) -> None:
         outside = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
         self._process = subprocess.Popen(
             [
                 interpreter(name, *requirements),
                 "-m",
-                f"benchmarks._peers._{name}_worker",
+                f"benchmarks._peers._{worker or name}_worker",
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
