@@ -6,4 +6,6 @@ from ._kalman import (
     KalmanFilter as KalmanFilter,
     UnscentedKalmanFilter as UnscentedKalmanFilter,
 )
+from ._mhe import MHE as MHE
+from ._random_walk import RandomWalk as RandomWalk
 from ._smoother import run_filter as run_filter, smooth as smooth

@@ -14,6 +14,7 @@ from .._check import (
     as_vector,
     check_definite,
     check_finite,
+    check_instance,
     symmetric_matrix,
 )
 from .._controller import wrong_observation
@@ -168,23 +169,9 @@ class AbstractGaussianFilter(AbstractEstimator):
         self._model()
 
     def _model(self, default: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """`W`, `V`, and the mean and covariance of the first state, checked, and in the
-        precision of all; where they are not given, `default` or zero and the identity.
-        """
-        where, dynamics = type(self).__name__, self.dynamics
-        mean: Any = self.mean
-        n, p = dynamics.state_size, dynamics.observation_size
-        k = dynamics.disturbance_size
-        W = _covariance_matrix(self.W, k, "W", "the disturbance", where)
-        V = _covariance_matrix(self.V, p, "V", "the observation", where)
-        start: Any = np.zeros(n, W.dtype) if default is None else default
-        mean = start if mean is None else as_vector(mean, n, "mean", where)
-        check_finite(mean, "mean", where)
-        P = np.eye(n, dtype=mean.dtype) if self.covariance is None else self.covariance
-        P = _covariance_matrix(P, n, "covariance", "the state", where)
-        # One precision for all, because loops carry the belief and keep its types.
-        dtype = jnp.result_type(mean, P, start, W, V)
-        return W, V, mean.astype(dtype), P.astype(dtype)
+        """As `checked_model`."""
+        given = self.W, self.V, self.mean, self.covariance
+        return checked_model(self.dynamics, *given, type(self).__name__, default)
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
         del key
@@ -266,6 +253,45 @@ class AbstractGaussianFilter(AbstractEstimator):
         # rounding.
         covariance = joint.remainder(G) + G @ after.covariance @ G.T
         return _like(Belief(belief.mean + matvec(G, shift), covariance), belief)
+
+
+def checked_model(
+    dynamics: AbstractDynamics,
+    W: Any,
+    V: Any,
+    mean: Any,
+    covariance: Any,
+    where: str,
+    default: Array | None = None,
+) -> tuple[Array, Array, Array, Array]:
+    """`W`, `V`, and the mean and covariance of the first state, checked, and in the
+    precision of all; where they are not given, `default` or zero and the identity.
+    """
+    n, p = dynamics.state_size, dynamics.observation_size
+    k = dynamics.disturbance_size
+    W = _covariance_matrix(W, k, "W", "the disturbance", where)
+    V = _covariance_matrix(V, p, "V", "the observation", where)
+    start: Any = np.zeros(n, W.dtype) if default is None else default
+    mean = start if mean is None else as_vector(mean, n, "mean", where)
+    check_finite(mean, "mean", where)
+    P = np.eye(n, dtype=mean.dtype) if covariance is None else covariance
+    P = _covariance_matrix(P, n, "covariance", "the state", where)
+    # One precision for all, because loops carry the belief and keep its types.
+    dtype = jnp.result_type(mean, P, start, W, V)
+    return W, V, mean.astype(dtype), P.astype(dtype)
+
+
+def check_dynamics(dynamics: Any, where: str) -> None:
+    """Raise unless these are dynamics that measure deviations of their state."""
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
+    n = dynamics.state_size
+    x = jnp.zeros(n)
+    shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape
+    if shape != (n,):
+        raise ValueError(
+            f"{where}: dynamics must have a difference of the size of the state, "
+            f"{(n,)}, got shape {shape}."
+        )
 
 
 def _like(after: Belief, before: Belief) -> Belief:

@@ -3,7 +3,6 @@
 from dataclasses import KW_ONLY
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
 from ._gaussian import (
     AbstractGaussianFilter,
+    check_dynamics,
     congruence,
     Joint,
     noise_of_state,
@@ -201,23 +201,11 @@ class _AbstractNonlinearFilter(AbstractGaussianFilter):
     """A filter of any dynamics, whose disturbance counts to first order."""
 
     def __post_init__(self):
-        self._check_dynamics()
+        check_dynamics(self.dynamics, type(self).__name__)
         self.W, self.V, self.mean, self.covariance = self._model()
 
     def __check_init__(self):
-        self._check_dynamics()
-
-    def _check_dynamics(self) -> None:
-        where, dynamics = type(self).__name__, self.dynamics
-        check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        n = dynamics.state_size
-        x = jnp.zeros(n)
-        shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape
-        if shape != (n,):
-            raise ValueError(
-                f"{where}: dynamics must have a difference of the size of the state, "
-                f"{(n,)}, got shape {shape}."
-            )
+        check_dynamics(self.dynamics, type(self).__name__)
 
     def _advanced(self, t, x, u, w=None):
         """The next state; NaN if the solver fails, which the loop around it reports."""

@@ -1,0 +1,249 @@
+"""Moving-horizon estimation."""
+
+from dataclasses import KW_ONLY
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._check import as_bounds, check_count, check_number, check_positive, is_concrete
+from .._controller import wrong_observation
+from .._message import shortened
+from .._module import function_field, parameter, positive
+from .._results import Result
+from .._typing import Control, Difference, Observation, PRNGKey, RealOrNone, RealScalar
+from ..dynamics import AbstractDynamics
+from ..math._linear_solve import is_definite
+from ._base import AbstractEstimator, Belief
+from ._gaussian import check_dynamics, checked_model
+from ._random_walk import check_walks, RandomWalk, WithParameters
+from ._window import begun, Model, moved, solved, Window
+
+
+class MHE(AbstractEstimator):
+    r"""The states of a window of observations, and parameters, by least squares between
+    bounds: moving-horizon estimation. Of `x_{k+1} = F(t_k, x_k, u_k, w_k)`,
+    `w ~ N(0, W)`, and `y_k = h(t_k, x_k) + v_k`, `v ~ N(0, V)`, each `update` minimises
+
+    $$|x_0 - \bar x|^2_{P^{-1}} + \sum_{k < N-1} |w_k|^2_{W^{-1}}
+    + \sum_{k < N} 2 \rho(|y_k - h(t_k, x_k)|_{V^{-1}})$$
+
+    over the `N` stages of the window, the last of which is now. The prior
+    $(\bar x, P)$ of the window's first state is that of the extended Kalman filter
+    without the observations of the window, linearised where the window has its states:
+    no observation counts twice (the filtering update). On linear dynamics without
+    active bounds the estimate is that of the [`delucax.estimators.KalmanFilter`][], for
+    any window.
+
+    An update makes one Gauss-Newton step from the solution before, a step later (the
+    real-time iteration), or `iterations` steps whose length is searched. A step is a
+    pass of the Kalman filter over the window and one back. All covariances may be
+    singular: a known state, a constant parameter, a perfect sensor. Active bounds are
+    perfect observations, which more passes find.
+
+    The covariance of the estimate is that of the pass forwards, without the bounds.
+
+    It is differentiable with respect to the weights, the prior, the bounds and the
+    dynamics, in both modes: the steps are differentiated as they are made, with the
+    same bounds active. The derivative jumps where a bound becomes active, or a residual
+    crosses the threshold of `robust`. Under `jax.vmap` a batch makes as many passes as
+    the member that needs most.
+
+    **Arguments:**
+
+    - `dynamics`: any dynamics; their `observe` is the sensor h.
+    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
+        symmetric, semidefinite.
+    - `V`: covariance of the sensor noise, shape `(p, p)`, likewise.
+    - `window`: how many observations it holds, at least 1.
+    - `mean`: of the first state, shape `(n,)`; zero by default.
+    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
+        semidefinite; the identity by default.
+    - `bounds`: of the states, a pair `(low, high)` of numbers or vectors of shape
+        `(n,)`, which may be infinite; none by default.
+    - `disturbance_bounds`: likewise of `w`, of shape `(k,)`.
+    - `parameters`: a dictionary from paths in the dynamics to
+        [`delucax.estimators.RandomWalk`][]: `{"system.length": RandomWalk(0.1)}`. None
+        by default.
+    - `robust`: the residual, in standard deviations, from which on $\rho$ is linear
+        (Huber's penalty), for outliers; 1.5 to 3 are usual. By default
+        $\rho(r) = r^2 / 2$. Needs a definite `V`.
+    - `iterations`: how many steps an update makes, 1 by default.
+    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
+        among the observations; subtraction by default.
+
+    An observation that is not finite is left out, and so is a step that is not called
+    with one. `status` is `diverged` at an observation or a solution that is not finite
+    (the window then keeps the estimate before), `no_feasible_point` if the bounds
+    cannot all hold, and `not_converged` if the active bounds were not found or, with
+    more than one step, if more of them would change the estimate.
+
+    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one,
+    sizes do not fit, bounds are not numbers with `low <= high`, a parameter has no
+    finite number in the dynamics to start from, or a number is out of its range.
+
+    Source: Rao, Rawlings and Mayne, 2003; Haseltine and Rawlings, 2005; Kühl et al.,
+    2011 (the prior); Diehl et al., 2005 (one step each); Huber, 1964.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import equinox as eqx
+        import jax.numpy as jnp
+
+        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
+        mhe = dlx.estimators.MHE(pendulum, W, V, 10, bounds=([-1.0, -5.0], [1.0, 5.0]))
+        state = mhe.init()
+        for k in range(3):
+            state = eqx.filter_jit(mhe.update)(0.05 * k, jnp.array([0.1, 0.0]), state)
+            mean, covariance = mhe.estimate(state)
+            state = eqx.filter_jit(mhe.predict)(0.05 * k, jnp.zeros(1), state)
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    W: Float[Array, "k k"] = parameter()
+    V: Float[Array, "p p"] = parameter()
+    window: int = eqx.field(static=True)
+    _: KW_ONLY
+    mean: Float[Array, " n"] = parameter(None)
+    covariance: Float[Array, "n n"] = parameter(None)
+    bounds: Any = None
+    disturbance_bounds: Any = None
+    parameters: dict[str, RandomWalk] = eqx.field(default_factory=dict)
+    robust: RealOrNone = parameter(None, constraint=positive)
+    iterations: int = eqx.field(default=1, static=True)
+    observation_difference: Difference | None = function_field(None)
+
+    def __post_init__(self):
+        where = "MHE"
+        check_dynamics(self.dynamics, where)
+        given = self.W, self.V, self.mean, self.covariance
+        self.W, self.V, self.mean, self.covariance = checked_model(
+            self.dynamics, *given, where
+        )
+        for name, size in (
+            ("bounds", self.dynamics.state_size),
+            ("disturbance_bounds", self.dynamics.disturbance_size),
+        ):
+            setattr(self, name, as_bounds(getattr(self, name), where, name, size))
+
+    def __check_init__(self):
+        where, dynamics = "MHE", self.dynamics
+        check_dynamics(dynamics, where)
+        given = self.W, self.V, self.mean, self.covariance
+        checked_model(dynamics, *given, where)
+        as_bounds(self.bounds, where, "bounds", dynamics.state_size)
+        size = dynamics.disturbance_size
+        as_bounds(self.disturbance_bounds, where, "disturbance_bounds", size)
+        check_walks(self.parameters, dynamics, where)
+        check_count(self.window, "window", where)
+        check_count(self.iterations, "iterations", where)
+        if self.robust is not None:
+            check_number(self.robust, "robust", where)
+            check_positive(self.robust, "robust", where)
+            if is_concrete(self.V) and not is_definite(self.V):
+                raise ValueError(
+                    f"{where}: V must be positive definite with robust, because a "
+                    f"perfect sensor has no outliers, got {shortened(self.V)}."
+                )
+
+    def _model(self) -> tuple[Model, Belief]:
+        """The model with the parameters as states, and what is known of the first."""
+        dynamics, W, P, mean = self.dynamics, self.W, self.covariance, self.mean
+        states, noise, dtype = self.bounds, self.disturbance_bounds, mean.dtype
+        if walks := tuple(self.parameters.values()):
+            wide = WithParameters(dynamics, tuple(self.parameters))
+            sizes = [value.size for value in wide.values(wide.start).values()]
+
+            def joined(entries):
+                pairs = zip(entries, sizes, strict=True)
+                whole = [jnp.broadcast_to(a, (size,)) for a, size in pairs]
+                return jnp.concatenate(whole).astype(dtype)
+
+            W = _block(W, joined([walk.step for walk in walks]))
+            P = _block(P, joined([walk.variance for walk in walks]))
+            mean = jnp.concatenate([mean, wide.start.astype(dtype)])
+            ends = [walk.bounds or (-jnp.inf, jnp.inf) for walk in walks]
+            if states is not None or any(walk.bounds for walk in walks):
+                states = _beside(
+                    states, self.mean, map(joined, zip(*ends, strict=True))
+                )
+            if noise is not None:
+                free = jnp.full(sum(sizes), jnp.inf, dtype)
+                noise = _beside(noise, self.W[0], (-free, free))
+            dynamics = wide
+        weights = W.astype(dtype), self.V.astype(dtype)
+        options: Any = states, noise, self.robust, self.observation_difference
+        return Model(dynamics, *weights, *options), Belief(mean, P)
+
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
+        del key
+        model, prior = self._model()
+        pairs = (model.states, len(prior.mean)), (model.disturbances, len(model.W))
+        bounded = sum(size for pair, size in pairs if pair is not None)
+        return begun(model, prior, self.window, bounded)
+
+    def update(self, t: RealScalar, y: Observation, state: Window) -> PyTree:
+        if y.shape != self.V.shape[:1]:
+            raise wrong_observation(self, self.V.shape[0], y)
+        model, _ = self._model()
+        is_seen = jnp.all(jnp.isfinite(y))
+        window = state._replace(
+            t=state.t.at[-1].set(t),
+            y=state.y.at[-1].set(jnp.where(is_seen, y, 0).astype(state.y.dtype)),
+            is_seen=state.is_seen.at[-1].set(is_seen),
+        )
+        return solved(model, window, self.iterations)
+
+    def predict(self, t: RealScalar, u: Control, state: Window) -> PyTree:
+        model, _ = self._model()
+        return moved(model, t, u.astype(state.u.dtype), state)
+
+    def estimate(self, state: Window) -> Belief:
+        """The mean and covariance of the state now.
+
+        **Arguments:** `state`: the estimator's state.
+
+        **Returns:** a [`delucax.estimators.Belief`][], without the parameters.
+        """
+        n = self.dynamics.state_size
+        return Belief(state.belief.mean[:n], state.belief.covariance[:n, :n])
+
+    def estimated_parameters(self, state: Window) -> dict[str, Belief]:
+        """The mean and covariance of each parameter now.
+
+        **Arguments:** `state`: the estimator's state.
+
+        **Returns:** a dictionary from paths to a [`delucax.estimators.Belief`][] of the
+        parameter's entries, one after the other.
+        """
+        wide = WithParameters(self.dynamics, tuple(self.parameters))
+        at, out = self.dynamics.state_size, {}
+        for path, value in wide.values(state.belief.mean[at:]).items():
+            here = slice(at, at + value.size)
+            covariance = state.belief.covariance[here, here]
+            out[path] = Belief(jnp.ravel(value), covariance)
+            at += value.size
+        return out
+
+    def status(self, state: Window) -> Result:
+        return state.result
+
+
+def _block(matrix: Array, variances: Array) -> Array:
+    """A covariance with independent entries after its own."""
+    rest = jnp.zeros((len(matrix), len(variances)), matrix.dtype)
+    return jnp.block([[matrix, rest], [rest.T, jnp.diag(variances)]])
+
+
+def _beside(bounds: Any, like: Array, more: Any) -> tuple[Array, Array]:
+    """Bounds of the entries of `like`, then others."""
+    own = (-jnp.inf, jnp.inf) if bounds is None else bounds
+    pairs = zip(own, more, strict=True)
+    wide = (jnp.concatenate([jnp.broadcast_to(a, like.shape), b]) for a, b in pairs)
+    low, high = (a.astype(like.dtype) for a in wide)
+    return low, high

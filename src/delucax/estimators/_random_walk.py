@@ -1,0 +1,155 @@
+"""Parameters that are estimated with the state, as random walks."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import bounds_field, check_finite, check_range
+from .._message import shortened
+from .._module import get_path, parameter
+from .._results import Result
+from .._typing import Real, RealScalar
+from ..dynamics import AbstractDynamics, AbstractWrapper
+
+
+class RandomWalk(eqx.Module):
+    r"""What is known of a parameter that [`delucax.estimators.MHE`][] estimates:
+
+    `theta_0 ~ N(start, variance)`, `theta_{k+1} = theta_k + N(0, step)`, between
+    bounds. It starts from the value that it has in the dynamics.
+
+    **Arguments:**
+
+    - `variance`: of the first value, a number or one for each entry of the parameter.
+        Zero is a value that is known at first.
+    - `step`: the variance of the change in a step, likewise; zero, a constant, by
+        default.
+    - `bounds`: a pair `(low, high)` of numbers or vectors; none by default.
+
+    **Raises:** `ValueError` if a variance is negative or not finite, or bounds are not
+    a pair with `low <= high`.
+
+    Source: Rawlings, Mayne and Diehl, 2017, chapter 4.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        length = dlx.estimators.RandomWalk(0.1, step=1e-5, bounds=(0.1, 5.0))
+        mhe = dlx.estimators.MHE(
+            pendulum,
+            1e-4 * jnp.eye(2),
+            1e-2 * jnp.eye(2),
+            10,
+            parameters={"system.length": length},
+        )
+        mhe.estimated_parameters(mhe.init())
+        ```
+    """
+
+    variance: Real = parameter()
+    step: Real = parameter(0.0)
+    bounds: tuple[Array, Array] | None = bounds_field("RandomWalk", default=None)
+
+    def __check_init__(self):
+        where = "RandomWalk"
+        for name in ("variance", "step"):
+            check_range(getattr(self, name), name, where)
+            check_finite(getattr(self, name), name, where)
+
+
+class WithParameters(AbstractWrapper):
+    """Dynamics whose last states are parameters at paths in them."""
+
+    dynamics: AbstractDynamics
+    paths: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def _values(self) -> list[Array]:
+        return [get_path(self.dynamics, path) for path in self.paths]
+
+    @property
+    def start(self) -> Array:
+        """The values in the dynamics, one after the other."""
+        return jnp.concatenate([jnp.ravel(value) for value in self._values])
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        more = (f"parameter[{i}]" for i in range(sum(a.size for a in self._values)))
+        return (*self.dynamics.state_names, *more)
+
+    @property
+    def disturbance_size(self) -> int:
+        own = self.state_size - self.dynamics.state_size
+        return self.dynamics.disturbance_size + own
+
+    def values(self, flat: Array) -> dict[str, Array]:
+        """The parameters by their paths."""
+        out, at = {}, 0
+        for path, value in zip(self.paths, self._values, strict=True):
+            out[path] = flat[at : at + value.size].reshape(value.shape)
+            at += value.size
+        return out
+
+    def _opened(self, x: Array) -> tuple[AbstractDynamics, Array, Array]:
+        """The dynamics with these parameters, the plant's own state, and they."""
+        n = self.dynamics.state_size
+        values = list(self.values(x[n:]).values())
+        at = lambda dynamics: [get_path(dynamics, path) for path in self.paths]
+        return eqx.tree_at(at, self.dynamics, values), x[:n], x[n:]
+
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
+        dynamics, own, flat = self._opened(x)
+        k = self.dynamics.disturbance_size
+        held = None if w is None else w[:k]
+        after, result = dynamics.advance(t, own, u, held)
+        return jnp.concatenate([after, flat if w is None else flat + w[k:]]), result
+
+    def observe(self, t: RealScalar, x: Array) -> Array:
+        dynamics, own, _ = self._opened(x)
+        return dynamics.observe(t, own)
+
+    def difference(self, x: Array, x_ref: Array) -> Array:
+        n = self.dynamics.state_size
+        own = self.dynamics.difference(x[:n], x_ref[:n])
+        return jnp.concatenate([own, x[n:] - x_ref[n:]])
+
+
+def check_walks(parameters: Any, dynamics: AbstractDynamics, where: str) -> None:
+    """Raise unless these are random walks of numbers in the dynamics."""
+    if not isinstance(parameters, dict) or not all(
+        isinstance(walk, RandomWalk) for walk in parameters.values()
+    ):
+        raise ValueError(
+            f"{where}: parameters must be a dictionary from paths to RandomWalk, got "
+            f"{shortened(parameters)}."
+        )
+    for path, walk in parameters.items():
+        try:
+            value = get_path(dynamics, path)
+        except ValueError as error:
+            raise ValueError(f"{where}: parameters: {error}") from error
+        if not eqx.is_inexact_array(value):
+            raise ValueError(
+                f"{where}: parameters names {path!r}, which must have a number in the "
+                f"dynamics to start from, got {shortened(value)}."
+            )
+        name = f"parameters[{path!r}]"
+        check_finite(value, f"{name} (to start from)", where)
+        for what, array in (
+            ("variance", walk.variance),
+            ("step", walk.step),
+            *(("bounds", end) for end in walk.bounds or ()),
+        ):
+            if array.shape not in ((), (value.size,)):
+                raise ValueError(
+                    f"{where}: {what} of {name} must be a number or have shape "
+                    f"({value.size},), got shape {array.shape}."
+                )

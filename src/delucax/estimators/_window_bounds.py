@@ -1,0 +1,226 @@
+"""A linear window between bounds, by guesses of the active ones.
+
+An active bound is an observation without noise, so that a guess costs one pass of the
+smoother. Its multipliers and violations give the next guess. If guesses do not end, an
+interior-point method finds the active bounds: to it a bound is an observation whose
+noise falls.
+
+Source: Hintermueller, Ito and Kunisch, 2002 (guesses); Mehrotra, 1992.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from .._results import choose, Result, RESULTS
+from .._typing import Array
+from ._base import Belief
+from ._window_smoother import Rows, Smoothed, smoothed, Steps
+
+
+_GUESSES = 10
+"""So many sets are tried in turn, as long as fewer bounds are wrong now and then."""
+_PATIENCE = 3
+_BARRIERS = 50
+"""So many interior-point steps at most."""
+_TO_BOUNDARY = 0.99
+
+
+class Limits(NamedTuple):
+    """The bounds of the entries of `(d, w)`, shape `(N, q)`, infinite where there are
+    none, and which entries these are."""
+
+    low: Array
+    high: Array
+    entries: tuple[int, ...]
+
+
+class Bounded(NamedTuple):
+    """The solution between bounds."""
+
+    solution: Smoothed
+    free: Smoothed  # without bounds
+    sides: Array  # (N, q): 1 at the upper bound, -1 at the lower one
+    result: Result
+
+
+class _Problem(NamedTuple):
+    """The window, its bounds, and their scale."""
+
+    steps: Steps
+    rows: Rows
+    start: Belief
+    W: Array
+    low: Array
+    high: Array
+    units: Array  # (q, n) or (q, n + k), the rows of the bounded entries
+    width: Array  # (N, q), the standard deviation without bounds
+
+    def bounded(self, on: Array, variance: Array, target: Array) -> Smoothed:
+        """The solution with observations of the bounded entries."""
+        c = jnp.where(on[:, :, None], self.units, 0)
+        more = Rows(c, variance, jnp.where(on, target, 0))
+        return smoothed(self.steps, self.rows.beside(more), self.start, self.W)
+
+    @property
+    def give(self) -> Array:
+        """The variance of a bound that is held. Bounds of one quantity at many stages
+        are dependent, so that each gives a little."""
+        return 1e3 * float(jnp.finfo(self.W.dtype).eps) * self.width**2
+
+    def held(self, sides: Array) -> Smoothed:
+        """The solution with these bounds active."""
+        target = jnp.where(sides > 0, self.high, self.low)
+        return self.bounded(sides != 0, self.give, target)
+
+    def at(self, solution: Smoothed) -> Array:
+        """The bounded entries."""
+        z = jnp.concatenate([solution.d, solution.zeta @ self.W], axis=1)
+        return z[:, : self.units.shape[1]] @ self.units.T
+
+    def multipliers(self, solution: Smoothed) -> Array:
+        """The multipliers of the bounds."""
+        return solution.u[:, self.rows.c.shape[1] :]
+
+
+def smoothed_between(
+    steps: Steps, rows: Rows, limits: Limits, start: Belief, W: Array, guess: Array
+) -> Bounded:
+    """The solution of the window between bounds. The derivative is that with the same
+    bounds active."""
+    low, high, entries = limits
+    eps, n = float(jnp.finfo(W.dtype).eps), steps.A.shape[1]
+    free = smoothed(steps, rows, start, W)
+    own = jnp.broadcast_to(jnp.diagonal(W), (len(low), len(W)))
+    at = jnp.array(entries)
+    variances = jnp.concatenate([free.variances, own], axis=1)[:, at]
+    width = jnp.sqrt(lax.stop_gradient(variances))
+    size = n if max(entries) < n else n + len(W)
+    units = jnp.eye(size, dtype=W.dtype)[at]
+    problem = _Problem(steps, rows, start, W, low, high, units, width)
+    constant = lax.stop_gradient(problem)
+    none = jnp.zeros(low.shape, int)
+    first, _ = _corrected(constant, lax.stop_gradient(free), none, jnp.zeros_like(low))
+    is_needed = jnp.any(first != none)
+    begin = jnp.where(is_needed, guess, none)
+    sides, done = _guessed(constant, begin, ~is_needed)
+
+    def barrier(sides):
+        del sides
+        return _guessed(constant, _by_barrier(constant, free), jnp.asarray(False))
+
+    sides, done = lax.cond(done, lambda s: (s, jnp.asarray(True)), barrier, sides)
+
+    def unheld(problem, sides):
+        pad = (0, 0), (0, sides.shape[1])
+        return free._replace(u=jnp.pad(free.u, pad))
+
+    held = lambda problem, sides: problem.held(sides)
+    solution = lax.cond(is_needed, held, unheld, problem, sides)
+    z = problem.at(lax.stop_gradient(solution))
+    sizes = (jnp.where(jnp.isfinite(a), jnp.abs(a), 0) for a in (low, high))
+    slack = eps**0.4 * (width + jnp.maximum(*sizes))
+    kept = jnp.all((z <= high + slack) & (z >= low - slack))
+    result = choose(kept, RESULTS.not_converged, RESULTS.no_feasible_point)
+    result = choose(done & kept, RESULTS.successful, result)
+    return Bounded(solution, free, sides, result)
+
+
+def _corrected(problem: _Problem, solution: Smoothed, sides: Array, u: Array):
+    """The next guess after the solution of one, and how many bounds it changes."""
+    z, width = problem.at(solution), problem.width
+    near = float(jnp.finfo(z.dtype).eps) ** 0.6
+    # What does not vary cannot be moved by its bounds.
+    off = (sides == 0) & (width > 0)
+    to_high = off & (z - problem.high > near * width)
+    to_low = off & (problem.low - z > near * width)
+    # An upper bound pulls down: the multiplier of its equation is negative.
+    leaves = (u * sides * width > near) & (problem.low < problem.high)
+    after = jnp.where(leaves, 0, sides)
+    after = jnp.where(to_high, 1, jnp.where(to_low, -1, after))
+    return after, jnp.sum(after != sides)
+
+
+def _guessed(problem: _Problem, sides: Array, done: Array) -> tuple[Array, Array]:
+    """The active bounds by guesses, and whether they ended."""
+
+    def body(carry):
+        sides, best, patience, k, _ = carry
+        solution = problem.held(sides)
+        u = problem.multipliers(solution)
+        after, count = _corrected(problem, solution, sides, u)
+        patience = jnp.where(count < best, _PATIENCE, patience - 1)
+        return after, jnp.minimum(count, best), patience, k + 1, count == 0
+
+    def going(carry):
+        _, _, patience, k, done = carry
+        return ~done & (k < _GUESSES) & (patience > 0)
+
+    counts = (jnp.asarray(count) for count in (sides.size + 1, _PATIENCE, 0))
+    sides, _, _, _, done = lax.while_loop(going, body, (sides, *counts, done))
+    return sides, done
+
+
+def _by_barrier(problem: _Problem, free: Smoothed) -> Array:
+    """The active bounds by an interior-point method, upper sides before lower ones."""
+    both = lambda a: jnp.stack([a, -a])
+    width, dtype = problem.width, problem.W.dtype
+    h = jnp.stack([problem.high, -problem.low])
+    fixed = problem.low == problem.high
+    on = jnp.isfinite(h) & (width > 0) & ~fixed
+    h = jnp.where(on, h, 0)
+    unit = jnp.where(width > 0, width, 1)
+    count = jnp.sum(on) + 1
+    end = float(jnp.finfo(dtype).eps) ** 0.6
+    mean = lambda s, z: jnp.sum(jnp.where(on, s * z, 0)) / count
+
+    def turn(carry, s, z, mu):
+        """The step with or, at first, without a correction of second order."""
+        ds, dz, aim = carry
+        push = (aim - jnp.where(aim > 0, ds * dz, 0)) / s
+        rate = jnp.where(on, z / s, 0)
+        weight = jnp.sum(rate, axis=0)
+        pulled = jnp.where(on, rate * h - z - push, 0)
+        target = (pulled[0] - pulled[1]) / jnp.where(weight > 0, weight, 1)
+        variance = 1 / jnp.where(weight > 0, weight, 1)
+        variance = jnp.where(fixed, problem.give, variance)
+        target = jnp.where(fixed, problem.high, target)
+        solution = problem.bounded((weight > 0) | fixed, variance, target)
+        s_new = h - both(problem.at(solution))
+        ds, dz = s_new - s, push - rate * s_new
+        length = _length(jnp.where(on, s, 1), jnp.where(on, ds, 0))
+        length = jnp.minimum(length, _length(jnp.where(on, z, 1), jnp.where(on, dz, 0)))
+        left = mean(s + length * ds, z + length * dz)
+        return (ds, dz, mu * (left / mu) ** 3), length
+
+    def body(carry):
+        s, z, gap, k = carry
+        mu = mean(s, z)
+        zero = jnp.zeros_like(s), jnp.zeros_like(z), jnp.zeros((), dtype)
+
+        def twice(_, carry):
+            return turn(carry[0], s, z, mu)
+
+        (ds, dz, _), length = lax.fori_loop(0, 2, twice, (zero, jnp.zeros((), dtype)))
+        length = jnp.minimum(_TO_BOUNDARY * length, 1)
+        s = jnp.where(on, s + length * ds, 1)
+        z = jnp.where(on, z + length * dz, 1)
+        return s, z, (1 - length) * gap, k + 1
+
+    def going(carry):
+        s, z, gap, k = carry
+        return ((mean(s, z) > end) | (gap > end)) & (k < _BARRIERS)
+
+    s = jnp.maximum(h - both(problem.at(free)), unit)
+    s = jnp.where(on, s, 1)
+    start = s, jnp.where(on, 1 / s, 1), jnp.ones((), dtype), jnp.asarray(0)
+    s, z, *_ = lax.while_loop(going, body, start)
+    active = on & (z * unit > s / unit)
+    sides = jnp.where(active[0], 1, jnp.where(active[1], -1, 0))
+    return jnp.where(fixed, 1, sides)
+
+
+def _length(a: Array, da: Array) -> Array:
+    """The largest step, at most 1, that keeps `a` from below 0."""
+    return 1 / jnp.maximum(jnp.max(-da / a, initial=0), 1)
