@@ -83,6 +83,10 @@ def estimated(kind, size):
     return c.OutputFeedback(c.PID(size, 2.0, dt=DT, output=[[1.0, 0.1]]), filtered)
 
 
+def moving(*given, **options):
+    return dlx.estimators.MHE(*given, 3, robust=0.5, **options)
+
+
 def mlp(size, in_size=2, features=None):
     key = jax.random.key(int(10 * size))
     options = dict(features=features, bounds=(-2.0 * size, 2.0), key=key)
@@ -199,6 +203,7 @@ CASES = {
     "OutputFeedback of an unscented filter": Case(
         lambda size: estimated(dlx.estimators.UnscentedKalmanFilter, size)
     ),
+    "OutputFeedback of a moving horizon": Case(lambda size: estimated(moving, size)),
     "HInfinity": Case(hinfinity),
     "HInfinity over a horizon": Case(lambda size: hinfinity(size, horizon=8)),
     "PID": Case(lambda size: c.PID(size, 2 * size, 0.3, dt=DT, output=[[1.0, 0.1]])),

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from helpers import assert_close, once
 
 import delucax as dlx
@@ -37,6 +38,33 @@ def test_a_window_in_a_closed_loop(key):
     y = jnp.concatenate([jnp.zeros((2, 2)), run.observations])
     for k in range(4):
         assert_close(run.controls[k], -K @ jnp.mean(y[k : k + 3], axis=0), rtol=1e-5)
+
+
+def test_a_moving_horizon_in_a_closed_loop(key):
+    """A batch, with noise and bounds."""
+    env = dlx.make("pendulum")
+    env = dlx.replace(env, {"sensor_noise": dlx.disturbances.Gaussian(0.1, size=2)})
+    regulator = dlx.controllers.LQR(dlx.linearize(env.dynamics), np.eye(2), np.eye(1))
+    weights = 1e-6 * np.eye(2), 1e-2 * np.eye(2)
+    mhe = dlx.estimators.MHE(
+        env.dynamics,
+        *weights,
+        5,
+        covariance=0.1 * np.eye(2),
+        bounds=([-0.3, -1.0], [0.3, 1.0]),
+        observation_difference=env.dynamics.difference,
+    )
+    controller = dlx.controllers.OutputFeedback(regulator, mhe)
+
+    @jax.jit
+    @jax.vmap
+    def run(key):
+        found = dlx.rollout(env, controller, key=key, x0=[0.2, 0.0], horizon=60)
+        failed = found.incidents["failed_estimate"].sum()
+        return found.states[-1], failed
+
+    states, failed = run(jax.random.split(key, 3))
+    assert np.max(np.abs(states)) < 0.1 and np.sum(failed) == 0
 
 
 class Doubtful(Window):

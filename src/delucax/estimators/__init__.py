@@ -8,4 +8,5 @@ from ._kalman import (
 )
 from ._mhe import MHE as MHE
 from ._random_walk import RandomWalk as RandomWalk
+from ._record import run_estimator as run_estimator
 from ._smoother import run_filter as run_filter, smooth as smooth

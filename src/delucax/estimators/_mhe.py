@@ -11,7 +11,7 @@ from .._check import as_bounds, check_count, check_number, check_positive, is_co
 from .._controller import wrong_observation
 from .._message import shortened
 from .._module import function_field, parameter, positive
-from .._results import Result
+from .._results import choose, Result, RESULTS
 from .._typing import Control, Difference, Observation, PRNGKey, RealOrNone, RealScalar
 from ..dynamics import AbstractDynamics
 from ..math._linear_solve import is_definite
@@ -197,7 +197,9 @@ class MHE(AbstractEstimator):
             y=state.y.at[-1].set(jnp.where(is_seen, y, 0).astype(state.y.dtype)),
             is_seen=state.is_seen.at[-1].set(is_seen),
         )
-        return solved(model, window, self.iterations)
+        after = solved(model, window, self.iterations)
+        result = choose(is_seen, after.result, RESULTS.diverged)
+        return after._replace(result=result)
 
     def predict(self, t: RealScalar, u: Control, state: Window) -> PyTree:
         model, _ = self._model()

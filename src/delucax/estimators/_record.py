@@ -1,0 +1,118 @@
+"""Any estimator along a whole record."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._check import as_rows, check_at_most, check_finite, check_instance, check_number
+from .._module import as_float_array
+from .._results import first_of, raise_on_failure, Result, RESULTS
+from ..dynamics import AbstractDynamics
+from ._base import AbstractEstimator, Belief
+from ._mhe import MHE
+
+
+class Estimated(eqx.Module):
+    """The result of `run_estimator`."""
+
+    predicted: Belief
+    updated: Belief
+    states: PyTree
+    results: Result
+    result: Result
+
+    def _facts(self) -> str:
+        failed = np.asarray(self.results != RESULTS.successful)
+        return f"At observation {failed.argmax()}." if failed.ndim == 1 else ""
+
+
+def run_estimator(
+    estimator: AbstractEstimator,
+    observations: Any,
+    controls: Any = None,
+    *,
+    t0: Any = 0.0,
+    throw: bool = True,
+) -> Estimated:
+    """Run any estimator over a record.
+
+    At each step k, with `t_k = t0 + k dt`: `update` with `y_k`, then `predict` with
+    `u_k`. Of a Kalman filter [`delucax.estimators.run_filter`][] also computes the
+    likelihood.
+
+    **Arguments:**
+
+    - `estimator`: a [`delucax.estimators.AbstractEstimator`][] with a field `dynamics`,
+        such as [`delucax.estimators.MHE`][].
+    - `observations`: shape `(T, p)`; `trajectory.observations`, for example. The window
+        of a moving-horizon estimator holds at most T.
+    - `controls`: those that were applied, shape `(T, m)`; zero by default.
+    - `t0`: the time of the first observation, 0 by default.
+    - `throw`: raise if the `status` of an update is no success (default); if false,
+        look at `result`.
+
+    **Returns:** an object with
+
+    - `predicted`: the belief of each state before it is observed, and at the end that
+        of the state after the last control: a [`delucax.estimators.Belief`][] with a
+        leading axis of `T + 1`;
+    - `updated`: the belief once it is observed, with a leading axis of `T`;
+    - `states`: those of the estimator after each update, with a leading axis of `T`;
+    - `results`: the status of each update; and `result`, the first that is no success.
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
+    finite, or a window longer than the record; an error at run time as `throw` says.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
+        y = jnp.sin(jnp.arange(20.0))[:, None]
+        mhe = dlx.estimators.MHE(dynamics, jnp.eye(1), jnp.eye(1), 5, bounds=(0.0, 1.0))
+        dlx.estimators.run_estimator(mhe, y).updated.mean
+        ```
+    """
+    where = "run_estimator"
+    check_instance(estimator, AbstractEstimator, "estimator", where, "")
+    dynamics: Any = getattr(estimator, "dynamics", None)
+    check_instance(dynamics, AbstractDynamics, "dynamics of estimator", where)
+    y = as_rows(observations, dynamics.observation_size, "observations", where)
+    check_finite(y, "observations", where)
+    u = jnp.zeros((len(y), dynamics.control_size), y.dtype)
+    if controls is not None:
+        u = as_rows(controls, dynamics.control_size, "controls", where, len(y))
+    check_finite(u, "controls", where)
+    check_number(t0, "t0", where)
+    if isinstance(estimator, MHE):
+        of = "observations of the record"
+        check_at_most(estimator.window, len(y), "window", where, of)
+    times = as_float_array(t0) + jnp.arange(len(y)) * dynamics.dt
+    run = _run(estimator, y, u, times.astype(y.dtype))
+    return raise_on_failure(run, where, throw, "the estimates", run._facts)
+
+
+@eqx.filter_jit
+def _run(estimator: Any, y: Array, u: Array, times: Array) -> Estimated:
+    first = estimator.init()
+
+    def step(state, inputs):
+        t, y, u = inputs
+        after = estimator.update(t, y, state)
+        moved = estimator.predict(t, u, after)
+        beliefs = estimator.estimate(after), estimator.estimate(moved)
+        return moved, (*beliefs, after, estimator.status(after))
+
+    _, (updated, moved, states, results) = lax.scan(step, first, (times, y, u))
+    joined = (
+        jnp.concatenate([a[None].astype(b.dtype), b])
+        for a, b in zip(estimator.estimate(first), moved, strict=True)
+    )
+    return Estimated(Belief(*joined), updated, states, results, first_of(results))
