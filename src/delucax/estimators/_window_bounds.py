@@ -120,7 +120,7 @@ def smoothed_between(
     solution = lax.cond(is_needed, held, unheld, problem, sides)
     z = problem.at(lax.stop_gradient(solution))
     sizes = (jnp.where(jnp.isfinite(a), jnp.abs(a), 0) for a in (low, high))
-    slack = eps**0.4 * (width + jnp.maximum(*sizes))
+    slack = jnp.sqrt(problem.give) + eps**0.4 * jnp.maximum(*sizes)
     kept = jnp.all((z <= high + slack) & (z >= low - slack))
     result = choose(kept, RESULTS.not_converged, RESULTS.no_feasible_point)
     result = choose(done & kept, RESULTS.successful, result)
