@@ -113,6 +113,38 @@ def test_a_step_without_an_observation():
 
 
 @needs_x64
+def test_the_trajectory_is_that_of_the_smoother():
+    """Once the window has the whole record; before, its first stages are not there."""
+    T = 12
+    dynamics, noise, P, ys, us = linear_case(0, 2)
+    mhe = c.MHE(dynamics, *noise, T, covariance=P)
+    found = c.run_estimator(mhe, ys[:T], us[:T])
+    x, w = jax.jit(jax.vmap(mhe.trajectory))(found.states)
+    kalman = c.KalmanFilter(dynamics, *noise, mean=np.zeros(4), covariance=P)
+    assert_close(x[-1], c.smooth(kalman, ys[:T], us[:T]).mean, atol=1e-9)
+    step = x[-1, :-1] @ dynamics.A.T + us[: T - 1] @ dynamics.B.T + w[-1] @ dynamics.E.T
+    assert_close(x[-1, 1:], step, atol=1e-9)
+    assert np.isnan(x[4, : T - 5]).all() and np.isnan(w[4, : T - 5]).all()
+    assert_close(x[4, T - 5 :], c.smooth(kalman, ys[:5], us[:5]).mean, atol=1e-9)
+    assert np.isfinite(w[4, T - 5 :]).all()
+
+
+@needs_x64
+def test_many_sensors():
+    """More than are written out, with noise that is correlated."""
+    p, rng = 14, np.random.default_rng(0)
+    dynamics = dlx.LinearDynamics(
+        [[0.9, 0.2], [0.0, 0.8]], [[0.0], [1.0]], rng.normal(size=(p, 2))
+    )
+    root = rng.normal(size=(p, p))
+    noise, ys = (0.1 * np.eye(2), root @ root.T), rng.normal(size=(6, p))
+    found = c.run_estimator(c.MHE(dynamics, *noise, 3), ys).updated
+    expected = c.run_filter(c.KalmanFilter(dynamics, *noise), ys).updated
+    assert_close(found.mean, expected.mean, atol=1e-9)
+    assert_close(found.covariance, expected.covariance, atol=1e-9)
+
+
+@needs_x64
 def test_the_extended_filter_fails_and_this_does_not():
     """From a poor guess of the gas-phase reactor (Haseltine and Rawlings, 2005)."""
     states, ys = reacting(100)

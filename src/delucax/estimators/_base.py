@@ -49,14 +49,14 @@ class AbstractEstimator(eqx.Module):
     Whatever the estimator carries from step to step is its state, a pytree of arrays.
     `estimate` computes a belief from it, and `status` the status of the last step.
     [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop. On a
-    record [`delucax.estimators.run_filter`][] makes them, of the Kalman filters alone,
-    whose log-likelihood it also computes.
+    record [`delucax.estimators.run_estimator`][] makes them, and of the Kalman filters
+    [`delucax.estimators.run_filter`][], which also computes their log-likelihood.
 
     To write an estimator, subclass this and give `init`, `update` and `predict`. The
     state of a filter is a [`delucax.estimators.Belief`][], and needs no other methods.
-    One that carries something else also gives `estimate`: a moving-horizon estimator,
-    say, carries the observations and controls of its window and the last solution. One
-    that solves a problem gives `status`.
+    One that carries something else also gives `estimate`: a
+    [`delucax.estimators.MHE`][] carries the observations and controls of its window and
+    the last solution. One that solves a problem gives `status`.
 
     !!! example
 

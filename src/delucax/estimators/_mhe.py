@@ -232,6 +232,22 @@ class MHE(AbstractEstimator):
             at += value.size
         return out
 
+    def trajectory(self, state: Window) -> tuple[Array, Array]:
+        """The states of the window, given all of its observations, and the disturbances
+        of its steps.
+
+        **Arguments:** `state`: the estimator's state.
+
+        **Returns:** `(states, disturbances)`, shapes `(N, n)` and `(N - 1, k)`, without
+        the parameters. The last ones are the newest; until the window is full, the
+        first ones are NaN.
+        """
+        model, _ = self._model()
+        there = state.is_there[:, None]
+        x = jnp.where(there, state.x, jnp.nan)[:, : self.dynamics.state_size]
+        w = jnp.where(there, state.zeta @ model.W, jnp.nan)[:-1]
+        return x, w[:, : self.dynamics.disturbance_size]
+
     def status(self, state: Window) -> Result:
         return state.result
 

@@ -18,6 +18,9 @@ from ..math._linear_solve import full_precision
 from ._base import Belief
 
 
+_WRITTEN_OUT = 12
+
+
 class Steps(NamedTuple):
     """The steps of a window; after the last stage the state stays."""
 
@@ -57,40 +60,47 @@ def independent(V: Array, *rows: Array) -> tuple[Array, ...]:
     what those before it say, and these rows; their number is the second axis."""
     # Elimination without exchanges. A row that says nothing new has variance 0.
     p, slack = len(V), len(V) * float(jnp.finfo(V.dtype).eps)
-    V_rows = list(V)
-    freed = [[array[:, i] for i in range(p)] for array in rows]
-    for i in range(p):
-        pivot = V_rows[i][i]
-        varies = pivot > slack * V[i, i]
-        pivot = jnp.where(varies, pivot, 1)
-        V_rows[i] = jnp.where(varies, V_rows[i], 0)
-        for j in range(i + 1, p):
-            factor = V_rows[j][i] * varies / pivot
-            V_rows[j] = V_rows[j] - factor * V_rows[i]
-            for entries in freed:
-                entries[j] = entries[j] - factor * entries[i]
-    variances = jnp.stack([row[i] for i, row in enumerate(V_rows)])
-    return variances, *(jnp.stack(entries, axis=1) for entries in freed)
+    own, freed = jnp.diagonal(V), list(rows)
+    for i in range(p - 1):
+        varies = V[i, i] > slack * own[i]
+        factor = V[:, i] / jnp.where(varies, V[i, i], 1)
+        factor = jnp.where(varies & (jnp.arange(p) > i), factor, 0)
+        V = V - factor[:, None] * V[i]
+        for k, a in enumerate(freed):
+            shares = factor.reshape(p, *(1,) * (a.ndim - 2))
+            freed[k] = a - shares * a[:, i : i + 1]
+    variances = jnp.diagonal(V)
+    return jnp.where(variances > slack * own, variances, 0), *freed
 
 
 def observed(m: Array, P: Array, rows: Rows) -> tuple[Array, Array, tuple]:
     """Mean and covariance once the rows of one stage are known, one after the other,
     with what the way back needs: of each row its gain, and its error over its variance.
     """
-    kept = []
-    for c, variance, target in zip(*rows, strict=True):
+
+    def known(carry, row):
+        m, P = carry
+        c, variance, target = row
         Pc = jnp.sum(P * c, axis=1)
         S = jnp.sum(c * Pc) + variance
-        unknown = S > 0
-        safe = jnp.where(unknown, S, 1)
+        safe = jnp.where(S > 0, S, 1)
         G = Pc / safe
-        error = jnp.where(unknown, target - jnp.sum(c * m), 0) / safe
+        error = jnp.where(S > 0, target - jnp.sum(c * m), 0) / safe
         m = m + Pc * error
         # (I - G c') P (I - G c')' + variance G G', as updates of rank one.
         P = P - G[:, None] * Pc
         P = P - jnp.sum(P * c, axis=1)[:, None] * G + variance * G[:, None] * G
-        kept.append((G, error))
-    return m, (P + P.T) / 2, tuple(jnp.stack(a) for a in zip(*kept, strict=True))
+        return (m, P), (G, error)
+
+    unroll = _unrolled(len(rows.c))
+    (m, P), kept = lax.scan(known, (m, P), tuple(rows), unroll=unroll)
+    return m, (P + P.T) / 2, kept
+
+
+def _unrolled(count: int) -> int:
+    """How many rows are written out: a loop in a loop is slow, many are a long
+    program."""
+    return count if count <= _WRITTEN_OUT else 1
 
 
 @full_precision
@@ -120,11 +130,16 @@ def smoothed(steps: Steps, rows: Rows, start: Belief, W: Array) -> Smoothed:
 
     def back(rho, here):
         A, c, (G, error) = here
-        rho, u = jnp.sum(A * rho[:, None], axis=0), []
-        for i in reversed(range(len(c))):
-            u.append(error[i] - jnp.sum(G[i] * rho))
-            rho = rho + c[i] * u[-1]
-        return rho[:n], (rho, jnp.stack(u[::-1]))
+
+        def known(rho, row):
+            c, G, error = row
+            u = error - jnp.sum(G * rho)
+            return rho + c * u, u
+
+        rho, given = jnp.sum(A * rho[:, None], axis=0), (c, G, error)
+        unroll = _unrolled(len(c))
+        rho, u = lax.scan(known, rho, given, reverse=True, unroll=unroll)
+        return rho[:n], (rho, u)
 
     zero = jnp.zeros(n, m.dtype)
     _, (rho, u) = lax.scan(back, zero, (A, rows.c, kept), reverse=True)
