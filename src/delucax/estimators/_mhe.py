@@ -76,8 +76,9 @@ class MHE(AbstractEstimator):
     An observation that is not finite is left out, and so is a step that is not called
     with one. `status` is `diverged` at an observation or a solution that is not finite
     (the window then keeps the estimate before), `no_feasible_point` if the bounds
-    cannot all hold, and `not_converged` if the active bounds were not found or, with
-    more than one step, if more of them would change the estimate.
+    cannot all hold, `inaccurate` if rounding keeps them from it, and `not_converged` if
+    the active bounds were not found or, with more than one step, if more of them would
+    change the estimate.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one,
     sizes do not fit, bounds are not numbers with `low <= high`, a parameter has no

@@ -25,6 +25,8 @@ _PATIENCE = 3
 _BARRIERS = 50
 """So many interior-point steps at most."""
 _TO_BOUNDARY = 0.99
+_LOOSE = 30
+"""A bound that is violated by more slacks than this cannot hold."""
 
 
 class Limits(NamedTuple):
@@ -67,7 +69,7 @@ class _Problem(NamedTuple):
     def give(self) -> Array:
         """The variance of a bound that is held. Bounds of one quantity at many stages
         are dependent, so that each gives a little."""
-        return 1e3 * float(jnp.finfo(self.W.dtype).eps) * self.width**2
+        return 30 * float(jnp.finfo(self.W.dtype).eps) * self.width**2
 
     def held(self, sides: Array) -> Smoothed:
         """The solution with these bounds active."""
@@ -90,7 +92,7 @@ def smoothed_between(
     """The solution of the window between bounds. The derivative is that with the same
     bounds active."""
     low, high, entries = limits
-    eps, n = float(jnp.finfo(W.dtype).eps), steps.A.shape[1]
+    n = steps.A.shape[1]
     free = smoothed(steps, rows, start, W)
     own = jnp.broadcast_to(jnp.diagonal(W), (len(low), len(W)))
     at = jnp.array(entries)
@@ -99,16 +101,16 @@ def smoothed_between(
     size = n if max(entries) < n else n + len(W)
     units = jnp.eye(size, dtype=W.dtype)[at]
     problem = _Problem(steps, rows, start, W, low, high, units, width)
-    constant = lax.stop_gradient(problem)
+    constant, fixed = lax.stop_gradient((problem, free))
     none = jnp.zeros(low.shape, int)
-    first, _ = _corrected(constant, lax.stop_gradient(free), none, jnp.zeros_like(low))
+    first, _ = _corrected(constant, fixed, none, jnp.zeros_like(low))
     is_needed = jnp.any(first != none)
     begin = jnp.where(is_needed, guess, none)
     sides, done = _guessed(constant, begin, ~is_needed)
 
     def barrier(sides):
         del sides
-        return _guessed(constant, _by_barrier(constant, free), jnp.asarray(False))
+        return _guessed(constant, _by_barrier(constant, fixed), jnp.asarray(False))
 
     sides, done = lax.cond(done, lambda s: (s, jnp.asarray(True)), barrier, sides)
 
@@ -118,13 +120,21 @@ def smoothed_between(
 
     held = lambda problem, sides: problem.held(sides)
     solution = lax.cond(is_needed, held, unheld, problem, sides)
-    z = problem.at(lax.stop_gradient(solution))
-    sizes = (jnp.where(jnp.isfinite(a), jnp.abs(a), 0) for a in (low, high))
-    slack = jnp.sqrt(problem.give) + eps**0.4 * jnp.maximum(*sizes)
-    kept = jnp.all((z <= high + slack) & (z >= low - slack))
-    result = choose(kept, RESULTS.not_converged, RESULTS.no_feasible_point)
-    result = choose(done & kept, RESULTS.successful, result)
+    result = _judged(constant, lax.stop_gradient(solution))
+    result = choose(done, result, RESULTS.not_converged)
     return Bounded(solution, free, sides, result)
+
+
+def _judged(problem: _Problem, solution: Smoothed) -> Result:
+    """Whether the bounds hold, up to rounding."""
+    z, info = problem.at(solution), jnp.finfo(problem.W.dtype)
+    ends = problem.low, problem.high
+    sizes = (jnp.where(jnp.isfinite(a), jnp.abs(a), 0) for a in ends)
+    slack = jnp.sqrt(problem.give) + float(info.eps) ** 0.4 * jnp.maximum(*sizes)
+    slack = jnp.maximum(slack, float(info.tiny) ** 0.5)
+    worst = jnp.max(jnp.maximum(z - problem.high, problem.low - z) / slack)
+    result = choose(worst <= 1, RESULTS.successful, RESULTS.inaccurate)
+    return choose(worst <= _LOOSE, result, RESULTS.no_feasible_point)
 
 
 def _corrected(problem: _Problem, solution: Smoothed, sides: Array, u: Array):
