@@ -113,11 +113,11 @@ class _Dynamics(AbstractDynamics):
 class _Cost(AbstractCost):
     carried: Carried
 
-    def __call__(self, t: RealScalar, x: Array, u: Array) -> Array:
+    def __call__(self, t: RealScalar, x: Array, u: Array) -> Any:
         parts, t, x = self.carried.opened(t, x)
         return parts["cost"](t, x, u)
 
-    def final(self, t: RealScalar, x: Array) -> Array:
+    def final(self, t: RealScalar, x: Array) -> Any:
         parts, t, x = self.carried.opened(t, x)
         return parts["cost"].final(t, x)
 
