@@ -160,9 +160,9 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
     own, at_own = (jnp.pad(a, ((0, 0), (first, N - last))) for a in (own, at_own))
     over = weights.variables + weights.controls * (jnp.arange(N) >= n)
     H = model.H + (own + over)[:, :, None] * eye
-    H = H + jnp.einsum("tpi,tp,tpj->tij", model.G, general, model.G)
-    h = model.h - own * at_own
-    h = h - jnp.einsum("tpi,tp->ti", model.G, general * at_general)
+    weighted = general[:, :, None] * model.G
+    H = H + jnp.sum(weighted[:, :, :, None] * model.G[:, :, None], axis=1)
+    h = model.h - own * at_own - jnp.sum(weighted * at_general[:, :, None], axis=1)
 
     def back(carry, here):
         P, s = carry

@@ -18,6 +18,7 @@ from .._check import (
 from .._module import parameter
 from .._typing import PRNGKey
 from ..qp import Soft
+from ..qp._solve import as_scalar
 from ._carried import with_carried
 from ._multipliers import Multipliers, zeros_like_result
 from ._plan import Plan
@@ -148,7 +149,7 @@ class SQP(AbstractPlanner):
         defaults = usual, usual / 10
         given = self.tolerance, self.constraint_tolerance
         tolerances = (
-            jnp.asarray(default if value is None else value, dtype)
+            as_scalar(default if value is None else value, dtype)
             for default, value in zip(defaults, given, strict=True)
         )
         options = Options(

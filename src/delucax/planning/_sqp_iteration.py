@@ -231,7 +231,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         qp = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
         dz = qp.x
         dx, du = dz[:, :n], dz[:-1, n:]
-        dp = qp.p - jnp.einsum("tij,tj->ti", convex.P, dx) - convex.s
+        dp = qp.p - jnp.sum(convex.P * dx[:, None], axis=2) - convex.s
         usable = jnp.all(jnp.isfinite(dz)) & (qp.errors[0] <= 1e3)
         impossible = ~usable & ~before.elastic
         # The width of the funnel, and by how much the cost should fall.
@@ -241,7 +241,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         change = jnp.concatenate(
             [
                 dz[:, limits.bounded[0] : limits.bounded[1]],
-                jnp.einsum("tpi,ti->tp", model.G, dz),
+                jnp.sum(model.G * dz[:, None], axis=2),
             ],
             axis=1,
         )

@@ -78,8 +78,9 @@ def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
     n, rows = at.states.shape[1], model.values.rows
     p, z = at.costates, at.sides[0] - at.sides[1]
     first, last = limits.bounded
-    pulled = jnp.pad(jnp.einsum("tij,ti->tj", model.F, p[1:]), ((0, 1), (0, 0)))
-    pushed = jnp.einsum("tpi,tp->ti", model.G, z[:, limits.own :])
+    pulled = jnp.sum(model.F * p[1:, :, None], axis=1)
+    pulled = jnp.pad(pulled, ((0, 1), (0, 0)))
+    pushed = jnp.sum(model.G * z[:, limits.own :, None], axis=1)
     pushed = pushed.at[:, first:last].add(z[:, : limits.own])
     own = (model.h - pulled).at[:, :n].add(p)
     gradient = own + pushed
