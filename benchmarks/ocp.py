@@ -5,7 +5,8 @@ CasADi, by the same steps from the same guess, functions expanded; the objective
 violation of our controls with adaptive steps; derivatives of optima against central
 differences; and the seconds of first answers, each in a fresh process. Prints tables,
 and writes `benchmarks/results/ocp.json`, and the same pinned to one core in `pinned/`.
-CasADi is installed into an environment of its own.
+CasADi is installed into an environment of its own. `--draw` solves the problems and
+draws `docs/assets/optimal_control.svg`, no more.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from benchmarks._optimal import PROBLEMS
 from benchmarks.planning import PEERS, Worker
 
 
+FIGURE = Path(__file__).parents[1] / "docs/assets/optimal_control.svg"
 LIMITS = {
     "objective, relative": 1e-4,
     "violation": 1e-5,
@@ -165,9 +167,51 @@ def derivatives() -> list[dict[str, Any]]:
     return rows
 
 
+TITLES = {
+    "particle_steering": "particle: angle, rad",
+    "robot_arm": "robot arm: slide, turn, lift",
+    "goddard_rocket": "rocket: thrust",
+    "hang_glider": "glider: lift",
+    "catalyst_mixing": "catalysts: mixture",
+    "hanging_chain": "chain: slope",
+    "gas_oil_cracking": "gas oil: fractions",
+    "methanol_to_hydrocarbons": "methanol: fractions",
+    "alpha_pinene": "alpha-pinene: shares, %",
+}
+
+
+def draw() -> None:
+    """The controls that were found, and the fits beside the measurements."""
+    import matplotlib.pyplot as plt
+
+    plt.rcParams["svg.hashsalt"] = "delucax"
+    figure, axes = plt.subplots(3, 3, figsize=(9.5, 6.5), layout="constrained")
+    for (name, title), ax in zip(TITLES.items(), axes.flat, strict=True):
+        problem = getattr(dlx.problems, name)()
+        plan = problem.solve()
+        if PROBLEMS[name].rates:
+            simulated = problem.simulate(plan)
+            widths = np.repeat(problem.dynamics.widths / 10, 10)
+            times = np.concatenate([[0.0], np.cumsum(widths)])
+            lines = ax.plot(times, simulated.states, lw=1.2)
+            for i, line in enumerate(lines):
+                ax.plot(times[::10], problem.states[:, i], ".", color=line.get_color())
+        else:
+            times = np.linspace(0, plan.duration, problem.horizon + 1)
+            for control in plan.controls.T:
+                ax.stairs(control, times, baseline=None, lw=1.2)
+        ax.set_title(title, fontsize=10)
+        ax.grid(alpha=0.25, lw=0.5)
+    figure.supxlabel("time")
+    figure.savefig(FIGURE, metadata={"Date": None})
+
+
 def measure(options: argparse.Namespace, folder: Path) -> None:
     """All tables under one setting."""
     jax.config.update("jax_enable_x64", True)
+    if options.draw:
+        draw()
+        return
     compile_anew()
     began = time.perf_counter()
     casadi = Worker("casadi", *PEERS["casadi"], worker="casadi_optimal")
@@ -185,4 +229,5 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=11)
+    parser.add_argument("--draw", action="store_true", help="the figure alone")
     run_in_settings(parser, measure)
