@@ -186,13 +186,14 @@ class Problem(eqx.Module):
         """The cost of a step at `t`, `x`, `u`, with the penalty by multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
-            return cost + 0.0  # an integer cost has a gradient then
+            # A whole number has a gradient then.
+            return jnp.asarray(cost + 0.0)
         c, equal = self.stage_constraints(t, x, u)
         return cost + augmented(c, y, self.multipliers.rho, equal)
 
     def final_cost(self, t: Array, x: Array) -> Array:
         """The cost at the end, at `t`, `x`, with the penalty of the constraints."""
-        cost = self.cost.final(t, x)
+        cost = jnp.asarray(self.cost.final(t, x) + 0.0)
         if self.multipliers is None:
             return cost
         c, equal = self.final_constraints(t, x)

@@ -24,6 +24,20 @@ class Simulated(NamedTuple):
     - `objective`: that of the simulated trajectory, a scalar.
     - `violation`: the largest violation of a constraint on it, also between the steps.
     - `times`, `states`: the trajectory, shapes `(K,)` and `(K, n)`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        def check(problem):
+            plan = problem.solve()
+            simulated = problem.simulate(plan)
+            return simulated.objective, simulated.violation
+
+        jax.eval_shape(check, dlx.problems.catalyst_mixing(20))
+        ```
     """
 
     objective: Array
