@@ -128,6 +128,7 @@ def first_answers() -> dict[str, float]:
 
 SLOPES = {
     ("particle_steering", "dynamics.system.acceleration"): 0.1,
+    ("robot_arm", "dynamics.system.length"): 1e-3,
     ("goddard_rocket", "dynamics.system.drag"): 1.0,
     ("hang_glider", "dynamics.system.updraft"): 1e-3,
     ("catalyst_mixing", "dynamics.system.rate"): 1e-2,

@@ -96,6 +96,7 @@ NAMES = {"angle": INSIDE, "speed": lambda t, x: 2 - x[1]}
             "degrees must be given",
         ),
         (lambda: made(degrees=3), "degrees must be 1 or 2"),
+        (lambda: made(degrees=1), "degrees must be 2 for"),
         (lambda: made(degrees={"angle": 1}), "degrees must be by the names"),
     ],
 )

@@ -130,6 +130,11 @@ def test_bad_unknowns(message):
 def test_unknowns_that_are_not_there():
     with user_error(match="names the state 'x2'"):
         least_time(1.0, unknowns=Unknowns(start={"x2": (0.0, 1.0)}))
+    with user_error(match="must start with dynamics, cost or constraints"):
+        least_time(1.0, unknowns=Unknowns(parameters={"system.A": (0.0, 1.0)}))
+    with user_error(match="time does not run backwards"):
+        path = {"dynamics.dt": (-1.0, 1.0)}
+        least_time(1.0, unknowns=Unknowns(parameters=path))
     with user_error(match="LinearSystem has no 'mass'"):
         path = {"dynamics.system.mass": (0.0, 1.0)}
         least_time(1.0, unknowns=Unknowns(parameters=path))

@@ -225,6 +225,40 @@ def _scattered(count: int, size: int) -> np.ndarray:
     return np.outer(np.arange(1, count + 1), np.sqrt(primes)) % 1
 
 
+class _Traced(ValueError):
+    """Nothing can be computed at sample states."""
+
+
+def checked_degrees(
+    plant: AbstractPlant,
+    functions: dict[str, Callable[..., Any]],
+    names: tuple[str, ...],
+    states: Any,
+    known: tuple[int, ...] | None,
+    is_disturbed: bool,
+    where: str,
+) -> tuple[int, ...]:
+    """The relative degrees, of a system that is affine. Those that are `known` are
+    checked unless something is traced."""
+    try:
+        if isinstance(plant, AbstractSystem):
+            check_affine(plant, states, is_disturbed, where)
+        found = relative_degrees(plant, functions, names, states, where)
+    except _Traced:
+        if known is None:
+            raise
+        return known
+    if known is None:
+        return found
+    for name, given, degree in zip(names, known, found, strict=True):
+        if given != degree:
+            raise ValueError(
+                f"{where}: degrees must be {degree} for {name!r}, which sees the "
+                f"control by then and not before, got {given}."
+            )
+    return known
+
+
 def relative_degrees(
     plant: AbstractPlant,
     functions: dict[str, Callable[..., Any]],
@@ -289,7 +323,7 @@ def _at_samples(test, conditions: Conditions, states: Any, where: str, option: A
     with jax.ensure_compile_time_eval():
         holds, known = _tested(test, conditions, jnp.asarray(states, float), option)
         if not is_concrete(holds):
-            raise ValueError(
+            raise _Traced(
                 f"{where}: degrees must be given where plant or barriers are traced."
             )
     holds, known = np.asarray(holds), np.asarray(known)

@@ -75,6 +75,12 @@ def _margins(
             f"{where}: times must be given, (start, end), where a barrier or the plant "
             "depends on time."
         )
+    if times is not None:
+        pair = np.asarray(times, float)
+        if pair.shape != (2,) or not np.all(np.isfinite(pair)) or pair[0] > pair[1]:
+            raise ValueError(
+                f"{where}: times must be two finite numbers (start, end), got {times}."
+            )
     span = np.linspace(*times, points) if varies and times is not None else np.zeros(1)
     axes = [span]
     for low, high in (states, controls):

@@ -30,11 +30,10 @@ from ..systems import AbstractPlant, AbstractSystem
 from ._barriers import (
     as_degrees,
     by_entry,
-    check_affine,
     check_plant,
+    checked_degrees,
     Conditions,
     entry_names,
-    relative_degrees,
     sample_states,
     sizes_of,
 )
@@ -129,8 +128,8 @@ class SafetyFilter(AbstractController):
     - `states`: where the relative degree is found, and that the system is affine,
         shape `(k, n)`; by default 16 points at most 1 from the equilibrium, or zero.
     - `degrees`: the relative degree of each barrier, 1 or 2; a number, or a dictionary
-        by barrier. It is for where plant or barriers are traced: the degrees are not
-        found then, and nothing is checked at sample states.
+        by barrier. It is for where plant or barriers are traced: nothing is checked at
+        sample states then.
     - `max_iterations`: the most linearisations in discrete time, 20 by default.
 
     **Raises:** `ValueError` on arguments of the wrong kind, shape or value; if a
@@ -223,18 +222,13 @@ class SafetyFilter(AbstractController):
         # The numbers are checked before anything is computed with them.
         self.degrees = (1,) * len(self.names)
         self.__check_init__()
-        if degrees is not None:
-            self.degrees = as_degrees(degrees, sizes, where)
-            return
+        known = None if degrees is None else as_degrees(degrees, sizes, where)
         samples = sample_states(plant)
         if states is not None:
             samples = as_rows(states, n, "states", where)
             check_finite(samples, "states", where)
-        if isinstance(plant, AbstractSystem):
-            check_affine(plant, samples, disturbance is not None, where)
-        self.degrees = relative_degrees(
-            plant, self.barriers, self.names, samples, where
-        )
+        given = plant, self.barriers, self.names, samples
+        self.degrees = checked_degrees(*given, known, disturbance is not None, where)
 
     def __check_init__(self):
         where = "SafetyFilter"

@@ -73,12 +73,12 @@ class MHE(AbstractEstimator):
     - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
         among the observations; subtraction by default.
 
-    An observation that is not finite is left out, and so is a step that is not called
-    with one. `status` is `diverged` at an observation or a solution that is not finite
-    (the window then keeps the estimate before), `no_feasible_point` if the bounds
-    cannot all hold, `inaccurate` if rounding keeps them from it, and `not_converged` if
-    the active bounds were not found or, with more than one step, if more of them would
-    change the estimate.
+    A reading that is missing is a step without a call of `update`. One that is not
+    finite is left out and counts as a failure. `status` is `diverged` at an observation
+    or a solution that is not finite (the window then keeps the estimate before),
+    `no_feasible_point` if the bounds cannot all hold, `inaccurate` if rounding keeps
+    them from it, and `not_converged` if the active bounds were not found or, with more
+    than one step, if more of them would change the estimate.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one,
     sizes do not fit, bounds are not numbers with `low <= high`, a parameter has no
@@ -98,10 +98,12 @@ class MHE(AbstractEstimator):
         W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
         mhe = dlx.estimators.MHE(pendulum, W, V, 10, bounds=([-1.0, -5.0], [1.0, 5.0]))
         state = mhe.init()
+        update, predict = eqx.filter_jit(mhe.update), eqx.filter_jit(mhe.predict)
         for k in range(3):
-            state = eqx.filter_jit(mhe.update)(0.05 * k, jnp.array([0.1, 0.0]), state)
+            t = jnp.asarray(0.05 * k)  # a Python number would compile again
+            state = update(t, jnp.array([0.1, 0.0]), state)
             mean, covariance = mhe.estimate(state)
-            state = eqx.filter_jit(mhe.predict)(0.05 * k, jnp.zeros(1), state)
+            state = predict(t, jnp.zeros(1), state)
         ```
     """
 
@@ -203,6 +205,11 @@ class MHE(AbstractEstimator):
         return after._replace(result=result)
 
     def predict(self, t: RealScalar, u: Control, state: Window) -> PyTree:
+        if u.shape != (self.dynamics.control_size,):
+            raise ValueError(
+                f"MHE.predict: u must have shape ({self.dynamics.control_size},), got "
+                f"shape {u.shape}."
+            )
         model, _ = self._model()
         return moved(model, t, u.astype(state.u.dtype), state)
 

@@ -176,6 +176,8 @@ class SQP(AbstractPlanner):
         """
         if start.states is None or start.controls.ndim != 2:
             raise ValueError("SQP.prepare: start must be one start, with states.")
+        if problem.unknowns is not None:
+            raise ValueError("SQP.prepare: problem must have no unknowns.")
         return prepared(problem, start, self.second_order)
 
     def feedback(self, problem: Problem, ready: PyTree, max_steps: int = 50) -> Plan:

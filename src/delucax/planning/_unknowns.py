@@ -49,6 +49,8 @@ class Unknowns(eqx.Module):
         `final(t, x) = t` minimises the time. The stage cost is not multiplied by the
         step. `T dt` by default.
 
+    What it starts from is moved between the bounds.
+
     **Raises:** `ValueError` if nothing is unknown, on a name that is not there, bounds
     that are not a pair of numbers with `low <= high`, a duration that may be zero or
     negative, a parameter without a finite value to start from.
@@ -91,21 +93,32 @@ class Unknowns(eqx.Module):
             for name, pair in value.items():
                 _check_pair(pair, f"{field}[{name!r}]", where)
         if self.duration is not None:
-            low, _ = _check_pair(self.duration, "duration", where)
-            if np.shape(low) or is_concrete(low) and not np.asarray(low) > 0:
+            low, high = _check_pair(self.duration, "duration", where)
+            if np.shape(low) or np.shape(high):
                 raise ValueError(
-                    f"{where}: duration must have positive bounds, because time does "
-                    f"not run backwards, got a lower bound of {shortened(low)}."
+                    f"{where}: duration must be two numbers (low, high), got "
+                    f"{self.duration}."
                 )
+            _check_runs(low, "duration", where)
         if self.duration is None and not self.start and not self.parameters:
             raise ValueError(f"{where}: at least one unknown must be given.")
+
+
+def _check_runs(low: Any, name: str, where: str) -> None:
+    """Raise if a lower bound of a time is not positive."""
+    if is_concrete(low) and not np.all(np.asarray(low) > 0):
+        raise ValueError(
+            f"{where}: {name} must have positive bounds, because time does not run "
+            f"backwards, got a lower bound of {shortened(low)}."
+        )
 
 
 def _check_pair(pair: Any, name: str, where: str) -> Bounds:
     """The pair, or an error."""
     if not isinstance(pair, tuple):
         raise ValueError(
-            f"{where}: {name} must be a pair (low, high), got {shortened(pair)}."
+            f"{where}: {name} must be a pair (low, high), a tuple or a list, got "
+            f"{shortened(pair)}."
         )
     if all(map(is_concrete, pair)):
         low, high = map(np.asarray, pair)
@@ -134,8 +147,15 @@ def check_unknowns(problem: Problem, horizon: int) -> None:
                 f"{where}: the bounds of the state {name!r} must be numbers, got shape "
                 f"{max(map(np.shape, pair))}."
             )
-    parts = parts_of(problem)
+    parts, step = parts_of(problem), _path_of_step(problem.dynamics, throw=False)
     for path, pair in bounds_by_path(problem, horizon).items():
+        if path.split(".")[0] not in _PARTS:
+            raise ValueError(
+                f"{where}: a path of unknowns must start with dynamics, cost or "
+                f"constraints, got {path!r}."
+            )
+        if path == step:
+            _check_runs(pair[0], path, where)
         try:
             value = get_path(parts, path)
         except ValueError as error:
@@ -176,7 +196,7 @@ def bounds_by_path(problem: Problem, horizon: int) -> dict[str, Bounds]:
     return named
 
 
-def _path_of_step(dynamics: AbstractDynamics) -> str:
+def _path_of_step(dynamics: AbstractDynamics, throw: bool = True) -> str:
     """The path of the step of a discretised system, through what wraps it."""
     path = "dynamics"
     inside: Any = dynamics
@@ -184,7 +204,7 @@ def _path_of_step(dynamics: AbstractDynamics) -> str:
         inside, "dynamics"
     ):
         path, inside = f"{path}.dynamics", inside.dynamics
-    if not isinstance(inside, AbstractDiscretization):
+    if throw and not isinstance(inside, AbstractDiscretization):
         raise ValueError(
             "SQP: with a duration among the unknowns, dynamics must be a system in "
             "continuous time, such as delucax.Discretized, got "
