@@ -205,6 +205,8 @@ def draw() -> None:
         ax.grid(alpha=0.25, lw=0.5)
     figure.supxlabel("time")
     figure.savefig(FIGURE, metadata={"Date": None})
+    lines = FIGURE.read_text().splitlines()
+    FIGURE.write_text("\n".join(line.rstrip() for line in lines) + "\n")
 
 
 def measure(options: argparse.Namespace, folder: Path) -> None:
