@@ -20,6 +20,7 @@ from ._message import did_you_mean, shortened
 from ._module import (
     as_float_array,
     check_function as check_function,
+    get_path,
 )
 from ._typing import Array, Bounds
 
@@ -194,6 +195,21 @@ def check_finite(array: Any, name: str, where: str) -> None:
     if eqx.is_inexact_array(array) and is_concrete(array):
         if not np.all(np.isfinite(np.asarray(array))):
             raise _error(array, name, where, "be finite")
+
+
+def number_at(tree: Any, path: str, kind: str, within: str, where: str) -> Array:
+    """The finite number or array at a path that an argument names."""
+    try:
+        value = get_path(tree, path)
+    except ValueError as error:
+        raise ValueError(f"{where}: {kind}: {error}") from error
+    if not eqx.is_inexact_array(value):
+        raise ValueError(
+            f"{where}: {kind} names {path!r}, which must have a number in the {within} "
+            f"to start from, got {shortened(value)}."
+        )
+    check_finite(value, f"{kind}[{path!r}] (to start from)", where)
+    return value
 
 
 def _check_entries(

@@ -19,9 +19,11 @@ from ._fields import (
 from ._names import indexed_names as indexed_names, names_of as names_of
 from ._networks import mlp as mlp
 from ._paths import (
+    by_path as by_path,
     check_paths as check_paths,
     get_path as get_path,
     replace as replace,
+    with_values as with_values,
 )
 from ._serialise import load as load, save as save
 from ._stack import (

@@ -1,5 +1,6 @@
 """Leaves by their path: `replace(env, {"dynamics.system.length": 1.2})`."""
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -8,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._message import did_you_mean, shortened
 from ._fields import (
@@ -50,6 +51,25 @@ def _nodes_along(tree: Any, path: str) -> list[Any]:
             raise ValueError(f"path: {kind} has no {part!r} (in {path!r}); {hint}")
         nodes.append(children[part])
     return nodes
+
+
+def with_values(tree: _T, values: Mapping[str, Any]) -> _T:
+    """A copy of `tree` with arrays at paths, which are not checked: they may be traced,
+    and as many as a loop needs."""
+    if not values:
+        return tree
+    at = lambda tree: [get_path(tree, path) for path in values]
+    return eqx.tree_at(at, tree, list(values.values()))
+
+
+def by_path(flat: Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """The entries of a vector as arrays by their paths."""
+    values, at = {}, 0
+    for path, shape in shapes.items():
+        size = math.prod(shape)
+        values[path] = flat[at : at + size].reshape(shape)
+        at += size
+    return values
 
 
 def replace(tree: _T, changes: Mapping[str, Any]) -> _T:

@@ -45,7 +45,7 @@ class Conditions(eqx.Module):
             return plant.advance(t, x, u, w)[0]
         return plant.vector_field(t, x, u, w)
 
-    def calm(self, dtype: Any) -> Array | None:
+    def no_disturbance(self, dtype: Any) -> Array | None:
         """The disturbance of zero, as the plant takes it."""
         if self.disturbance is None and not self.plant.disturbance_names:
             return None
@@ -75,11 +75,13 @@ class Conditions(eqx.Module):
                 now, slope = jax.jvp(psi, (t, x), moved)
                 return slope + rates * now
 
-            calm = self.calm(x.dtype)
-            if self.disturbance is None or calm is None:
-                return under(calm)
-            value, (E,) = value_and_jacobians(under, calm)
-            bound = jnp.broadcast_to(self.disturbance.astype(x.dtype), calm.shape)
+            no_disturbance = self.no_disturbance(x.dtype)
+            if self.disturbance is None or no_disturbance is None:
+                return under(no_disturbance)
+            value, (E,) = value_and_jacobians(under, no_disturbance)
+            bound = jnp.broadcast_to(
+                self.disturbance.astype(x.dtype), no_disturbance.shape
+            )
             return value - jnp.abs(E) @ bound
 
         return condition
@@ -243,14 +245,14 @@ def checked_degrees(
     try:
         if isinstance(plant, AbstractSystem):
             check_affine(plant, states, is_disturbed, where)
-        found = relative_degrees(plant, functions, names, states, where)
+        degrees = relative_degrees(plant, functions, names, states, where)
     except _Traced:
         if known is None:
             raise
         return known
     if known is None:
-        return found
-    for name, given, degree in zip(names, known, found, strict=True):
+        return degrees
+    for name, given, degree in zip(names, known, degrees, strict=True):
         if given != degree:
             raise ValueError(
                 f"{where}: degrees must be {degree} for {name!r}, which sees the "
@@ -266,22 +268,22 @@ def relative_degrees(
     states: Any,
     where: str,
 ) -> tuple[int, ...]:
-    """The relative degree of each barrier, found at sample states."""
+    """The relative degree of each barrier, by its derivatives at sample states."""
     # It does not depend on the decay, which may be traced.
     ones: Any = np.ones((len(names), 2))
     conditions = Conditions(plant, functions, ones, None)
-    seen, known = _at_samples(_sees_control, conditions, states, where, 0)
+    first, known = _at_samples(_sees_control, conditions, states, where, 0)
     if not np.all(known):
         raise ValueError(
             f"{where}: barriers must be finite at one of the sample states, and "
             f"{names[int(np.argmin(known))]!r} is not at any: give `states` at which "
             "it is."
         )
-    degrees = np.where(seen, 1, 2)
-    if not np.all(seen):
-        seen_later, _ = _at_samples(_sees_control, conditions, states, where, 1)
-        if not np.all(seen | seen_later):
-            name = names[int(np.argmin(seen | seen_later))]
+    degrees = np.where(first, 1, 2)
+    if not np.all(first):
+        second, _ = _at_samples(_sees_control, conditions, states, where, 1)
+        if not np.all(first | second):
+            name = names[int(np.argmin(first | second))]
             is_discrete = isinstance(plant, AbstractDynamics)
             when = "two steps later" if is_discrete else "by its second derivative"
             raise ValueError(
@@ -341,7 +343,7 @@ def _sees_control(conditions: Conditions, t: Array, x: Array, order: int):
     psi = conditions.first if order else conditions.values
     u = jnp.zeros(conditions.control_size, x.dtype)
     A = jax.jacfwd(conditions.along(psi, order), 2)(t, x, u)
-    flow = lambda u: conditions.flow(t, x, u, conditions.calm(x.dtype))
+    flow = lambda u: conditions.flow(t, x, u, conditions.no_disturbance(x.dtype))
     moved, g = flow(u), jax.jacfwd(flow)(u)
     place = moved if isinstance(conditions.plant, AbstractDynamics) else x
     slope = jax.jacfwd(psi, 1)(t, place)
@@ -355,10 +357,10 @@ def _is_curved(conditions: Conditions, t: Array, x: Array, with_disturbance: boo
     m = conditions.control_size
     k = conditions.plant.disturbance_size if with_disturbance else 0
     one, two = jnp.asarray(4 * _scattered(2, m + k) - 2, x.dtype)
-    calm = conditions.calm(x.dtype)
+    no_disturbance = conditions.no_disturbance(x.dtype)
 
     def field(z):
-        w = z[m:] if with_disturbance else calm
+        w = z[m:] if with_disturbance else no_disturbance
         return conditions.flow(t, x, z[:m], w)
 
     terms = [field(one + two), field(jnp.zeros_like(one)), -field(one), -field(two)]

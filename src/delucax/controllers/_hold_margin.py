@@ -53,8 +53,8 @@ def hold_margin(
         if not dt * np.max(decay) <= 1:
             raise ValueError(f"{where}: dt must be at most 1 / decay, got {dt}.")
         box = tuple(whole(end, n) for end in ends)
-        found = _margins(conditions, float(dt), box, controls, times, points, where)
-        return jnp.asarray(found, conditions.decay.dtype)
+        margins = _margins(conditions, float(dt), box, controls, times, points, where)
+        return jnp.asarray(margins, conditions.decay.dtype)
 
 
 def _margins(
@@ -98,9 +98,9 @@ def _margins(
         size = conditions.plant.disturbance_size
         most = np.broadcast_to(np.asarray(conditions.disturbance), size)
         corners = np.array(list(itertools.product(*((-b, b) for b in most))))
-    found = _falls(conditions, jnp.asarray(flat, dtype), jnp.asarray(corners, dtype))
+    on_grid = _falls(conditions, jnp.asarray(flat, dtype), jnp.asarray(corners, dtype))
     fall, change, psi, holds = (
-        np.asarray(a).reshape(*shape, *a.shape[1:]) for a in found
+        np.asarray(a).reshape(*shape, *a.shape[1:]) for a in on_grid
     )
     safe = _in_cells(holds, np.logical_or)
     if not safe.any():
@@ -131,7 +131,11 @@ def _falls(conditions: Conditions, flat: Array, corners: Array) -> Any:
         change, push = jax.linearize(changed, t, x)
 
         def fall(w):
-            w = w if conditions.disturbance is not None else conditions.calm(x.dtype)
+            w = (
+                w
+                if conditions.disturbance is not None
+                else conditions.no_disturbance(x.dtype)
+            )
             return -push(jnp.ones_like(t), conditions.flow(t, x, u, w))
 
         values, psi = conditions.values(t, x), conditions.last(t, x)
@@ -167,18 +171,18 @@ def _fastest(
 
     rate = reach = 0.0
     for _ in range(_ROUNDS):
-        found = measured(rate, reach, -np.inf)
-        if not (found[0] > rate or found[1] > reach):
+        now = measured(rate, reach, -np.inf)
+        if not (now[0] > rate or now[1] > reach):
             break
-        rate, reach = max(found[0], rate), max(found[1], reach)
+        rate, reach = max(now[0], rate), max(now[1], reach)
     else:
         rate, reach = measured(np.inf, np.inf, -np.inf)
-    found = rate, reach
+    now = rate, reach
     for _ in range(_FEW):
-        found = measured(rate, reach, -decay * reach - dt * rate)
-        rate, reach = min(found[0], rate), min(found[1], reach)
+        now = measured(rate, reach, -decay * reach - dt * rate)
+        rate, reach = min(now[0], rate), min(now[1], reach)
     # A NaN is not greater than what came before it.
-    return rate if np.all(np.isfinite(found)) else np.nan
+    return rate if np.all(np.isfinite(now)) else np.nan
 
 
 def _in_cells(values: np.ndarray, join: Any) -> np.ndarray:

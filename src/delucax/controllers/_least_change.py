@@ -193,8 +193,8 @@ def least_change_sequentially(
         step = after - u
         # How the pull to the nominal control changes along the last step.
         size = dot(last, last)
-        found = dot(pull - curvature * step, last) / jnp.where(size > 0, size, 1)
-        new = jnp.where(size > 0, jnp.clip(found, _LEAST, _MOST), 1)
+        estimate = dot(pull - curvature * step, last) / jnp.where(size > 0, size, 1)
+        new = jnp.where(size > 0, jnp.clip(estimate, _LEAST, _MOST), 1)
         return after, step, new.astype(dtype), curvature * step, count + 1
 
     def iterated(_, start):

@@ -73,8 +73,8 @@ class SafetyFilter(AbstractController):
     `c = db/dt + decay b`,
 
     and one whose second derivative does (degree two) gives it for `db/dt + decay b`,
-    with a second decay. The degree is found when the filter is made. Where the control
-    is applied at all times, `b >= 0` then holds for ever if it does at first; of degree
+    with a second decay. The constructor determines the degree. Where the control is
+    applied at all times, `b >= 0` then holds for ever if it does at first; of degree
     two, if `db/dt + decay b >= 0` does too.
 
     For dynamics in discrete time the change over a step takes the place of the
@@ -125,7 +125,7 @@ class SafetyFilter(AbstractController):
         the others hard. All are hard by default.
     - `weight`: the price of a change of each control, 1 by default; a number or of
         shape `(m,)`.
-    - `states`: where the relative degree is found, and that the system is affine,
+    - `states`: where the relative degree and that the system is affine are checked,
         shape `(k, n)`; by default 16 points at most 1 from the equilibrium, or zero.
     - `degrees`: the relative degree of each barrier, 1 or 2; a number, or a dictionary
         by barrier. It is for where plant or barriers are traced: nothing is checked at

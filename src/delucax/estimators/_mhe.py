@@ -18,7 +18,7 @@ from ..math._linear_solve import is_definite
 from ._base import AbstractEstimator, Belief
 from ._gaussian import check_dynamics, checked_model
 from ._random_walk import check_walks, RandomWalk, WithParameters
-from ._window import begun, Model, moved, solved, Window
+from ._window import first_window, Model, moved, solved, Window
 
 
 class MHE(AbstractEstimator):
@@ -188,7 +188,7 @@ class MHE(AbstractEstimator):
         model, prior = self._model()
         pairs = (model.states, len(prior.mean)), (model.disturbances, len(model.W))
         bounded = sum(size for pair, size in pairs if pair is not None)
-        return begun(model, prior, self.window, bounded)
+        return first_window(model, prior, self.window, bounded)
 
     def update(self, t: RealScalar, y: Observation, state: Window) -> PyTree:
         if y.shape != self.V.shape[:1]:

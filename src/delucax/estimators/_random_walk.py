@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import bounds_field, check_finite, check_range
+from .._check import bounds_field, check_finite, check_range, number_at
 from .._message import shortened
-from .._module import get_path, parameter
+from .._module import by_path, get_path, parameter, with_values
 from .._results import Result
 from .._typing import Real, RealScalar
 from ..dynamics import AbstractDynamics, AbstractWrapper
@@ -90,18 +90,13 @@ class WithParameters(AbstractWrapper):
 
     def values(self, flat: Array) -> dict[str, Array]:
         """The parameters by their paths."""
-        out, at = {}, 0
-        for path, value in zip(self.paths, self._values, strict=True):
-            out[path] = flat[at : at + value.size].reshape(value.shape)
-            at += value.size
-        return out
+        shapes = (value.shape for value in self._values)
+        return by_path(flat, dict(zip(self.paths, shapes, strict=True)))
 
     def _opened(self, x: Array) -> tuple[AbstractDynamics, Array, Array]:
         """The dynamics with these parameters, the plant's own state, and they."""
         n = self.dynamics.state_size
-        values = list(self.values(x[n:]).values())
-        at = lambda dynamics: [get_path(dynamics, path) for path in self.paths]
-        return eqx.tree_at(at, self.dynamics, values), x[:n], x[n:]
+        return with_values(self.dynamics, self.values(x[n:])), x[:n], x[n:]
 
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
@@ -132,17 +127,8 @@ def check_walks(parameters: Any, dynamics: AbstractDynamics, where: str) -> None
             f"{shortened(parameters)}."
         )
     for path, walk in parameters.items():
-        try:
-            value = get_path(dynamics, path)
-        except ValueError as error:
-            raise ValueError(f"{where}: parameters: {error}") from error
-        if not eqx.is_inexact_array(value):
-            raise ValueError(
-                f"{where}: parameters names {path!r}, which must have a number in the "
-                f"dynamics to start from, got {shortened(value)}."
-            )
         name = f"parameters[{path!r}]"
-        check_finite(value, f"{name} (to start from)", where)
+        value = number_at(dynamics, path, "parameters", "dynamics", where)
         for what, array in (
             ("variance", walk.variance),
             ("step", walk.step),

@@ -109,7 +109,7 @@ class Model(eqx.Module):
         return share, jnp.where(is_far, limit * (r - limit / 2), square / 2)
 
 
-def begun(model: Model, prior: Belief, size: int, bounded: int) -> Window:
+def first_window(model: Model, prior: Belief, size: int, bounded: int) -> Window:
     """The window before the first observation."""
     dynamics, dtype = model.dynamics, prior.mean.dtype
     zeros = lambda *shape: jnp.zeros((size, *shape), dtype)

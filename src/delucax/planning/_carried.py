@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._module import get_path
+from .._module import by_path, get_path, with_values
 from .._results import Result
 from .._typing import RealScalar
 from ..costs import AbstractCost
@@ -40,21 +40,12 @@ class Carried(eqx.Module):
 
     def values(self, carried: Array) -> dict[str, Array]:
         """The values by their paths."""
-        values, at = carried * self.unit, 0
-        out = {}
-        for path, shape in zip(self.paths, self.shapes, strict=True):
-            count = int(np.prod(shape))
-            out[path] = values[at : at + count].reshape(shape)
-            at += count
-        return out
+        shapes = dict(zip(self.paths, self.shapes, strict=True))
+        return by_path(carried * self.unit, shapes)
 
     def opened(self, k: RealScalar, X: Array) -> tuple[dict[str, Any], Array, Array]:
         """The parts of the problem, the time and the state at step `k`."""
-        values = self.values(X[self.size :])
-        parts = self.parts
-        if values:
-            at = lambda parts: [get_path(parts, path) for path in values]
-            parts = eqx.tree_at(at, parts, list(values.values()))
+        parts = with_values(self.parts, self.values(X[self.size :]))
         return parts, self.t0 + k * parts["dynamics"].dt, X[: self.size]
 
 
@@ -219,5 +210,5 @@ def with_carried(
         none = [(0, 0)] * (gains.ndim - 1)
         gains = jnp.pad(gains, (*none, (0, carried.guess.shape[0])))
     guess = start.states if start.states is None else also(start.states)
-    begun = Start(start.controls, guess, gains, start.multipliers)
-    return whole, begun, states if states is None else also(states), carried
+    wider = Start(start.controls, guess, gains, start.multipliers)
+    return whole, wider, states if states is None else also(states), carried

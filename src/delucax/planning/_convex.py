@@ -173,12 +173,12 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
 
     end = H[-1, :n, :n], h[-1, :n]
     xs = model.F, H[:-1], h[:-1], model.values.defects[1:]
-    begun, (H, h, Ps, ss, K, shift) = lax.scan(back, end, xs, reverse=True)
+    at_start, (H, h, Ps, ss, K, shift) = lax.scan(back, end, xs, reverse=True)
     if limits.free:
         # The first state is in part chosen too, at the cost-to-go from it.
         order = np.array([i for i in range(n) if i not in limits.free])
         given, order = len(order), np.array([*order, *limits.free], int)
-        P, s = begun[0][order][:, order], begun[1][order]
+        P, s = at_start[0][order][:, order], at_start[1][order]
         (P0, s0), (H0, h0), _, added = _chosen(P, s, given)
         at = order[:given]
         H = H.at[0, order[:, None], order].add(H0)

@@ -57,8 +57,8 @@ def checked_plan(
         )
         if problem is None or problem.constraints is None:
             return words
-        found = solved_problem(problem, plan)
-        worst = worst_of(problem.constraints, found, plan.states, plan.controls)
+        solved = solved_problem(problem, plan)
+        worst = worst_of(problem.constraints, solved, plan.states, plan.controls)
         return f"{words} {worst}".rstrip()
 
     return raise_on_failure(plan, where, throw, "the plan", facts)

@@ -10,9 +10,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_float_array, check_finite, is_concrete
+from .._check import as_float_array, is_concrete, number_at
 from .._message import did_you_mean, shortened
-from .._module import get_path
+from .._module import with_values
 from ..dynamics import AbstractDiscretization, AbstractDynamics
 from ._plan import Plan
 from ._problem import Problem
@@ -156,16 +156,7 @@ def check_unknowns(problem: Problem, horizon: int) -> None:
             )
         if path == step:
             _check_runs(pair[0], path, where)
-        try:
-            value = get_path(parts, path)
-        except ValueError as error:
-            raise ValueError(f"{where}: parameters of unknowns: {error}") from error
-        if not eqx.is_inexact_array(value):
-            raise ValueError(
-                f"{where}: {path!r} of unknowns must have a number in the problem to "
-                f"start from, got {shortened(value)}."
-            )
-        check_finite(value, f"{path} (to start from)", where)
+        value = number_at(parts, path, "parameters of unknowns", "problem", where)
         for end in pair:
             if np.shape(end) not in ((), value.shape):
                 raise ValueError(
@@ -215,10 +206,5 @@ def _path_of_step(dynamics: AbstractDynamics, throw: bool = True) -> str:
 
 def solved_problem(problem: Problem, plan: Plan) -> Problem:
     """The problem with the values that a plan found."""
-    values = plan.parameters
-    if not values:
-        return problem
-    parts = parts_of(problem)
-    at = lambda parts: [get_path(parts, path) for path in values]
-    parts = eqx.tree_at(at, parts, list(values.values()))
+    parts = with_values(parts_of(problem), plan.parameters or {})
     return dataclasses.replace(problem, **parts)

@@ -128,7 +128,7 @@ class OptimalControl(eqx.Module):
         return -plan.cost if self.is_maximised else plan.cost
 
     def simulate(self, plan: Plan, points: int = 10, rtol: float = 1e-10) -> Simulated:
-        """Apply the controls of a plan, with the unknowns that it found, with adaptive
+        """Apply the controls of a plan, with its values of the unknowns, with adaptive
         steps (Dormand and Prince, order 8).
 
         **Arguments:**
@@ -143,19 +143,19 @@ class OptimalControl(eqx.Module):
         check_instance(plan, Plan, "plan", where)
         points = check_count(points, "points", where)
         check_positive(rtol, "rtol", where)
-        found = self if plan.parameters is None else replace(self, plan.parameters)
-        fine = _fine(found.dynamics, points, rtol)
+        solved = self if plan.parameters is None else replace(self, plan.parameters)
+        fine = _fine(solved.dynamics, points, rtol)
         states = open_loop(fine, plan.states[0], jnp.repeat(plan.controls, points, 0))
         at_steps = states[::points]
         problem = Problem(
-            found.dynamics,
-            found.cost,
+            solved.dynamics,
+            solved.cost,
             plan.states[0],
             jnp.zeros_like(states[0, 0]),
-            constraints=found.constraints,
+            constraints=solved.constraints,
         )
         cost = problem.total(at_steps, plan.controls)
-        violation = _violation(found, fine, states, plan.controls)
+        violation = _violation(solved, fine, states, plan.controls)
         steps = jnp.arange(len(states))
         sign = -1 if self.is_maximised else 1
         return Simulated(sign * cost, violation, steps * fine.dt, states)
@@ -175,19 +175,19 @@ def _fine(dynamics: Any, points: int, rtol: float) -> Any:
 
 
 def _violation(
-    found: OptimalControl, fine: AbstractDynamics, states: Array, controls: Array
+    solved: OptimalControl, fine: AbstractDynamics, states: Array, controls: Array
 ) -> Array:
     """The largest violation of a constraint along a simulation."""
-    own, points = found.constraints, (len(states) - 1) // len(controls)
+    own, points = solved.constraints, (len(states) - 1) // len(controls)
     over = [jnp.zeros((), states.dtype)]
-    pairs = [(found.bounds, controls)]
+    pairs = [(solved.bounds, controls)]
     if own is not None:
         bounds = own.states
         if bounds is not None and jnp.ndim(bounds[0]) == 2:
             bounds = tuple(jnp.repeat(end, points, 0)[: len(states)] for end in bounds)
         pairs += [(bounds, states), (own.controls, controls)]
         problem = Problem(
-            fine, found.cost, states[0], jnp.zeros_like(states[0, 0]), constraints=own
+            fine, solved.cost, states[0], jnp.zeros_like(states[0, 0]), constraints=own
         )
         held = jnp.repeat(controls, points, axis=0)
         for c, equal in problem.constraints_along(states, held):
