@@ -5,7 +5,10 @@ virtual environments import it too.
 """
 
 import gc
+import os
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -146,3 +149,17 @@ def race(
         Timing(c.name, c.steps, tuple(s), c.compile_seconds)
         for c, s in zip(contenders, seconds, strict=True)
     ]
+
+
+def in_fresh_process(code: str) -> float:
+    """The seconds that a program prints in a process of its own, in double precision
+    and without compiled programs from disk."""
+    changes = {"JAX_ENABLE_COMPILATION_CACHE": "false", "JAX_ENABLE_X64": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | changes,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return float(done.stdout)

@@ -9,9 +9,6 @@ tables, and writes `benchmarks/results/nmpc.json`, and the same pinned to one co
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +22,7 @@ import pandas as pd
 import delucax as dlx
 from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._plans import AT_REST, LIMITED, Plans, pull
+from benchmarks._timing import in_fresh_process
 from benchmarks.planning import Charged, Discrete, guess_of, PEERS, Worker
 
 
@@ -193,22 +191,13 @@ print(time.perf_counter() - start)
 def first_answers() -> dict[str, float]:
     """Seconds from a problem to its first answer, each in a fresh process."""
     seconds = {}
-    environment = os.environ | {
-        "JAX_ENABLE_COMPILATION_CACHE": "false",
-        "JAX_ENABLE_X64": "1",
-    }
-    tasks = [(name, False) for name in LIMITED] + [("quadrotor among discs", True)]
-    for name, is_real_time in tasks:
-        code = FIRST.format(name=name, real_time=is_real_time)
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+    for name, is_real_time in [
+        *((name, False) for name in LIMITED),
+        ("quadrotor among discs", True),
+    ]:
         label = f"{name}, a real-time iteration" if is_real_time else name
-        seconds[label] = float(done.stdout)
+        code = FIRST.format(name=name, real_time=is_real_time)
+        seconds[label] = in_fresh_process(code)
     return seconds
 
 

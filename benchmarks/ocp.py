@@ -11,9 +11,6 @@ draws `docs/assets/optimal_control.svg`, no more.
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -26,6 +23,7 @@ import pandas as pd
 import delucax as dlx
 from benchmarks._machine import compile_anew, describe, run_in_settings
 from benchmarks._optimal import PROBLEMS
+from benchmarks._timing import in_fresh_process
 from benchmarks.planning import PEERS, Worker
 
 
@@ -109,21 +107,8 @@ print(time.perf_counter() - start)
 
 def first_answers() -> dict[str, float]:
     """Seconds from a name to a solution, each in a fresh process."""
-    seconds = {}
-    environment = os.environ | {
-        "JAX_ENABLE_COMPILATION_CACHE": "false",
-        "JAX_ENABLE_X64": "1",
-    }
-    for name in dlx.problems.NAMES:
-        done = subprocess.run(
-            [sys.executable, "-c", FIRST.format(name=name)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        seconds[name] = float(done.stdout)
-    return seconds
+    names = dlx.problems.NAMES
+    return {name: in_fresh_process(FIRST.format(name=name)) for name in names}
 
 
 SLOPES = {

@@ -13,10 +13,7 @@ import argparse
 import functools
 import importlib.util
 import json
-import os
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +27,7 @@ import pandas as pd
 
 import delucax as dlx
 from benchmarks._machine import compile_anew, describe, run_in_settings
-from benchmarks._timing import Contender, python, race
+from benchmarks._timing import Contender, in_fresh_process, python, race
 
 
 FAMILIES = "LIPMWALK", "WHLIPBAL", "QUADCMPC", "QUADCMPC in stages"
@@ -387,15 +384,8 @@ def batch(limit: float, rounds: int) -> dict[str, Any]:
 
 def first_answers() -> dict[str, float]:
     """Seconds from a problem to its solution, each in a fresh process."""
-    seconds = {}
-    for name, make in PROBLEMS.items():
-        environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-        command = [sys.executable, "-c", FIRST.format(make=make)]
-        done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, check=True
-        )
-        seconds[name] = float(done.stdout)
-    return seconds
+    programs = {name: FIRST.format(make=make) for name, make in PROBLEMS.items()}
+    return {name: in_fresh_process(code) for name, code in programs.items()}
 
 
 def measure(options: argparse.Namespace, folder: Path) -> None:

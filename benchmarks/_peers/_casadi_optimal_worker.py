@@ -19,6 +19,7 @@ import casadi as ca  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 from benchmarks._optimal import Optimal, PROBLEMS
+from benchmarks._peers._casadi_worker import solved
 
 
 def stepped(case: Optimal, n: int, m: int) -> Any:
@@ -81,24 +82,6 @@ def build(case: Optimal, request: dict[str, Any]) -> Any:
     return opti
 
 
-def solve(opti: Any) -> dict[str, Any]:
-    """From the guess."""
-    began = time.perf_counter()
-    try:
-        opti.solve()
-    except RuntimeError:
-        pass
-    spent = time.perf_counter() - began
-    stats = opti.stats()
-    return {
-        # Without what Opti does in Python.
-        "seconds": stats.get("t_wall_total", spent),
-        "objective": float(opti.debug.value(opti.f)),
-        "success": bool(stats["success"]),
-        "iterations": int(stats["iter_count"]),
-    }
-
-
 def main() -> None:
     """Answer requests until standard input ends."""
     ready: list[Any] = []
@@ -110,7 +93,7 @@ def main() -> None:
             seconds = time.perf_counter() - began
             answer: dict[str, Any] = {"id": len(ready) - 1, "seconds": seconds}
         elif "solve" in request:
-            answer = solve(ready[request["solve"]])
+            answer = solved(ready[request["solve"]])
         else:
             answer = {"casadi": ca.__version__}
         print(json.dumps(answer), flush=True)

@@ -70,6 +70,24 @@ def confine(opti: Any, x: Any, room: Any) -> None:
             opti.subject_to(opti.bounded(low, x[i], high))
 
 
+def solved(opti: Any) -> dict[str, Any]:
+    """What one solve from the guess finds, and the time that it takes."""
+    began = time.perf_counter()
+    try:
+        opti.solve()
+    except RuntimeError:
+        pass
+    spent = time.perf_counter() - began
+    stats = opti.stats()
+    return {
+        # Without what Opti does in Python, where the solver says how long it took.
+        "seconds": stats.get("t_wall_total", spent),
+        "objective": float(opti.debug.value(opti.f)),
+        "success": bool(stats["success"]),
+        "iterations": int(stats["iter_count"]),
+    }
+
+
 def solve(built: Any, case: Plans, starts: Any, guess: Any) -> dict[str, Any]:
     """One after the other, each from the guess."""
     opti, x0, X, U = built
@@ -81,18 +99,11 @@ def solve(built: Any, case: Plans, starts: Any, guess: Any) -> dict[str, Any]:
             opti.set_initial(X[k], states[k])
             opti.set_initial(u, controls[k])
         opti.set_initial(X[-1], states[-1])
-        began = time.perf_counter()
-        try:
-            opti.solve()
-        except RuntimeError:
-            pass
-        spent = time.perf_counter() - began
-        stats = opti.stats()
-        # Without what Opti does in Python, where the solver says how long it took.
-        seconds += stats.get("t_wall_total", spent)
-        costs.append(float(opti.debug.value(opti.f)))
-        fine.append(bool(stats["success"]))
-        iterations.append(int(stats["iter_count"]))
+        answer = solved(opti)
+        seconds += answer["seconds"]
+        costs.append(answer["objective"])
+        fine.append(answer["success"])
+        iterations.append(answer["iterations"])
     found = [np.atleast_1d(opti.debug.value(u)).tolist() for u in U]
     return {
         "seconds": seconds,
