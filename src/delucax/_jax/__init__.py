@@ -22,6 +22,7 @@ from ._batches import (
     hoisted as hoisted,
     matmul as matmul,
 )
+from ._compilation import quickly_compiled as quickly_compiled
 from ._components import (
     by_components as by_components,
     COMPONENTS_UP_TO as COMPONENTS_UP_TO,

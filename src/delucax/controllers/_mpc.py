@@ -23,7 +23,7 @@ from .._check import (
 )
 from .._check_models import check_cost_sizes
 from .._controller import AbstractController, Tally
-from .._jax import host_unless_traced, xp
+from .._jax import host_unless_traced, quickly_compiled, xp
 from .._module import as_float_array, function_field
 from .._results import Result, RESULTS
 from .._typing import Control, Difference, Observation, PRNGKey, RealScalar
@@ -377,7 +377,7 @@ class MPC(AbstractController):
 
 
 # Functions, as a call of a module's method takes a tenth of a millisecond each.
-@eqx.filter_jit
+@quickly_compiled
 def _prepared(mpc: MPC, t: RealScalar, state: MPCState) -> MPCState:
     last, planner = state.last, mpc.planner
     assert last.states is not None and isinstance(planner, SQP)
@@ -385,7 +385,7 @@ def _prepared(mpc: MPC, t: RealScalar, state: MPCState) -> MPCState:
     return state._replace(prepared=planner.prepare(problem, last))
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _fed_back(mpc: MPC, t: RealScalar, y: Observation, state: MPCState) -> Any:
     planner = mpc.planner
     assert isinstance(planner, SQP)

@@ -24,7 +24,7 @@ from .._check import (
     finite_vector,
 )
 from .._message import shortened
-from .._module import as_float_array, as_module
+from .._module import as_module
 from .._results import choose, raise_on_failure, RESULTS
 from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
@@ -198,7 +198,7 @@ class AbstractPlanner(eqx.Module):
         n, m = dynamics.state_size, dynamics.control_size
         x0 = finite_vector(x0, n, "x0", where)
         check_number(t0, "t0", where)
-        begin: Any = as_float_array(t0)
+        begin: Any = t0
         is_count = isinstance(controls, numbers.Integral)
         if isinstance(controls, Start | Plan):
             if self.starts_from_states:
@@ -263,13 +263,14 @@ class AbstractPlanner(eqx.Module):
         return checked_plan(plan, where, throw, problem)
 
 
-def _cast(array: Array, dtype: Any, shape: tuple[int, ...] | None = None) -> Array:
+def _cast(array: Any, dtype: Any, shape: tuple[int, ...] | None = None) -> Array:
     """The array in another precision, and of another shape if one is given."""
-    shape = array.shape if shape is None else shape
+    shape = np.shape(array) if shape is None else shape
     if isinstance(array, Tracer):
         return jnp.broadcast_to(array, shape).astype(dtype)
-    if array.dtype == dtype and array.shape == shape and not array.weak_type:
-        return array
+    if isinstance(array, jax.Array) and not array.weak_type:
+        if array.dtype == dtype and array.shape == shape:
+            return array
     # By NumPy, for each conversion would be compiled as a program of its own.
     return jnp.asarray(np.broadcast_to(np.asarray(array, dtype), shape))
 

@@ -15,6 +15,7 @@ from .._check import (
     finite_rows,
     is_concrete,
 )
+from .._jax import quickly_compiled
 from .._module import parameter
 from .._typing import PRNGKey
 from ..qp import Soft
@@ -222,7 +223,7 @@ def _check_controls(problem: Problem, horizon: int) -> None:
         )
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _solve(problem: Problem, start: Start, options: Options) -> Plan:
     n, whole, carried = problem.x0.shape[0], problem, None
     if problem.unknowns is not None:

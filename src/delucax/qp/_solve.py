@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from .._check import check_bool, check_count, check_instance, check_range, is_concrete
+from .._jax import quickly_compiled
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Array, RealScalar
 from ..math._linear_solve import full_precision
@@ -119,7 +119,8 @@ def as_scalar(number: Any, dtype: Any) -> Any:
     return number.astype(dtype)
 
 
-@eqx.filter_jit
+@quickly_compiled
+@quickly_compiled
 @full_precision
 def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     form = problem.form()
