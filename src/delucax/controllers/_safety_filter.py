@@ -26,6 +26,7 @@ from .._module import as_module
 from .._results import Result, RESULTS
 from .._typing import Array, PRNGKey, RealScalar
 from ..dynamics import AbstractDynamics
+from ..math._linear_solve import full_precision
 from ..systems import AbstractPlant, AbstractSystem
 from ._barriers import (
     as_degrees,
@@ -348,7 +349,21 @@ class SafetyFilter(AbstractController):
                 f"SafetyFilter: controller must return a control of shape ({m},), as "
                 f"the plant takes, got {jnp.shape(nominal)}."
             )
-        task, conditions = self._task(nominal.astype(y.dtype)), self._above(t, y)
+        u, over, count, result = self._least_change(t, y, nominal.astype(y.dtype))
+        after = SafetyFilterState(
+            controller=memory,
+            result=result,
+            missed=self._named(over),
+            failures=state.failures.add(result != RESULTS.successful),
+            iterations=jnp.asarray(count, state.iterations.dtype),
+        )
+        return u, after
+
+    # An accelerator's rounded products would let the plant through its barriers.
+    @full_precision
+    def _least_change(self, t: RealScalar, y: Array, nominal: Array) -> tuple:
+        """The control, what the conditions miss, how many iterations, the status."""
+        task, conditions = self._task(nominal), self._above(t, y)
         if isinstance(self.plant, AbstractDynamics):
             u, over, size, count, converged = least_change_sequentially(
                 task, conditions, self.max_iterations
@@ -358,15 +373,7 @@ class SafetyFilter(AbstractController):
             u = least_change(task, s, A)
             over, size = missed(task, s, A, u)
             count, converged = 1, True
-        result = judged(task, over, size, converged)
-        after = SafetyFilterState(
-            controller=memory,
-            result=result,
-            missed=self._named(over),
-            failures=state.failures.add(result != RESULTS.successful),
-            iterations=jnp.asarray(count, state.iterations.dtype),
-        )
-        return u, after
+        return u, over, count, judged(task, over, size, converged)
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         memory = self.controller.applied(u, cost, state.controller)

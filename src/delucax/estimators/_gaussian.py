@@ -251,7 +251,7 @@ class AbstractGaussianFilter(AbstractEstimator):
         # P + G (P_after - Sigma) G', of which the remainder is P - G Sigma G': a sum of
         # two semidefinite terms, where the textbook's difference may lose that in
         # rounding.
-        covariance = joint.remainder(G) + G @ after.covariance @ G.T
+        covariance = joint.remainder(G) + congruence(G, after.covariance)
         return _like(Belief(belief.mean + matvec(G, shift), covariance), belief)
 
 

@@ -22,7 +22,7 @@ from .._module import function_field, parameter, positive, weight
 from .._results import raise_on_failure, RESULTS
 from .._typing import Array, Difference, Numbers, Real
 from ..dynamics import AbstractDynamics, LinearDynamics
-from ..math._linear_solve import symmetric
+from ..math._linear_solve import full_precision, symmetric
 from ..riccati import filter_dare
 from ._gaussian import (
     AbstractGaussianFilter,
@@ -375,6 +375,7 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
         noise = self._noise(t, u, belief.mean)
         return self._sampled(advance, self.dynamics.difference, belief, noise)
 
+    @full_precision
     def _sampled(self, function, difference, belief, noise):
         mean, (n,) = belief.mean, belief.mean.shape
         # n + lambda in the textbooks, with lambda = alpha^2 (n + kappa) - n.

@@ -194,6 +194,7 @@ class Linear(NamedTuple):
     defects: Array
 
 
+@full_precision
 def solved(model: Model, window: Window, iterations: int) -> Window:
     """The window with its least-squares estimate, after so many iterations."""
     point = Point(window.x, window.zeta, jnp.zeros_like(window.prior.mean))

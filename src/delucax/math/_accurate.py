@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from .._jax import lax, matmul, on_host, scan, xp
 from .._typing import Array
+from ._linear_solve import full_precision
 from ._norms import power_of_two
 
 
@@ -20,6 +21,7 @@ _LONGEST = 512
 """Up to so many terms one slice of the factors is enough in double precision."""
 
 
+@full_precision
 def product(
     left: Float[Array, "n k"], right: Float[Array, "k m"], *added: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
