@@ -81,6 +81,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "are in `keep`, as by default, `trajectory.incident_counts` says how many were "
         "not."
     )
+    delay_beyond_memory = (
+        "A delay is negative, or longer than the memory of the dynamics: make them "
+        "with a longer memory, or keep the delay within it."
+    )
     no_equilibrium = (
         "There is no equilibrium near the guess: the least residual there is not zero. "
         "Fix fewer states and controls, or start from another guess."

@@ -9,8 +9,10 @@ from ._base import (
     open_loop as open_loop,
 )
 from ._conversion import c2d as c2d, d2c as d2c
+from ._delays import Delayed as Delayed, TransportDelay as TransportDelay
 from ._discretized import Discretized as Discretized
 from ._linear import LinearDynamics as LinearDynamics
 from ._linearize import linearize as linearize, OperatingPoint as OperatingPoint
+from ._method_of_steps import MethodOfSteps as MethodOfSteps
 from ._trim import trim as trim
-from ._wrappers import Delayed as Delayed, WorstCase as WorstCase
+from ._wrappers import WorstCase as WorstCase

@@ -181,7 +181,7 @@ def _forwarded_units(what: str) -> Any:
     return property(units, doc="Those of the wrapped plant if the names are, else ().")
 
 
-class _Forwarding(AbstractDynamics):
+class Forwarding(AbstractDynamics):
     """Dynamics whose names, sizes and hooks are by default those of a wrapped plant."""
 
     @property
@@ -203,7 +203,7 @@ class _Forwarding(AbstractDynamics):
         """Whether `observe` returns the state itself."""
         # A sensor of the wrapper's own is traced; else the wrapped plant is asked,
         # which may know without tracing.
-        own = type(self).observe is not _Forwarding.observe
+        own = type(self).observe is not Forwarding.observe
         if own or self.state_size != self._inside.state_size:
             return super().observes_state
         return self._inside.observes_state
@@ -218,7 +218,7 @@ class _Forwarding(AbstractDynamics):
         return self._inside.equilibrium()
 
 
-class AbstractDiscretization(_Forwarding):
+class AbstractDiscretization(Forwarding):
     """Dynamics that step a continuous-time system, in a field `system`, whose names,
     units, sensor and equilibrium they have.
 
@@ -261,7 +261,7 @@ class AbstractDiscretization(_Forwarding):
         return self.system
 
 
-class AbstractWrapper(_Forwarding):
+class AbstractWrapper(Forwarding):
     """A wrapper around a field `dynamics`, to which everything is forwarded that a
     subclass does not override.
 

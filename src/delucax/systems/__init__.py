@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from .._lazy import lazily as _lazily
 from ._base import AbstractPlant as AbstractPlant, AbstractSystem as AbstractSystem
+from ._delayed import AbstractDelaySystem as AbstractDelaySystem
 from ._general import (
     FunctionSystem as FunctionSystem,
     LinearSystem as LinearSystem,

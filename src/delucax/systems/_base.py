@@ -133,6 +133,25 @@ class AbstractPlant(eqx.Module):
         )
 
 
+def check_names(plant: AbstractPlant) -> None:
+    """Raise unless the names of a plant are tuples, and its angles are states."""
+    where = type(plant).__name__
+    for kind in ("state", "angle", "control", "disturbance"):
+        names = getattr(plant, f"{kind}_names")
+        if isinstance(names, str) or not isinstance(names, tuple | list):
+            raise ValueError(
+                f"{where}: {kind}_names must be a tuple of strings, such as "
+                f"('angle', 'velocity'), got {names!r}."
+            )
+    if not plant.state_names:
+        raise ValueError(f"{where}: state_names must not be empty.")
+    if not set(plant.angle_names) <= set(plant.state_names):
+        raise ValueError(
+            f"{where}: angle_names must be among state_names, "
+            f"{plant.state_names}, got {plant.angle_names}."
+        )
+
+
 class AbstractSystem(AbstractPlant):
     r"""A system in continuous time, `dx/dt = f(t, x, u, w)`.
 
@@ -176,21 +195,7 @@ class AbstractSystem(AbstractPlant):
     """
 
     def __check_init__(self):
-        where = type(self).__name__
-        for kind in ("state", "angle", "control", "disturbance"):
-            names = getattr(self, f"{kind}_names")
-            if isinstance(names, str) or not isinstance(names, tuple | list):
-                raise ValueError(
-                    f"{where}: {kind}_names must be a tuple of strings, such as "
-                    f"('angle', 'velocity'), got {names!r}."
-                )
-        if not self.state_names:
-            raise ValueError(f"{where}: state_names must not be empty.")
-        if not set(self.angle_names) <= set(self.state_names):
-            raise ValueError(
-                f"{where}: angle_names must be among state_names, "
-                f"{self.state_names}, got {self.angle_names}."
-            )
+        check_names(self)
         check_parameters(self)
 
     @classmethod

@@ -1,0 +1,329 @@
+"""Dynamics whose controls and observations arrive late."""
+
+import abc
+import math
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_vector, check_count, check_instance, check_number, is_concrete
+from .._module import parameter
+from .._results import choose, first_failure, Result, RESULTS
+from .._typing import Control, Numbers, Observation, Real, RealScalar, State, Time
+from ._base import AbstractDiscretization, AbstractDynamics, AbstractWrapper
+
+
+_SLACK = 8
+"""In units of rounding, relative."""
+
+
+class _AbstractDelay(AbstractWrapper):
+    """Dynamics whose state has pending controls and observations at its end,
+
+    `(x, u[k - 1], ..., u[k - c], y[k - 1], ..., y[k - s])`, the newest first.
+    """
+
+    @property
+    @abc.abstractmethod
+    def _kept(self) -> tuple[int, int]:
+        """How many controls and observations are kept, `(c, s)`."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        inner, (controls, sensor) = self.dynamics, self._kept
+        ages = range(controls)
+        late = [f"{name}[-{k + 1}]" for k in ages for name in inner.control_names]
+        outputs = range(inner.observation_size if sensor else 0)
+        late += [f"y{i}[-{k + 1}]" for k in range(sensor) for i in outputs]
+        return (*inner.state_names, *late)
+
+    def _cut(self, x: Array) -> tuple[Array, Array, Array]:
+        """The plant's own state, the pending controls and the pending observations."""
+        n = self.dynamics.state_size
+        m = n + self._kept[0] * self.dynamics.control_size
+        return x[:n], x[n:m], x[m:]
+
+    def inner(self, x: Array) -> Array:
+        """The plant's own state.
+
+        **Arguments:** `x`: the state.
+
+        **Returns:** its first entries.
+        """
+        return self._cut(x)[0]
+
+    def filled(self, x: Numbers, u: Numbers | None = None) -> Array:
+        """The state of a plant that has rested.
+
+        **Arguments:**
+
+        - `x`: the plant's own state.
+        - `u`: the pending control, zero by default.
+
+        **Returns:** the state, in which every pending control is `u` and every pending
+        observation that of `x`.
+
+        **Raises:** `ValueError` on a wrong shape.
+        """
+        inner, where = self.dynamics, f"{type(self).__name__}.filled"
+        x = as_vector(x, inner.state_size, "x", where)
+        u = [0.0] * inner.control_size if u is None else u
+        u = as_vector(u, inner.control_size, "u", where)
+        return self._filled(x, u)
+
+    @eqx.filter_jit
+    def _filled(self, x: Array, u: Array) -> Array:
+        y, (controls, sensor) = self.dynamics.observe(0.0, x), self._kept
+        late = [jnp.tile(u, controls), jnp.tile(y, sensor)]
+        return jnp.concatenate([x, *late]).astype(x.dtype)
+
+    @property
+    def observes_state(self) -> bool:
+        """True if nothing is kept and the plant observes its state."""
+        return not any(self._kept) and self.dynamics.observes_state
+
+    def difference(self, x: State, x_ref: State) -> State:
+        # Angles wrap in the plant's own state alone.
+        n = self.dynamics.state_size
+        own = self.dynamics.difference(x[:n], x_ref[:n])
+        return jnp.concatenate([own, x[n:] - x_ref[n:]])
+
+    def equilibrium(self) -> tuple[State, Control]:
+        x, u = self.dynamics.equilibrium()
+        return self.filled(x, u), u
+
+
+class Delayed(_AbstractDelay):
+    """Dynamics with an input delay, an output delay or both, in whole steps,
+
+    `x_next = F(t, x, u[k - controls], w)`, `y = observe(t, x)[k - sensor]`.
+
+    Pending controls and observations are part of the state: `(x, u[k - 1], ...,
+    u[k - controls], y[k - 1], ..., y[k - sensor])`. It is a true transport delay,
+    differentiable like any other state. [`delucax.dynamics.TransportDelay`][] takes any
+    time in place of whole steps.
+
+    **Arguments:**
+
+    - `dynamics`: the plant.
+    - `controls`: steps until a control acts, 0 by default.
+    - `sensor`: steps until an observation is read, 0 by default.
+
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or a delay is
+    not a whole number of at least 0.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        late = dlx.dynamics.Delayed(plant, controls=2)
+        x0 = late.filled(jnp.array([0.1, 0.0]))
+        dlx.open_loop(late, x0, jnp.ones((5, 1)))
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    controls: int = eqx.field(default=0, static=True)
+    sensor: int = eqx.field(default=0, static=True)
+
+    def __check_init__(self):
+        check_count(self.controls, "controls", "Delayed", least=0)
+        check_count(self.sensor, "sensor", "Delayed", least=0)
+
+    @property
+    def _kept(self) -> tuple[int, int]:
+        return self.controls, self.sensor
+
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
+        own, controls, observed = self._cut(x)
+        acting, late = u, []
+        # The newest comes first, and the oldest acts, or is read. Slices of no entries
+        # are left out, so that the state stays one of components.
+        if self.controls:
+            m = u.shape[0]
+            acting = controls[-m:]
+            late = [u.astype(x.dtype)]
+            late += [controls[:-m]] if self.controls > 1 else []
+        if self.sensor:
+            y = self.dynamics.observe(t, own).astype(x.dtype)
+            late += [y, observed[: -y.shape[0]]] if self.sensor > 1 else [y]
+        after, result = self.dynamics.advance(t, own, acting, w)
+        return jnp.concatenate([after, *late]), result
+
+    def observe(self, t: Time, x: State) -> Observation:
+        own, _, observed = self._cut(x)
+        if not self.sensor:
+            return self.dynamics.observe(t, own)
+        # The oldest observation is the last block.
+        return observed[-(observed.shape[0] // self.sensor) :]
+
+
+class TransportDelay(_AbstractDelay):
+    r"""A plant in continuous time whose controls act late, whose sensor is read late,
+    or both, by times that need not be multiples of `dt`,
+
+    `dx/dt = f(t, x, u(t - controls), w)`, `y(t) = observe(x(t - sensor))`,
+
+    where `u` is held over each interval. So an interval begins with the control of one
+    interval and goes on with that of the next: it is integrated in two parts, which is
+    exact. Where the sensor is late, the part up to what it will read is integrated once
+    more.
+
+    The state is `(x, u[k - 1], ..., y[k - 1], ...)`: pending controls, and what the
+    sensor read in the intervals before, the newest first. `filled` makes one.
+    Disturbances enter as in the plant; those that are added to its next state are added
+    at the end of the interval.
+
+    The delays are differentiable, to the right where one is a whole number of steps.
+    How many controls and readings are kept is fixed when the dynamics are made. A delay
+    that is changed later, such as in `delucax.training.fit`, must stay within this
+    memory: the status is `delay_beyond_memory` if it does not.
+
+    **Arguments:**
+
+    - `dynamics`: the plant, such as a [`delucax.Discretized`][], without a diffusion.
+    - `controls`: the time until a control acts, 0 by default.
+    - `sensor`: the age of what the sensor reads, 0 by default.
+    - `control_memory`, `sensor_memory`: the longest delay that can be set later, in
+        steps; as many as the delays need by default.
+
+    **Raises:** `ValueError` if `dynamics` is no discretisation of a system or has a
+    diffusion, or a delay is negative, not finite, or longer than its memory.
+
+    Source: Åström and Wittenmark, 1997, section 2.3.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        late = dlx.dynamics.TransportDelay(plant, controls=0.07, sensor=0.01)
+        x0 = late.filled(jnp.array([0.1, 0.0]))
+        dlx.open_loop(late, x0, jnp.ones((5, 1)))
+        ```
+    """
+
+    dynamics: AbstractDiscretization
+    controls: Real = parameter(0.0)
+    sensor: Real = parameter(0.0)
+    control_memory: int | None = eqx.field(default=None, static=True)
+    sensor_memory: int | None = eqx.field(default=None, static=True)
+
+    def __post_init__(self):
+        where = "TransportDelay"
+        check_instance(self.dynamics, AbstractDiscretization, "dynamics", where)
+        for kind in ("control", "sensor"):
+            name = "controls" if kind == "control" else kind
+            delay, memory = getattr(self, name), getattr(self, f"{kind}_memory")
+            check_number(delay, name, where)
+            known = is_concrete(delay) and is_concrete(self.dynamics.dt)
+            steps = float(delay) / float(self.dynamics.dt) if known else 0.0
+            if steps < 0:
+                raise ValueError(f"{where}: {name} must be at least 0, got {delay}.")
+            slack = 1 - _SLACK * float(jnp.finfo(float).eps)
+            if memory is None:
+                if not known:
+                    raise ValueError(
+                        f"{where}: {kind}_memory must be given where {name} or dt is "
+                        "not known in advance."
+                    )
+                memory = math.ceil(steps * slack)
+            memory = check_count(memory, f"{kind}_memory", where, least=0)
+            if steps * slack > memory:
+                raise ValueError(
+                    f"{where}: {name} must be within the memory of {memory} steps of "
+                    f"{self.dynamics.dt}, got {delay}."
+                )
+            setattr(self, f"{kind}_memory", memory)
+
+    def __check_init__(self):
+        if self.dynamics.noise == "brownian":
+            raise ValueError(
+                "TransportDelay: dynamics must have no diffusion: the parts of an "
+                "interval would need increments of their own."
+            )
+
+    @property
+    def _kept(self) -> tuple[int, int]:
+        assert self.control_memory is not None and self.sensor_memory is not None
+        return self.control_memory, self.sensor_memory and self.sensor_memory + 1
+
+    def _in_steps(self, delay: Array) -> tuple[Array, Array]:
+        """The whole steps of a delay, and the rest as a fraction of a step."""
+        steps = delay / self.dynamics.dt
+        # A quotient that should be whole may be rounded.
+        slack = _SLACK * float(jnp.finfo(float).eps) * steps
+        whole = jnp.floor(steps + slack)
+        rest = steps - whole
+        # Zero, with the derivative of the delay.
+        return whole, jnp.where(rest < slack, rest - lax.stop_gradient(rest), rest)
+
+    def _is_beyond(self, delay: Array, memory: int) -> Array:
+        whole, rest = self._in_steps(delay)
+        return (whole < 0) | (whole + (rest > 0) > memory)
+
+    def _part(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None, h: Array
+    ) -> tuple[Array, Result]:
+        """The state after a part `h` of an interval."""
+        part = eqx.tree_at(lambda inner: inner.dt, self.dynamics, h)
+        return part.advance(t, x, u, w)
+
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
+        own, pending, observed = self._cut(x)
+        dt, m = self.dynamics.dt, u.shape[0]
+        held = None if self.noise == "additive" else w
+        if not self._kept[0]:
+            switch, middle, first, second = 0.0, own, u, u
+            after, result = self.dynamics.advance(t, own, u, w)
+        else:
+            newest = jnp.concatenate([u.astype(x.dtype), pending])
+            table, most = newest.reshape(-1, m), self._kept[0]
+            whole, rest = self._in_steps(self.controls)
+            # The control of one interval, and then that of the next.
+            index = whole.astype(int)
+            first = table[jnp.clip(index + 1, 0, most)]
+            second = table[jnp.clip(index, 0, most)]
+            switch = rest * dt
+            middle, early = self._part(t, own, first, held, switch)
+            after, late = self._part(t + switch, middle, second, w, dt - switch)
+            failed = self._is_beyond(self.controls, most)
+            result = first_failure(early, late)
+            result = choose(failed, RESULTS.delay_beyond_memory, result)
+            pending = newest[:-m]
+        if self._kept[1]:
+            _, rest = self._in_steps(self.sensor)
+            # What is read later is the state `rest` steps before the end.
+            at = (1 - rest) * dt
+            before = at < switch
+            start = jnp.where(before, own, middle)
+            since = jnp.where(before, 0.0, switch)
+            acting = jnp.where(before, first, second)
+            read, failure = self._part(t + since, start, acting, held, at - since)
+            if self.noise == "additive" and w is not None:
+                read = read + jnp.where(rest > 0, 0, w)
+            y = self.dynamics.observe(t + at, read).astype(x.dtype)
+            observed = jnp.concatenate([y, observed[: -y.shape[0]]])
+            failed = self._is_beyond(self.sensor, self._kept[1] - 1)
+            result = first_failure(result, failure)
+            result = choose(failed, RESULTS.delay_beyond_memory, result)
+        return jnp.concatenate([after, pending, observed]).astype(x.dtype), result
+
+    def observe(self, t: Time, x: State) -> Observation:
+        own, _, observed = self._cut(x)
+        most = self._kept[1]
+        if not most:
+            return self.dynamics.observe(t, own)
+        whole, _ = self._in_steps(self.sensor)
+        return observed.reshape(most, -1)[jnp.clip(whole.astype(int), 0, most - 1)]

@@ -1,0 +1,246 @@
+"""Systems with delayed states, integrated from one step to the next."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_entries, as_vector, check_count, check_instance, is_concrete
+from .._integration import check_method, RK4, runge_kutta_step, tableau_of
+from .._module import parameter
+from .._results import choose, Result, RESULTS
+from .._typing import Control, Numbers, Observation, Real, RealScalar, State, Time
+from ..systems import AbstractDelaySystem
+from ._base import Forwarding
+
+
+_PARTS = "start", "slope_at_start", "end", "slope_at_end"
+
+
+class MethodOfSteps(Forwarding):
+    r"""Zero-order-hold discretisation of a system with delayed states.
+
+    Each control interval is cut into `substeps` equal steps of an explicit Runge-Kutta
+    method, none longer than the shortest delay, so that what is late is always known:
+    it is read off the cubic through the states and slopes at the ends of a past step,
+    whose error is of order 4 in the step. The control is held, and so is a disturbance
+    that enters the field; where the system names none, `w` is added to the next state.
+
+    The state is `(x, history)`: of each past step within `memory` the state and the
+    slope at its start and at its end, the newest step first. `filled` makes one that
+    has rested, and `started` one from a function of time. It is a state like any other:
+    [`delucax.linearize`][] gives a matrix whose eigenvalues tell of stability, and
+    derivatives with respect to the delays go through the cubics.
+
+    The slope jumps where a control switches, and where the history ends; a delay later
+    a higher derivative jumps. Order 4 is reached where delays are whole numbers of
+    substeps.
+
+    **Arguments:**
+
+    - `system`: the system, a [`delucax.systems.AbstractDelaySystem`][].
+    - `dt`: the control interval, a positive number.
+    - `solver`: an explicit Runge-Kutta method of Diffrax; [`delucax.dynamics.RK4`][] by
+        default.
+    - `substeps`: steps in an interval; as many as the shortest delay asks for by
+        default, and at least 1.
+    - `memory`: the longest delay that can be set later, in substeps; that of the delays
+        by default.
+
+    **Raises:** `ValueError` if a delay is not positive, shorter than a substep or
+    longer than `memory`, or if `solver` does not fit. Delays that change later have the
+    status `delay_beyond_memory` there.
+
+    Source: Hairer, Nørsett and Wanner, 1993, section II.17.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from jaxtyping import Array
+
+        class Lag(dlx.systems.AbstractDelaySystem):
+            state_names, control_names = ("x",), ("u",)
+            delays: Array = dlx.parameter([0.4])
+
+            def vector_field(self, t, x, u, w, late):
+                return -late[0] + u
+
+        dynamics = dlx.dynamics.MethodOfSteps(Lag(), dt=0.1)
+        dlx.open_loop(dynamics, dynamics.filled([1.0]), jnp.zeros((20, 1)))[:, 0]
+        ```
+    """
+
+    system: AbstractDelaySystem
+    dt: Real = parameter()
+    solver: diffrax.AbstractSolver = RK4()
+    substeps: int | None = eqx.field(default=None, static=True)
+    memory: int | None = eqx.field(default=None, static=True)
+
+    def __post_init__(self):
+        where = "MethodOfSteps"
+        check_instance(self.system, AbstractDelaySystem, "system", where)
+        delays = as_entries(self.system.delays, None, "delays", where, "delay")
+        known = is_concrete(delays) and is_concrete(self.dt)
+        if not known and (self.substeps is None or self.memory is None):
+            raise ValueError(
+                f"{where}: substeps and memory must be given where the delays or dt "
+                "are not known in advance."
+            )
+        if known and not (np.size(delays) and np.all(np.asarray(delays) > 0)):
+            raise ValueError(f"{where}: delays must be positive, got {delays}.")
+        # A quotient that should be whole may be rounded up.
+        up = lambda ratio: max(1, int(np.ceil(float(ratio) * (1 - 1e-6))))
+        if self.substeps is None:
+            self.substeps = up(self.dt / np.min(delays))
+        self.substeps = check_count(self.substeps, "substeps", where)
+        if self.memory is None:
+            self.memory = up(np.max(delays) * self.substeps / self.dt)
+        self.memory = check_count(self.memory, "memory", where)
+
+    def __check_init__(self):
+        where, delays = "MethodOfSteps", jnp.asarray(self.system.delays)
+        if is_concrete(delays) and is_concrete(self.dt) and self._is_beyond(delays):
+            raise ValueError(
+                f"{where}: delays must be at least a substep, {self._step}, and at "
+                f"most memory = {self.memory} of them, got {delays}."
+            )
+        check_method(self.solver, None, 1, None, where)
+        if tableau_of(self.solver) is None:
+            raise ValueError(
+                f"{where}: solver must be an explicit Runge-Kutta method, got "
+                f"{type(self.solver).__name__}."
+            )
+        if self.system.noise == "brownian":
+            raise ValueError(f"{where}: system must have no Brownian noise.")
+
+    @property
+    def _inside(self):
+        return self.system
+
+    @property
+    def _step(self) -> Array:
+        assert self.substeps is not None
+        return self.dt / self.substeps
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        names, steps = self.system.state_names, range(self.memory or 0)
+        parts = [(k, part) for k in steps for part in _PARTS]
+        late = [f"{name}.{part}[-{k + 1}]" for k, part in parts for name in names]
+        return (*names, *late)
+
+    def _cut(self, x: Array) -> tuple[Array, Array]:
+        """The system's own state, and the history, shape `(memory, 4, n)`."""
+        n = self.system.state_size
+        return x[:n], x[n:].reshape(-1, len(_PARTS), n)
+
+    def inner(self, x: Array) -> Array:
+        """The system's own state.
+
+        **Arguments:** `x`: the state.
+
+        **Returns:** its first entries.
+        """
+        return self._cut(x)[0]
+
+    def filled(self, x: Numbers) -> Array:
+        """The state of a system that has rested.
+
+        **Arguments:** `x`: the system's own state, now and before.
+
+        **Returns:** the state.
+
+        **Raises:** `ValueError` on a wrong shape.
+        """
+        x = as_vector(x, self.system.state_size, "x", "MethodOfSteps.filled")
+        rest = jnp.stack([x, jnp.zeros_like(x), x, jnp.zeros_like(x)])
+        history = jnp.tile(rest[None], (self.memory or 0, 1, 1))
+        return jnp.concatenate([x, history.ravel()])
+
+    def started(self, past: Callable[[Array], Array]) -> Array:
+        """The state after a given past.
+
+        **Arguments:** `past`: the system's own state as a function of the time before
+        now, which is 0: it is called at negative times.
+
+        **Returns:** the state.
+
+        **Raises:** `ValueError` on a wrong shape.
+        """
+        h, zero = self._step, jnp.zeros(())
+        x = as_vector(past(zero), self.system.state_size, "past", "MethodOfSteps")
+        both = lambda s: jax.jvp(past, (s,), (jnp.ones_like(s),))
+        ends = -h * jnp.arange((self.memory or 0) + 1, dtype=zero.dtype)
+        values, slopes = jax.vmap(both)(ends)
+        parts = values[1:], slopes[1:], values[:-1], slopes[:-1]
+        return jnp.concatenate([x, jnp.stack(parts, axis=1).ravel()])
+
+    def _is_beyond(self, delays: Array) -> Array:
+        ratio = delays / self._step
+        slack = 1e-6  # a delay that should be whole in substeps may be rounded
+        most = (self.memory or 0) + slack
+        return jnp.any((ratio < 1 - slack) | (ratio > most))
+
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
+        system, h = self.system, self._step
+        own, history = self._cut(x)
+        delays = jnp.atleast_1d(system.delays).astype(x.dtype)
+        held = None if self.noise == "additive" else w
+        if held is None and self.noise is None:
+            held = jnp.zeros(self.disturbance_size, x.dtype)
+        tableau: Any = tableau_of(self.solver)
+
+        def body(carry, k):
+            own, history = carry
+            begin = t + k * h
+
+            def field(s, x):
+                late = _at(history, (delays - s) / h, h)
+                return system.vector_field(begin + s, x, u, held, late)
+
+            after = runge_kutta_step(tableau, field, jnp.zeros((), x.dtype), own, h)
+            parts = own, field(0.0, own), after, field(h, after)
+            newest = jnp.stack(parts).astype(x.dtype)
+            return (after, jnp.concatenate([newest[None], history[:-1]])), None
+
+        steps = jnp.arange(self.substeps or 1)
+        (own, history), _ = lax.scan(body, (own, history), steps)
+        if self.noise == "additive" and w is not None:
+            own = own + w
+        failed = self._is_beyond(delays)
+        result = choose(failed, RESULTS.delay_beyond_memory, RESULTS.successful)
+        return jnp.concatenate([own, history.ravel()]).astype(x.dtype), result
+
+    def observe(self, t: Time, x: State) -> Observation:
+        return self.system.observe(t, self.inner(x))
+
+    def difference(self, x: State, x_ref: State) -> State:
+        # Angles wrap in the system's own state alone.
+        n = self.system.state_size
+        own = self.system.difference(x[:n], x_ref[:n])
+        return jnp.concatenate([own, x[n:] - x_ref[n:]])
+
+    def equilibrium(self) -> tuple[State, Control]:
+        x, u = self.system.equilibrium()
+        return self.filled(x), u
+
+
+def _at(history: Array, age: Array, h: Array) -> Array:
+    """The states `age` steps ago, by Hermite's cubic."""
+    index = jnp.clip(jnp.floor(age).astype(int), 0, len(history) - 1)
+    start, rise, end, fall = jnp.moveaxis(history[index], 1, 0)
+    s = (1 - (age - index))[:, None]
+    # In the form of Hairer, Nørsett and Wanner, II.6: exact at both ends.
+    change = end - start
+    bend = (1 - 2 * s) * change + (s - 1) * h * rise + s * h * fall
+    return (1 - s) * start + s * end + s * (s - 1) * bend

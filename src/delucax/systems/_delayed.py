@@ -1,0 +1,77 @@
+"""Systems whose derivative depends on past states."""
+
+import abc
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from .._module import check_parameters
+from .._typing import Control, Disturbance, State, Time
+from ._base import AbstractPlant, check_names
+
+
+class AbstractDelaySystem(AbstractPlant):
+    """A system with delayed states,
+
+    `dx/dt = f(t, x(t), u, w, late)`, `late[i] = x(t - delays[i])`.
+
+    Subclass it as a [`delucax.AbstractSystem`][], with one argument more.
+    [`delucax.dynamics.MethodOfSteps`][] makes dynamics of it. Delays of controls and
+    sensors alone are those of [`delucax.dynamics.TransportDelay`][].
+
+    **Attributes:** `delays`: the delays, positive, shape `(d,)`; a
+    [`delucax.parameter`][], or a property that is computed from some.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from jaxtyping import Array
+
+        class Blowflies(dlx.systems.AbstractDelaySystem):
+            state_names, control_names = ("population",), ("harvest",)
+            delays: Array = dlx.parameter([12.0])
+            death: Array = dlx.parameter(0.2)
+
+            def vector_field(self, t, x, u, w, late):
+                born = 8.5 * late[0] * jnp.exp(-late[0])
+                return born - self.death * x - u
+
+        dynamics = dlx.dynamics.MethodOfSteps(Blowflies(), dt=0.5)
+        x0 = dynamics.filled([1.0])
+        dlx.open_loop(dynamics, x0, jnp.zeros((100, 1)))[-1, 0]
+        ```
+    """
+
+    if TYPE_CHECKING:  # a static checker would ask for an abstract field as argument
+        delays: ClassVar[Any]
+    else:
+        delays: eqx.AbstractVar[Float[Array, " d"]]
+
+    def __check_init__(self):
+        check_names(self)
+        check_parameters(self)
+
+    @abc.abstractmethod
+    def vector_field(
+        self,
+        t: Time,
+        x: State,
+        u: Control,
+        w: Disturbance,
+        late: Float[Array, "d n"],
+    ) -> State:
+        """The time derivative of the state.
+
+        **Arguments:**
+
+        - `t`: time, a scalar.
+        - `x`: state, shape `(state_size,)`.
+        - `u`: control, shape `(control_size,)`.
+        - `w`: disturbance, as for [`delucax.AbstractSystem`][].
+        - `late`: the state at `t - delays[i]` as row `i`, shape `(d, state_size)`.
+
+        **Returns:** dx/dt, shape `(state_size,)`.
+        """
