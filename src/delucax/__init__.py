@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         environments as environments,
         estimators as estimators,
         experiments as experiments,
+        export as export,
         interop as interop,
         lung as lung,
         math as math,
@@ -80,7 +81,7 @@ del TYPE_CHECKING
 
 _PACKAGES = """
     analysis controllers costs disturbances dynamics environments estimators experiments
-    interop lung math planning plotting problems qp references riccati simulation
+    export interop lung math planning plotting problems qp references riccati simulation
     studies systems training
 """.split()
 _name, _names = _lazily(

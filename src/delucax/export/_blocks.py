@@ -1,0 +1,179 @@
+"""Plain programs: nodes in blocks, and those that nothing needs left out.
+
+Loops and branches have blocks of their own, which may read the values of the blocks
+around them.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Const:
+    """A known array; a key of `jax.random` stays one of JAX."""
+
+    __slots__ = ("dtype", "shape", "value")
+
+    def __init__(self, value: Any):
+        if not jnp.issubdtype(value.dtype, jax.dtypes.extended):
+            value = np.asarray(value)
+        self.value, self.shape, self.dtype = value, value.shape, value.dtype
+
+
+class Var:
+    """An array that is computed. `weight` counts its readers, one in a loop twice."""
+
+    __slots__ = ("depth", "dtype", "remaining", "shape", "weight")
+
+    def __init__(self, shape: Any, dtype: Any, depth: int):
+        self.shape, self.dtype, self.depth = tuple(shape), dtype, depth
+        self.weight = self.remaining = 0
+
+
+Atom = Const | Var
+
+
+class Node:
+    """An operation. `where` says which line of Python asked for it."""
+
+    __slots__ = ("ins", "op", "outs", "params", "where")
+
+    def __init__(self, op: str, ins: list[Atom], outs: list[Var], params: Any, where):
+        self.op, self.ins, self.outs, self.params = op, ins, outs, params
+        self.where = where
+
+    @property
+    def blocks(self) -> "list[Block]":
+        """Those inside."""
+        return self.params.get("blocks", [])
+
+
+class Block:
+    """Nodes in order, from `params` to `outs`."""
+
+    def __init__(self, parent: "Block | None", repeats: bool):
+        self.parent, self.repeats = parent, repeats
+        self.depth: int = parent.depth + 1 if parent else 0
+        self.params: list[Var] = []
+        self.nodes: list[Node] = []
+        self.outs: list[Atom] = []
+        self.known: dict[Any, Sequence[Atom]] = {}
+
+    def param(self, shape: Any, dtype: Any) -> Var:
+        """A new parameter."""
+        var = Var(shape, dtype, self.depth)
+        self.params.append(var)
+        return var
+
+
+def drop_dead(block: Block) -> None:
+    """Leave out the nodes that nothing needs, and what loops carry to no use."""
+    _keep(block, set(), True)
+
+
+def _keep(block: Block, needed: set[Var], drops: bool) -> None:
+    """Add what a block needs for its results; and leave out the rest, if so told."""
+    needed.update(a for a in block.outs if isinstance(a, Var))
+    kept = []
+    for node in reversed(block.nodes):
+        if needed.isdisjoint(node.outs):
+            continue
+        if drops:
+            kept.append(node)
+        if node.op in ("scan", "while"):
+            live = _live(node, needed)
+            if drops:
+                _narrow(node, live, needed)
+                for inner in node.blocks:
+                    _keep(inner, needed, True)
+            given = zip(node.ins, _is_given(node, live), strict=True)
+            needed.update(a for a, used in given if used and isinstance(a, Var))
+            continue
+        for inner in node.blocks:
+            _keep(inner, needed, drops)
+        needed.update(a for a in node.ins if isinstance(a, Var))
+    if drops:
+        block.nodes = kept[::-1]
+
+
+def _carried(node: Node) -> int:
+    return node.params.get("carried", len(node.ins))
+
+
+def _live(node: Node, needed: set[Var]) -> set[int]:
+    """Which of the values that a loop carries are of use. What its body reads becomes
+    needed."""
+    *tests, body = node.blocks
+    count = _carried(node)
+    for test in tests:
+        _keep(test, needed, False)
+    live = {
+        k
+        for k in range(count)
+        if node.outs[k] in needed or any(test.params[k] in needed for test in tests)
+    }
+    outs = body.outs
+    while True:
+        wanted = [k in live if k < count else node.outs[k] in needed
+                  for k in range(len(outs))]  # fmt: skip
+        body.outs = [out for out, use in zip(outs, wanted, strict=True) if use]
+        _keep(body, needed, False)
+        body.outs = outs
+        more = {k for k in range(count) if body.params[k] in needed} | live
+        if more == live:
+            return live
+        live = more
+
+
+def _is_given(node: Node, live: set[int]) -> list[bool]:
+    """Which inputs of a loop are of use; after `_narrow` all are."""
+    if len(node.ins) == len(node.blocks[-1].params) and "narrow" in node.params:
+        return [True] * len(node.ins)
+    count = _carried(node)
+    return [k in live or k >= count for k in range(len(node.ins))]
+
+
+def _narrow(node: Node, live: set[int], needed: set[Var]) -> None:
+    """Leave out what a loop carries, reads or stacks to no use."""
+    body, count = node.blocks[-1], _carried(node)
+    ins = [k for k in range(len(node.ins)) if k in live or k >= count
+           and body.params[k] in needed]  # fmt: skip
+    outs = [k for k, out in enumerate(node.outs) if k in live or k >= count
+            and out in needed]  # fmt: skip
+    node.ins = [node.ins[k] for k in ins]
+    for inner in node.blocks:
+        inner.params = [inner.params[k] for k in ins]
+    body.outs = [body.outs[k] for k in outs]
+    node.outs = [node.outs[k] for k in outs]
+    node.params["narrow"] = True
+    if "carried" in node.params:
+        node.params["carried"] = len(live)
+
+
+def count_readers(block: Block) -> None:
+    """Count the readers of each value."""
+
+    def read(atom, block):
+        if isinstance(atom, Var):
+            atom.weight += 1 if not _repeats_within(block, atom.depth) else 2
+            atom.remaining += 1
+
+    for node in block.nodes:
+        for atom in node.ins:
+            read(atom, block)
+        for inner in node.blocks:
+            count_readers(inner)
+    for atom in block.outs:
+        read(atom, block)
+
+
+def _repeats_within(block: Block | None, depth: int) -> bool:
+    """Whether a loop lies between the block and that depth."""
+    while block is not None and block.depth > depth:
+        if block.repeats:
+            return True
+        block = block.parent
+    return False

@@ -1,0 +1,360 @@
+"""A controller in C: its state, and the functions that act on it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._check import finite_vector
+from .._controller import AbstractController, initial_state
+from .._module import parts_of
+from ..systems import AbstractPlant
+from . import _file
+from ._cast import cast, precision
+from ._description import Array, Description
+from ._emit import Shared
+from ._expressions import c_type, Expr, is_supported, literal
+from ._function import (
+    argument,
+    finite_test,
+    memory,
+    new_program,
+    ready,
+)
+from ._program import Program
+from ._trace import trace, Unsupported
+from ._values import Scalars, Table, Value, View
+
+
+_MOST_TRIED = 16
+
+
+class _Traced:
+    """A controller as programs of arrays."""
+
+    def __init__(self, controller: Any, dtype: np.dtype, example: Any):
+        self.dtype = dtype
+        with precision(dtype):
+            controller = cast(controller, dtype)
+            start = _first_state(controller, dtype)
+            arrays, static = eqx.partition(start, eqx.is_array)
+            leaves, structure = jax.tree_util.tree_flatten_with_path(arrays)
+            self.start = [np.asarray(leaf) for _, leaf in leaves]
+            self.paths = [jax.tree_util.keystr(path) for path, _ in leaves]
+            kinds = [(leaf.shape, leaf.dtype) for leaf in self.start]
+
+            def unflatten(flat):
+                return eqx.combine(jax.tree.unflatten(structure, flat), static)
+
+            def flatten(state):
+                flat, after = jax.tree.flatten(eqx.filter(state, eqx.is_array))
+                shapes = [jnp.shape(leaf) for leaf in flat]
+                if after != structure or shapes != [s for s, _ in kinds]:
+                    raise ValueError(
+                        "export.c: the controller must return a state like that of "
+                        f"init, {structure}, got {after}."
+                    )
+                return [
+                    jnp.asarray(leaf, kind)
+                    for leaf, (_, kind) in zip(flat, kinds, strict=True)
+                ]
+
+            def step(t, y, *flat):
+                u, after = controller(t, y, unflatten(flat))
+                return [jnp.asarray(u, dtype), *flatten(after)]
+
+            def applied(u, cost, *flat):
+                return flatten(controller.applied(u, cost, unflatten(flat)))
+
+            number = jax.ShapeDtypeStruct((), dtype)
+            state = [jax.ShapeDtypeStruct(s, d) for s, d in kinds]
+            y = _observation(step, number, state, dtype, example)
+            self.step = trace(step, number, y, *state)
+            self.observations, self.controls = y.shape[0], self.step.outs[0].shape
+            u = jax.ShapeDtypeStruct(self.controls, dtype)
+            self.applied = trace(applied, u, number, *state)
+
+
+def _first_state(controller: AbstractController, dtype: np.dtype) -> Any:
+    try:
+        state = initial_state(controller, None)
+    except ValueError as error:
+        raise Unsupported(
+            f"export.c: {type(controller).__name__} cannot be exported: it needs a "
+            f"random key, and C draws no random numbers ({error})"
+        ) from error
+    return cast(state, dtype)
+
+
+def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: Any):
+    """The shape of the observation: that of the example, or the one size that fits."""
+    if example is not None:
+        y = np.asarray(example) if not hasattr(example, "shape") else example
+        if len(y.shape) != 1:
+            raise ValueError(
+                "export.c: example must be an observation, a vector, for a "
+                f"controller, got shape {tuple(y.shape)}."
+            )
+        return jax.ShapeDtypeStruct(tuple(y.shape), dtype)
+    fitting = []
+    for size in range(1, _MOST_TRIED + 1):
+        y = jax.ShapeDtypeStruct((size,), dtype)
+        try:
+            jax.eval_shape(step, number, y, *state)
+        except Exception:  # noqa: BLE001 - whatever the controller raises for it
+            continue
+        fitting.append(y)
+        if len(fitting) > 1:
+            break
+    if len(fitting) == 1:
+        return fitting[0]
+    raise ValueError(
+        "export.c: example must be an observation (zeros of its shape are enough), "
+        "as the controller does not tell its size."
+    )
+
+
+def export_controller(
+    controller: Any,
+    name: str,
+    dtype: np.dtype,
+    example: Any,
+    fallback: Any,
+    most: int | None,
+) -> Any:
+    """The header and the source of a controller, and what its report needs."""
+    traced = _Traced(controller, dtype, example)
+    (m,) = traced.controls
+    if fallback is not None:
+        fallback = np.asarray(finite_vector(fallback, m, "fallback", "export.c"), dtype)
+    state = _members(traced)
+    names = [a.name for a in state]
+    last = _file.free_names(["last_control"], names)[0] if fallback is None else None
+    shared, macro, real = Shared(), name.upper(), f"{name}_real"
+    description = Description(
+        name,
+        "controller",
+        str(dtype),
+        (Array("t", (), str(dtype)), Array("y", (traced.observations,), str(dtype))),
+        (Array("u", (m,), str(dtype)),),
+        tuple(state),
+    )
+    step = _step(traced, name, state, last, fallback, shared, most)
+    applied = _applied(traced, name, state, shared, most)
+    init = _init(traced, name, state, last, m, shared)
+    members = [
+        f"{_kind(a, real)} {a.name}{_extent(a)}; /* {_words(a)} */" for a in state
+    ]
+    if last is not None:
+        members.append(f"{real} {last}[{m}]; /* the last good control */")
+    if not members:
+        members = ["char unused;"]
+    body = [
+        f"#define {macro}_OBSERVATION_SIZE {traced.observations}",
+        f"#define {macro}_CONTROL_SIZE {m}",
+        f"enum {{ {macro}_BAD_INPUT = 1, {macro}_BAD_RESULT = 2 }};",
+        "",
+        "typedef struct {",
+        *(f"  {member}" for member in members),
+        f"}} {name}_state;",
+        "",
+        *(f"{f.signature};" for f, _ in (init, step, applied)),
+    ]
+    comment = _comment(controller, traced, name, fallback)
+    text, constants = _file.source(name, [init, step, applied], shared)
+    size = sum(array.nbytes for array in traced.start)
+    size += m * dtype.itemsize if last is not None else 0
+    functions = [init[0], step[0], applied[0]]
+    return _file.header(description, comment, body), text, functions, constants, size
+
+
+def _kind(array: Array, real: str) -> str:
+    if array.dtype.startswith("float"):
+        return real
+    return c_type(array.dtype, stored=True)
+
+
+def _extent(array: Array) -> str:
+    size = int(np.prod(array.shape, dtype=int))
+    return f"[{size}]" if array.shape else ""
+
+
+def _words(array: Array) -> str:
+    shape = "x".join(map(str, array.shape))
+    return f"{array.path or 'state'}, {shape}" if shape else array.path or "state"
+
+
+def _members(traced: _Traced) -> list[Array]:
+    for array, path in zip(traced.start, traced.paths, strict=True):
+        if not is_supported(array.dtype):
+            raise Unsupported(
+                f"export.c: state{path} cannot be exported: its type {array.dtype} "
+                "has no form in C."
+            )
+    names = _file.free_names(p.strip(".[]") or "memory" for p in traced.paths)
+    return [
+        Array(name, array.shape, str(array.dtype), path)
+        for name, array, path in zip(names, traced.start, traced.paths, strict=True)
+    ]
+
+
+def _places(state: Sequence[Array]) -> list[Value]:
+    """The members of the state, as arrays."""
+    places: list[Value] = []
+    for array in state:
+        name, dtype = f"state->{array.name}", np.dtype(array.dtype)
+        if array.shape:
+            places.append(View(memory(name, array.shape, dtype), array.shape))
+        else:
+            expr = Expr(name, dtype, frozenset([name]))
+            places.append(Scalars((), dtype, [expr], frozenset()))
+    return places
+
+
+def _init(traced, name, state, last, m, shared):
+    program = Program(1, shared, None)
+    for place, array in zip(_places(state), traced.start, strict=True):
+        table = Table(array, shared.table)
+        if isinstance(place, View):
+            program.fill(place, table)
+        else:
+            program.put(place, table)
+    if last is not None:
+        zeros = Table(np.zeros(m, traced.dtype), shared.table)
+        program.fill(View(memory(f"state->{last}", (m,), traced.dtype), (m,)), zeros)
+    roots = {f"state->{a.name}" for a in state} | {f"state->{last}"}
+    signature = f"void {name}_init({name}_state *state)"
+    return _file.Function(signature, program, roots, ""), ["state"]
+
+
+def _step(traced, name, state, last, fallback, shared, most):
+    program = new_program(traced.step, shared, most)
+    dtype, (m,) = traced.dtype, traced.controls
+    places = _places(state)
+    t = argument(program, "t", (), dtype)
+    y = argument(program, "y", (traced.observations,), dtype)
+    answer = View(memory("u", (m,), dtype), (m,))
+    kept = View(memory(f"state->{last}", (m,), dtype), (m,))
+    spare = kept if last is not None else Table(fallback, shared.table)
+    macro = name.upper()
+
+    def leave_unless(good, flag):
+        program.choose(good, 2, lambda k: None if k else refuse(flag))
+
+    def refuse(flag):
+        program.fill(answer, spare)
+        program.line(f"return {macro}_{flag};", frozenset(), None)
+
+    leave_unless(finite_test(program, [t, y]), "BAD_INPUT")
+    for var, value in zip(traced.step.params, [t, y, *places], strict=True):
+        program.bind(var, value)
+    u, *after = program.run(traced.step)
+    u = ready(program, u)
+    changed = [
+        (place, ready(program, value), first)
+        for place, value, first in zip(places, after, traced.start, strict=True)
+        if not _is_same(place, value)
+    ]
+    tested = [v for _, v, first in changed if np.all(np.isfinite(first))]
+    leave_unless(finite_test(program, [u, *tested]), "BAD_RESULT")
+    program.put_all([p for p, *_ in changed], [v for _, v, _ in changed])
+    program.fill(answer, u)
+    if last is not None:
+        program.fill(kept, u)
+    real = f"{name}_real"
+    signature = (
+        f"int {name}_step({name}_state *state, {real} t, const {real} *y, {real} *u)"
+    )
+    roots = {"u", f"state->{last}", *(f"state->{a.name}" for a in state)}
+    arguments = ["state", "t", "y", "u"]
+    return _file.Function(signature, program, roots, "return 0;"), arguments
+
+
+def _applied(traced, name, state, shared, most):
+    program = new_program(traced.applied, shared, most)
+    places, dtype = _places(state), traced.dtype
+    u = argument(program, "u", traced.controls, dtype)
+    cost = argument(program, "cost", (), dtype)
+    for var, value in zip(traced.applied.params, [u, cost, *places], strict=True):
+        program.bind(var, value)
+    after = program.run(traced.applied)
+    changed = [
+        (place, ready(program, value), first)
+        for place, value, first in zip(places, after, traced.start, strict=True)
+        if not _is_same(place, value)
+    ]
+    if changed:
+        tested = [v for _, v, first in changed if np.all(np.isfinite(first))]
+        good = finite_test(program, tested)
+
+        def leave(k):
+            if not k:
+                program.line("return;", frozenset(), None)
+
+        program.choose(good, 2, leave)
+        program.put_all([p for p, *_ in changed], [v for _, v, _ in changed])
+    real = f"{name}_real"
+    signature = (
+        f"void {name}_applied({name}_state *state, const {real} *u, {real} cost)"
+    )
+    roots = {f"state->{a.name}" for a in state}
+    return _file.Function(signature, program, roots, ""), ["state", "u", "cost"]
+
+
+def _is_same(place: Value, value: Value) -> bool:
+    """Whether a member of the state stays as it is."""
+    if isinstance(place, View):
+        return (
+            isinstance(value, View)
+            and value.buffer is place.buffer
+            and ((value.strides, value.start) == (place.strides, place.start))
+        )
+    pair = value.entries(), place.entries()
+    return pair[0][0].text == pair[1][0].text
+
+
+def _comment(controller, traced, name, fallback) -> list[str]:
+    (m,), p = traced.controls, traced.observations
+    answer = "fallback" if fallback is not None else "the last good control, or 0"
+    lines = [
+        f"{name}: a controller in C, made by delucax from a "
+        f"{type(controller).__name__}.",
+        "",
+        f"  {name}_init(&state);",
+        f"  flag = {name}_step(&state, t, y, u);",
+        f"  {name}_applied(&state, u, cost);",
+        "",
+        "A step takes the time t and the observation y, and gives the control u. Then",
+        "applied is told the control that was really applied, and its cost.",
+        "",
+        "A step returns 0; or a flag if t or y, or what it computes, is not finite.",
+        f"The control is {answer} then, and the state is as before the step.",
+        *_named(controller, m, p),
+    ]
+    if fallback is not None:
+        numbers = ", ".join(literal(x, traced.dtype).text for x in fallback)
+        lines.append(f"fallback: {numbers}")
+    return lines
+
+
+def _named(controller: Any, m: int, p: int) -> list[str]:
+    """The names of controls and observations, where a plant is known."""
+    plants = parts_of(controller, AbstractPlant)
+    if not plants or plants[0].control_size != m:
+        return []
+    plant = plants[0]
+    lines = ["", *unit_lines("u", plant.control_names, plant.control_units)]
+    if plant.state_size == p and plant.observes_state:
+        lines += unit_lines("y", plant.state_names, plant.state_units)
+    return lines
+
+
+def unit_lines(letter: str, names: Sequence[str], units: Sequence[str]) -> list[str]:
+    """A line for each entry of a vector."""
+    return [
+        f"  {letter}[{k}]: {name}" + (f" [{units[k]}]" if k < len(units) else "")
+        for k, name in enumerate(names)
+    ]

@@ -1,0 +1,194 @@
+"""The files of a program in C: their text, and writing both or none."""
+
+import contextlib
+import keyword
+import re
+import secrets
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from . import _layout
+from ._description import Description
+from ._emit import Line, Scope, Shared
+from ._expressions import c_type
+from ._program import Program
+from ._report import Report
+
+
+_RESERVED = frozenset(
+    """
+    alignas alignof and and_eq asm auto bitand bitor bool break case catch char class
+    compl complex const const_cast constexpr continue decltype default delete do double
+    dynamic_cast else enum explicit export extern false float for friend goto if inline
+    int int16_t int32_t int64_t int8_t long main mutable namespace new noexcept not
+    not_eq nullptr operator or or_eq private protected public register
+    reinterpret_cast restrict return short signed sizeof static static_assert
+    static_cast struct switch template this thread_local throw true try typedef typeid
+    typename uint16_t uint32_t uint64_t uint8_t union unsigned using virtual void
+    volatile wchar_t while xor xor_eq state flag memcpy memset work
+    acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp exp2
+    expm1 fabs fdim floor fma fmax fmin fmod frexp gamma hypot ilogb isfinite isinf
+    isnan j0 j1 jn ldexp lgamma log log10 log1p log2 logb lrint lround modf nan
+    nearbyint nextafter pow remainder rint round scalbn signbit signgam sin sinh sqrt
+    tan tanh tgamma trunc y0 y1 yn
+    """.split()
+)
+_OWN = re.compile(r"[vbci][0-9]+|work_.*|.*_[fiub][0-9]+|.*_b")
+
+
+def is_free(name: str) -> bool:
+    """Whether a name may be one in C."""
+    simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
+    return simple and name not in _RESERVED and not _OWN.fullmatch(name)
+
+
+def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    """Names in C like those given, no two the same."""
+    used, made = set(taken), []
+    for name in names:
+        name = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "value"
+        if name[0].isdigit():
+            name = f"value_{name}"
+        if not is_free(name) or keyword.iskeyword(name):
+            name += "_"
+        base, k = name, 1
+        while name in used:
+            k += 1
+            name = f"{base}_{k}"
+        used.add(name)
+        made.append(name)
+    return made
+
+
+class Function:
+    """A function of the file: its signature, and the program in it."""
+
+    def __init__(self, signature: str, program: Program, roots: set[str], exits: str):
+        self.signature, self.program, self.exits = signature, program, exits
+        self.needed = _layout.pruned(program.top, roots)
+        self.memory, self.bytes = _layout.placed(program.buffers, program.top)
+
+    @property
+    def stack(self) -> int:
+        """Bytes of arrays and variables."""
+        return self.bytes + _variables(self.program.top)
+
+    def text(self, arguments: Iterable[str]) -> list[str]:
+        """The lines of the definition."""
+        body = _layout.printed(self.program.top)
+        everything = "\n".join(body)
+        unused = [
+            a for a in arguments if not re.search(rf"\b{a}\b", everything + self.exits)
+        ]
+        lines = [f"{self.signature} {{", *(f"  {line}" for line in self.memory)]
+        lines += body
+        lines += [f"  (void){a};" for a in unused]
+        if self.exits:
+            lines.append(f"  {self.exits}")
+        return [*lines, "}"]
+
+
+def _variables(scope: Scope) -> int:
+    total = 0
+    for item in scope.items:
+        if isinstance(item, Line):
+            declared = item.writes is not None and item.writes.startswith("v")
+            total += 8 * (declared and " = " in item.text or item.text.endswith(";"))
+        else:
+            total += sum(map(_variables, item.scopes))
+    return total
+
+
+def source(name: str, functions: list[tuple[Function, list[str]]], shared: Shared):
+    """The text of the file, and the bytes of its constants."""
+    used = frozenset().union(*(f.needed for f, _ in functions))
+    tables, size = _layout.constants(shared, used)
+    bodies = [f.text(arguments) for f, arguments in functions]
+    lines = [
+        f'#include "{name}.h"',
+        "",
+        "#include <math.h>",
+        "#include <string.h>",
+        "",
+        *tables,
+    ]
+    everything = "\n".join("\n".join(b) for b in bodies)
+    for routine, text in shared.routines.items():
+        if re.search(rf"\b{routine}\(", everything):
+            lines += ["", *text.strip().splitlines()]
+    for body in bodies:
+        lines += ["", *body]
+    return "\n".join(lines) + "\n", size
+
+
+def header(description: Description, comment: list[str], body: list[str]) -> str:
+    """The text of the header."""
+    name = description.macro
+    lines = [
+        "/*",
+        *(f" * {line}".rstrip().replace("*/", "* /") for line in comment),
+        " */",
+        description.comment(),
+        f"#ifndef {name}_H",
+        f"#define {name}_H",
+        "",
+        "#include <stdint.h>",
+        "",
+        "#ifdef __cplusplus",
+        'extern "C" {',
+        "#endif",
+        "",
+        f"typedef {c_type(description.dtype)} {description.name}_real;",
+        "",
+        *body,
+        "",
+        "#ifdef __cplusplus",
+        "}",
+        "#endif",
+        "",
+        "#endif",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def write_both(directory: Path, texts: dict[str, str]) -> tuple[str, ...]:
+    """Write files: all of them, or none."""
+    beside = {
+        directory / name: directory / f".{name}.{secrets.token_hex(4)}"
+        for name in texts
+    }
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for (target, path), text in zip(beside.items(), texts.values(), strict=True):
+            if target.is_dir():
+                raise IsADirectoryError(f"{target} is a directory")
+            path.write_text(text, encoding="utf-8")
+        for target, path in beside.items():
+            path.replace(target)
+    except OSError as error:
+        raise ValueError(
+            f"export.c: directory must be one that can be written, got {directory}: "
+            f"{error}."
+        ) from error
+    finally:
+        for path in beside.values():
+            with contextlib.suppress(OSError):
+                path.unlink()
+    return tuple(map(str, beside))
+
+
+def report(
+    files: tuple[str, ...], functions: list[Any], constants: int, state: int, text: str
+) -> Report:
+    """The report of these functions."""
+    bounds = dict.fromkeys(b for f in functions for b in f.program.bounds)
+    return Report(
+        files,
+        constants,
+        state,
+        max(f.stack for f in functions),
+        max(f.program.top.cost for f in functions),
+        tuple(bounds),
+        text.count("\n"),
+    )

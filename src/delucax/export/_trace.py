@@ -1,0 +1,340 @@
+"""Programs of JAX made plain: calls looked through, constants folded."""
+
+import contextlib
+import functools
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox
+import jax
+import jax.numpy as jnp
+import lineax
+import numpy as np
+import optax
+import optimistix
+from jax.extend.core import (
+    ClosedJaxpr,  # pyright: ignore[reportPrivateImportUsage]
+    Literal,
+)
+from jax.interpreters.partial_eval import dce_jaxpr
+
+from ._blocks import Atom, Block, Const, count_readers, drop_dead, Node, Var
+from ._expressions import is_supported
+from ._fold import folded, is_all
+
+
+def trace(function: Callable[..., Any], *shapes: Any) -> Block:
+    """The plain program of a function of arrays, which returns a list of arrays."""
+    closed: Any = jax.make_jaxpr(function)(*shapes)
+    jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), True)
+    block = Block(None, False)
+    avals: Any = [v.aval for v in jaxpr.invars]
+    params = [block.param(a.shape, a.dtype) for a in avals]
+    block.outs = _inlined(ClosedJaxpr(jaxpr, closed.consts), params, block, "")
+    drop_dead(block)
+    count_readers(block)
+    return block
+
+
+class Unsupported(ValueError):
+    """What C cannot take."""
+
+
+def refuse(name: str, why: str, where: str) -> Unsupported:
+    """The error for an operation that has no form in C."""
+    line = f" at {where}" if where else ""
+    return Unsupported(f"export.c: {name}{line} cannot be exported: {why}.")
+
+
+_LIBRARIES = tuple(
+    str(Path(str(module.__file__)).parent) + os.sep
+    for module in (jax, equinox, lineax, diffrax, optax, optimistix, contextlib)
+) + (str(Path(__file__).parents[1]) + os.sep,)
+
+
+def _line(eqn: Any) -> str:
+    """The line of the user's code that an equation comes from."""
+    traceback = eqn.source_info.traceback
+    for frame in traceback.frames if traceback else ():
+        file = frame.file_name
+        if not file.startswith(_LIBRARIES) and not file.startswith("<"):
+            return f"{Path(file).name}:{frame.line_num}"
+    return ""
+
+
+def _inlined(closed: Any, args: Sequence[Atom], block: Block, where: str) -> list[Atom]:
+    """The outputs of a program for these inputs; its nodes go into the block."""
+    jaxpr: Any = closed.jaxpr
+    values: dict[Any, Atom] = dict(zip(jaxpr.invars, args, strict=True))
+    for var, value in zip(jaxpr.constvars, closed.consts, strict=True):
+        values[var] = Const(_array(value))
+
+    def read(atom):
+        if isinstance(atom, Literal):
+            aval: Any = atom.aval
+            return Const(np.asarray(atom.val, aval.dtype))
+        return values[atom]
+
+    for eqn in jaxpr.eqns:
+        outs = _added(eqn, [read(a) for a in eqn.invars], block, where)
+        for var, out in zip(eqn.outvars, outs, strict=True):
+            values[var] = out
+    return [read(a) for a in jaxpr.outvars]
+
+
+def _array(value: Any) -> Any:
+    return value if hasattr(value, "dtype") else np.asarray(value)
+
+
+_SAME = "stop_gradient", "optimization_barrier", "copy", "copy_p", "sharding_constraint"
+_CALLS = "jaxpr", "call_jaxpr", "fun_jaxpr"
+
+
+def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
+    """The outputs of an equation in a block."""
+    op, params = eqn.primitive.name, eqn.params
+    if op == "concatenate":
+        ins = [a for a in ins if 0 not in a.shape] or ins
+    where = _line(eqn) or where
+    if op in _SAME:
+        return ins
+    is_known = all(isinstance(a, Const) for a in ins) and not eqn.effects
+    outs = [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    if is_known and op in ("scan", "while"):
+        return _computed(eqn, ins, outs)
+    if op in _LOOPS:
+        return _LOOPS[op](eqn, ins, block, where)
+    if all(0 in shape for shape, _ in outs) and outs:
+        return [Const(np.zeros(shape, dtype)) for shape, dtype in outs]
+    if op == "pure_callback" and _is_error(params["callback"]):
+        return _failed(eqn)
+    inner = next((params[name] for name in _CALLS if name in params), None)
+    if inner is not None:
+        closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+        return _inlined(closed, ins, block, where)
+    if op == "platform_index":
+        platforms = params["platforms"]
+        # What is for every platform avoids what only XLA has.
+        index = platforms.index(None) if None in platforms else 0
+        return [Const(np.asarray(index, np.int32))]
+    if "callback" in op:
+        raise refuse(op, "C cannot call Python", where)
+    if is_known:
+        return _computed(eqn, ins, outs)
+    impl = eqn.primitive.impl
+    if not getattr(impl, "__module__", "functools").startswith(("jax", "functools")):
+        # One of another library, which it says in terms of others.
+        impl = functools.partial(impl, **params)
+        shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in ins]
+        closed = jax.make_jaxpr(lambda *args: jax.tree.leaves(impl(*args)))(*shapes)
+        return _inlined(closed, ins, block, where)
+    return _node(op, ins, outs, dict(params), block, where)
+
+
+def _computed(eqn: Any, ins: list[Any], outs: Any) -> list[Atom]:
+    """The outputs of an equation whose inputs are known."""
+    values = [a.value for a in ins]
+    dtypes = [dtype for _, dtype in outs]
+    result = folded(eqn.primitive.name, values, eqn.params, dtypes)
+    if result is None:
+        result = eqn.primitive.bind(*map(jnp.asarray, values), **eqn.params)
+        result = result if eqn.primitive.multiple_results else [result]
+    return [Const(value) for value in result]
+
+
+def _is_error(callback: Any) -> bool:
+    """Whether it is the one with which Equinox raises an error."""
+    function = getattr(callback, "callback_func", callback)
+    return getattr(function, "__module__", "").startswith("equinox")
+
+
+def _failed(eqn: Any) -> list[Atom]:
+    """What stands in place of an error that is raised at run time: NaN. A value that
+    cannot be NaN is zero."""
+    outs = [v.aval for v in eqn.outvars]
+    fill = lambda a: np.nan if jnp.issubdtype(a.dtype, jnp.floating) else 0
+    return [Const(np.full(a.shape, fill(a), a.dtype)) for a in outs]
+
+
+def _node(
+    op: str, ins: list[Atom], outs: Any, params: Any, block: Block, where: str
+) -> Sequence[Atom]:
+    """The outputs of a new node, or of a like one that is there already."""
+    same = _unchanged(op, ins, outs, params)
+    if same is not None:
+        return [same]
+    # What does not depend on a loop is computed before it.
+    depth = max((a.depth for a in ins if isinstance(a, Var)), default=0)
+    while (
+        "blocks" not in params
+        and block.repeats
+        and block.parent is not None
+        and depth < block.depth
+    ):
+        block = block.parent
+    key = _key(op, ins, params)
+    around = block
+    while around is not None and key is not None:
+        if key in around.known:
+            return around.known[key]
+        around = around.parent
+    for shape, dtype in outs:
+        if not is_supported(dtype):
+            raise refuse(op, f"its type {dtype} has no form in C", where)
+        if not all(isinstance(extent, int) for extent in shape):
+            raise refuse(op, "its shape is not known", where)
+    made = [Var(shape, dtype, block.depth) for shape, dtype in outs]
+    block.nodes.append(Node(op, ins, made, params, where))
+    if key is not None:
+        block.known[key] = made
+    return made
+
+
+def _key(op: str, ins: list[Atom], params: Any) -> Any:
+    try:
+        words = tuple(sorted((k, v) for k, v in params.items() if k != "sharding"))
+        hash(words)
+    except TypeError:
+        return None
+    return op, tuple(map(_name, ins)), words
+
+
+def _name(atom: Atom) -> Any:
+    if isinstance(atom, Const) and isinstance(atom.value, np.ndarray):
+        if atom.value.size <= 64:
+            return str(atom.dtype), atom.shape, atom.value.tobytes()
+    return id(atom)
+
+
+def _unchanged(op: str, ins: list[Atom], outs: Any, params: Any) -> Atom | None:
+    """An input that an operation leaves as it is."""
+    (shape, dtype), *more = outs
+    if more or not ins:
+        return None
+    first, last = ins[0], ins[-1]
+    fits = lambda a: a.shape == shape and a.dtype == dtype
+    alike = fits(first)
+    if op in ("add", "add_any", "mul", "sub", "div") and len(ins) == 2:
+        neutral = 1 if op in ("mul", "div") else 0
+        if isinstance(last, Const) and alike and is_all(last.value, neutral):
+            return first
+        turns = op in ("add", "add_any", "mul")
+        if turns and isinstance(first, Const) and is_all(first.value, neutral):
+            return last if fits(last) else None
+    if op in ("and", "or") and np.dtype(dtype).kind == "b":
+        for one, other in ((first, last), (last, first)):
+            if isinstance(one, Const) and fits(other):
+                if np.all(one.value == (op == "and")):
+                    return other
+    if op == "select_n" and isinstance(first, Const) and first.value.size:
+        which = first.value.astype(int)
+        if np.all(which == which.flat[0]):
+            return ins[1 + int(which.flat[0])]
+    same_shape = "broadcast_in_dim", "reshape", "squeeze", "slice", "reduce_precision"
+    if op in ("convert_element_type", "transpose", *same_shape, "concatenate", "pad"):
+        pads = op == "pad" and any(map(any, params["padding_config"]))
+        order = params.get("permutation", range(len(shape)))
+        narrows = op == "reduce_precision"
+        if alike and not pads and not narrows and list(order) == sorted(order):
+            return first
+    if op in ("reduce_sum", "reduce_max", "reduce_min") and not params["axes"]:
+        return first
+    return None
+
+
+def _inside(closed: Any, args: Sequence[Atom], block: Block, where: str) -> None:
+    block.outs = _inlined(closed, args, block, where)
+
+
+def _counts(params: Any) -> tuple[int, int]:
+    """The numbers of constants and of carried values of a scan."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
+def _scan(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
+    params, length = eqn.params, eqn.params["length"]
+    n, m = _counts(params)
+    closed = params["jaxpr"]
+    consts, carry, xs = ins[:n], ins[n : n + m], ins[n + m :]
+    if length == 0:
+        empty = [Const(np.zeros(v.aval.shape, v.aval.dtype)) for v in eqn.outvars[m:]]
+        return [*carry, *empty]
+    body = Block(block, True)
+    # What each step leaves as it is, is no part of the carry.
+    fixed = [closed.jaxpr.outvars[i] is closed.jaxpr.invars[n + i] for i in range(m)]
+    given: list[Atom] = [
+        a if same else body.param(a.shape, a.dtype)
+        for a, same in zip(carry, fixed, strict=True)
+    ]
+    starts = [a for a, same in zip(carry, fixed, strict=True) if not same]
+    rows: list[Atom] = [body.param(a.shape[1:], a.dtype) for a in xs]
+    _inside(closed, [*consts, *given, *rows], body, where)
+    body.outs = [out for i, out in enumerate(body.outs) if i >= m or not fixed[i]]
+    shapes = [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    wanted = [s for i, s in enumerate(shapes) if i >= m or not fixed[i]]
+    details = dict(
+        length=length, reverse=params["reverse"], carried=len(starts), blocks=[body]
+    )
+    made = iter(_node("scan", [*starts, *xs], wanted, details, block, where))
+    return [carry[i] if i < m and fixed[i] else next(made) for i in range(len(shapes))]
+
+
+def _while(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
+    params = eqn.params
+    n, m = params["cond_nconsts"], params["body_nconsts"]
+    in_cond, in_body, carry = ins[:n], ins[n : n + m], ins[n + m :]
+    body, cond = Block(block, True), Block(block, True)
+    inner = params["body_jaxpr"].jaxpr
+    fixed = [inner.outvars[i] is inner.invars[m + i] for i in range(len(carry))]
+    starts = [a for a, same in zip(carry, fixed, strict=True) if not same]
+    for loop, closed, consts in (
+        (cond, params["cond_jaxpr"], in_cond),
+        (body, params["body_jaxpr"], in_body),
+    ):
+        given: list[Atom] = [
+            a if same else loop.param(a.shape, a.dtype)
+            for a, same in zip(carry, fixed, strict=True)
+        ]
+        _inside(closed, [*consts, *given], loop, where)
+    body.outs = [o for o, same in zip(body.outs, fixed, strict=True) if not same]
+    wanted = [(a.shape, a.dtype) for a in starts]
+    details = dict(blocks=[cond, body])
+    made = iter(_node("while", starts, wanted, details, block, where))
+    return [a if same else next(made) for a, same in zip(carry, fixed, strict=True)]
+
+
+def _cond(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
+    which, *args = ins
+    branches = eqn.params["branches"]
+    if isinstance(which, Const):
+        index = min(max(int(which.value), 0), len(branches) - 1)
+        return _inlined(branches[index], args, block, where)
+    inside = []
+    for closed in branches:
+        inside.append(Block(block, False))
+        _inside(closed, args, inside[-1], where)
+    wanted = [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    return _node("cond", [which], wanted, dict(blocks=inside), block, where)
+
+
+def _linear_solve(eqn: Any, ins: list[Atom], block: Block, where: str):
+    lengths = eqn.params["const_lengths"]
+    before = lengths.matvec + lengths.vecmat
+    after = before + lengths.solve + lengths.transpose_solve
+    consts = ins[before : before + lengths.solve]
+    solve = eqn.params["jaxprs"].solve
+    return _inlined(solve, [*consts, *ins[after:]], block, where)
+
+
+_LOOPS = {
+    "scan": _scan,
+    "while": _while,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+}

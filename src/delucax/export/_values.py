@@ -1,0 +1,209 @@
+"""Arrays while C is written: what an index reads.
+
+An array may be a table of constants, a view of memory, a few scalars, or a formula that
+is written out where it is read.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ._expressions import (
+    Expr,
+    flat_index,
+    Index,
+    known,
+    literal,
+    NOTHING,
+    row_major,
+    union,
+)
+
+
+Indices = tuple[Index, ...]
+
+
+class Buffer:
+    """Memory: an argument, or a part of an array on the stack."""
+
+    __slots__ = ("block", "dtype", "holders", "is_own", "name", "size")
+
+    def __init__(self, name: str, dtype: Any, size: int, block: Any, is_own: bool):
+        self.name, self.dtype, self.size = name, np.dtype(dtype), size
+        self.block, self.is_own, self.holders = block, is_own, 0
+
+
+class Value:
+    """An array. `buffers` are the memory that reading it reads."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+    buffers: frozenset[Buffer] = frozenset()
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.shape, dtype=int))
+
+    def at(self, indices: Indices) -> Expr:
+        """The entry."""
+        raise NotImplementedError
+
+    def entries(self) -> list[Expr]:
+        """All of them, in order."""
+        ranges = map(range, self.shape)
+        return [self.at(tuple(map(known, i))) for i in itertools.product(*ranges)]
+
+
+class Table(Value):
+    """A known array; `name` names it in C once it is read by an index."""
+
+    def __init__(self, array: np.ndarray, named: Callable[[np.ndarray], str]):
+        self.array, self.named = array, named
+        self.shape, self.dtype = array.shape, array.dtype
+
+    def at(self, indices: Indices) -> Expr:
+        if all(i.is_known for i in indices):
+            return literal(self.array[tuple(i.const for i in indices)], self.dtype)
+        if self.is_uniform:
+            return literal(self.array.flat[0], self.dtype)
+        name = self.named(self.array)
+        index = flat_index(indices, row_major(self.shape), known(0))
+        reads = index.reads | {name}
+        low, high = -np.inf, np.inf
+        if self.dtype.kind in "iub":
+            low, high = float(self.array.min()), float(self.array.max())
+        return Expr(f"{name}[{index.text}]", self.dtype, reads, low=low, high=high)
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether all entries are the same."""
+        first = self.array.flat[:1]
+        same = self.array == first
+        if self.dtype.kind == "f":
+            same |= np.isnan(self.array) & np.isnan(first)
+        return bool(np.all(same))
+
+
+class Scalars(Value):
+    """A few entries, an expression for each."""
+
+    def __init__(self, shape: Sequence[int], dtype: Any, parts: list[Expr], buffers):
+        self.shape, self.dtype, self.parts = tuple(shape), dtype, parts
+        self.buffers = buffers
+        self._strides = row_major(self.shape)
+
+    def at(self, indices: Indices) -> Expr:
+        flat = flat_index(indices, self._strides, known(0))
+        assert flat.is_known
+        return self.parts[flat.const]
+
+    def entries(self) -> list[Expr]:
+        return self.parts
+
+
+class View(Value):
+    """Memory with an offset and strides."""
+
+    def __init__(
+        self,
+        buffer: Buffer,
+        shape: Sequence[int],
+        strides: Sequence[int] | None = None,
+        start: Index | None = None,
+    ):
+        self.buffer, self.shape, self.dtype = buffer, tuple(shape), buffer.dtype
+        self.strides = row_major(self.shape) if strides is None else tuple(strides)
+        self.start = known(0) if start is None else start
+        self.buffers = frozenset([buffer])
+
+    def at(self, indices: Indices) -> Expr:
+        flat = flat_index(indices, self.strides, self.start)
+        text = f"{self.buffer.name}[{flat.text}]"
+        return Expr(text, self.dtype, flat.reads | {self.buffer.name})
+
+    @property
+    def is_contiguous(self) -> bool:
+        """Whether the entries lie one after another."""
+        expected = row_major(self.shape)
+        pairs = zip(self.shape, self.strides, expected, strict=True)
+        return all(n == 1 or a == b for n, a, b in pairs)
+
+    @property
+    def pointer(self) -> str:
+        """The address of the first entry."""
+        if self.start.is_known and self.start.const == 0:
+            return self.buffer.name
+        return f"{self.buffer.name} + {self.start.text}"
+
+
+class Formula(Value):
+    """A function of indices."""
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        dtype: Any,
+        at: Callable[[Indices], Expr],
+        of: Sequence[Value],
+        cost: int = 0,
+    ):
+        self.shape, self.dtype, self._at = tuple(shape), dtype, at
+        self.buffers = frozenset().union(*(v.buffers for v in of))
+        # That of the formulas in it is done again wherever it is read.
+        self.cost = cost + sum(v.cost for v in of if isinstance(v, Formula))
+
+    def at(self, indices: Indices) -> Expr:
+        return self._at(indices)
+
+
+def remapped(
+    value: Value, shape: Sequence[int], index: Callable[[Indices], Indices]
+) -> Value:
+    """The array whose entry at `i` is that of `value` at `index(i)`, an affine map."""
+    shape = tuple(shape)
+    if isinstance(value, Scalars):
+        corners = itertools.product(*map(range, shape))
+        if all(i.is_known for i in index(tuple(known(0) for _ in shape))):
+            parts = [value.at(index(tuple(map(known, i)))) for i in corners]
+            return Scalars(shape, value.dtype, parts, value.buffers)
+    if isinstance(value, View):
+        zero = tuple(known(0) for _ in shape)
+        origin = index(zero)
+        strides = []
+        for axis in range(len(shape)):
+            moved = list(zero)
+            moved[axis] = known(1)
+            steps = zip(index(tuple(moved)), origin, value.strides, strict=True)
+            strides.append(sum((a.const - b.const) * s for a, b, s in steps))
+        start = flat_index(origin, value.strides, value.start)
+        return View(value.buffer, shape, strides, start)
+    return Formula(shape, value.dtype, lambda i: value.at(index(i)), [value])
+
+
+def reshaped(value: Value, shape: Sequence[int]) -> Value | None:
+    """The same entries in another shape; `None` if they must first be in memory."""
+    shape = tuple(shape)
+    if isinstance(value, Scalars):
+        return Scalars(shape, value.dtype, value.parts, value.buffers)
+    if isinstance(value, Table):
+        return Table(value.array.reshape(shape), value.named)
+    if isinstance(value, View) and value.is_contiguous:
+        return View(value.buffer, shape, None, value.start)
+    # Axes of one entry come and go freely.
+    old = [axis for axis, n in enumerate(value.shape) if n != 1]
+    new = [axis for axis, n in enumerate(shape) if n != 1]
+    if [value.shape[a] for a in old] != [shape[a] for a in new]:
+        return None
+    rank, pairs = len(value.shape), dict(zip(old, new, strict=True))
+
+    def index(indices):
+        return tuple(indices[pairs[a]] if a in pairs else known(0) for a in range(rank))
+
+    return remapped(value, shape, index)
+
+
+def reads_of(parts: Sequence[Expr]) -> frozenset[str]:
+    """The names in the expressions."""
+    return union(p.reads for p in parts) if parts else NOTHING
