@@ -13,6 +13,7 @@ from .._controller import AbstractController, initial_state
 from .._module import parts_of
 from ..systems import AbstractPlant
 from . import _file
+from ._blocks import Block
 from ._cast import cast, precision
 from ._description import Array, Description
 from ._emit import Shared
@@ -215,7 +216,7 @@ def _places(state: Sequence[Array]) -> list[Value]:
 
 
 def _init(traced, name, state, last, m, shared):
-    program = Program(1, shared, None)
+    program = Program(Block(None, False), 1, shared, None)
     for place, array in zip(_places(state), traced.start, strict=True):
         table = Table(array, shared.table)
         if isinstance(place, View):

@@ -21,6 +21,7 @@ _FLOAT: dict[str, tuple[str, int]] = {
     "div": ("{0} / {1}", 1),
     "neg": ("-{0}", 1),
     "square": ("@square({0})", 1),
+    "one_minus_square": ("@one_minus_square({0})", 3),
     "max": ("@maximum({0}, {1})", 1),
     "min": ("@minimum({0}, {1})", 1),
     "sign": ("@sign({0})", 1),
@@ -40,7 +41,7 @@ _FLOAT: dict[str, tuple[str, int]] = {
         name: (f"{name}{{f}}({{0}})", 1)
         for name in (
             "acos acosh asin asinh atan atanh cbrt ceil cos cosh erf erfc exp exp2"
-            " expm1 floor log log1p sin sinh sqrt tan tanh"
+            " expm1 floor log log1p log2 sin sinh sqrt tan tanh"
         ).split()
     },
 }
@@ -142,7 +143,8 @@ def _written(
 
 
 def _routines_in(template: str) -> list[str]:
-    return [part.split("(")[0] for part in template.split("@")[1:]]
+    parts = {part.split("(")[0] for part in template.split("@")[1:]}
+    return sorted(parts, key=len, reverse=True)
 
 
 def _is_call(template: str) -> bool:
@@ -176,6 +178,8 @@ def _range(template: str, given: list[Expr], of: np.dtype) -> Any:
 
 def _compared(op: str, given: list[Expr]) -> Expr:
     a, b = given
+    if a.dtype.kind == "u":
+        a, b = a._replace(low=max(a.low, 0)), b._replace(low=max(b.low, 0))
     answer = None
     if a.dtype.kind in "iub":
         # Loop counters are compared with their bounds.

@@ -163,7 +163,7 @@ class Index(NamedTuple):
         return Expr(text, np.dtype(dtype), self.reads, cost, None, self.low, self.high)
 
 
-def known(number: int) -> Index:
+def known(number: int | np.integer) -> Index:
     """A constant index."""
     return Index(int(number))
 

@@ -28,7 +28,7 @@ _LONG = 600
 
 def new_program(block: Block, shared: Shared, most: int | None) -> Program:
     """A program to write the block with."""
-    return Program(FEW if nodes_in(block) < _LONG else FEW_IN_LONG, shared, most)
+    return Program(block, FEW if nodes_in(block) < _LONG else FEW_IN_LONG, shared, most)
 
 
 def nodes_in(block: Block) -> int:

@@ -68,35 +68,34 @@ def pruned(top: Scope, roots: Iterable[str]) -> frozenset[str]:
     return frozenset(needed)
 
 
-def spans(top: Scope, names: frozenset[str]) -> dict[str, tuple[int, int]]:
+def spans(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]:
     """From when to when each piece of memory is in use."""
+    homes = {b.name: b.home for b in buffers}
     first: dict[str, int] = {}
     last: dict[str, int] = {}
     clock = 0
 
-    def touch(name):
-        first.setdefault(name, clock)
-        last[name] = clock
-
-    def walk(scope):
+    def walk(scope) -> set[str]:
         nonlocal clock
+        touched = set()
         for item in scope.items:
             clock += 1
             if isinstance(item, Line):
-                for name in item.reads & names:
-                    touch(name)
-                if item.writes in names:
-                    touch(item.writes)
+                names = {n for n in (*item.reads, item.writes) if n in homes}
+                for name in names:
+                    first.setdefault(name, clock)
+                    last[name] = clock
+                touched |= names
                 continue
             begin = clock
-            for inner in item.scopes:
-                walk(inner)
+            inside = set().union(*map(walk, item.scopes))
             clock += 1
-            # What was there before a loop must last until it ends.
-            if any(s.repeats for s in item.scopes):
-                for name, since in first.items():
-                    if since < begin <= last[name]:
-                        last[name] = clock
+            touched |= inside
+            for name in inside:
+                # What is there before a round of a loop and after it, is all along.
+                if any(s.repeats and not homes[name].is_within(s) for s in item.scopes):
+                    first[name], last[name] = min(first[name], begin), clock
+        return touched
 
     walk(top)
     return {name: (first[name], last[name]) for name in first}
@@ -105,7 +104,7 @@ def spans(top: Scope, names: frozenset[str]) -> dict[str, tuple[int, int]]:
 def placed(buffers: list[Buffer], top: Scope) -> tuple[list[str], int]:
     """The declarations of memory, and its bytes. What is not in use at the same time
     shares a place."""
-    used = spans(top, frozenset(b.name for b in buffers))
+    used = spans(top, buffers)
     lines, total = [], 0
     kinds: dict[Any, list[Buffer]] = {}
     for buffer in buffers:

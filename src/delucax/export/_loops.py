@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ._blocks import Block, Const
+from ._bounds import Bound
 from ._emit import Group, Scope
 from ._expressions import Expr, known
 from ._trace import refuse
@@ -76,7 +76,7 @@ def _hand_back(e, places):
 
 def while_(e, node, *starts):
     cond, body = node.blocks
-    bound = bound_of(cond, body, node.ins)
+    bound = Bound(cond, body, node.ins, e.origins).rounds()
     if bound is None:
         bound = e.most
     if bound is None:
@@ -105,86 +105,6 @@ def while_(e, node, *starts):
     outside.cost += bound * inside.cost
     _hand_back(e, places)
     return places
-
-
-def bound_of(cond: Block, body: Block, starts: Any) -> int | None:
-    """The most rounds of a loop that counts them: it proceeds while a number that it
-    carries is on one side of another that is known."""
-    made = {block: _makers(block) for block in (cond, body)}
-    bounds = []
-    pending: list[Any] = [(cond, cond.outs[0], True)]
-    while pending:
-        block, atom, value = pending.pop()
-        if isinstance(atom, Const):
-            continue
-        if atom in block.params:
-            # A flag that the round before has set.
-            if block is cond:
-                pending.append((body, body.outs[block.params.index(atom)], value))
-            continue
-        node = made[block].get(atom)
-        if node is None:
-            continue
-        if node.op == "not":
-            pending.append((block, node.ins[0], not value))
-        elif node.op == ("and" if value else "or") or node.op == "convert_element_type":
-            pending += [(block, a, value) for a in node.ins]
-        elif node.op in _TESTS:
-            bounds += _counted(node, value, block is body, block, body, starts)
-    return min(bounds, default=None)
-
-
-def _makers(block):
-    return {out: node for node in block.nodes for out in node.outs}
-
-
-_TESTS = {"lt": (1, 0), "le": (1, 1), "gt": (-1, 0), "ge": (-1, 1), "ne": (0, 0)}
-_OPPOSITE = {"lt": "ge", "le": "gt", "gt": "le", "ge": "lt"}
-
-
-def _counted(test, value, is_late, block, body, starts):
-    """The rounds while a test has a value, if it is one of a count."""
-    op = test.op if value else _OPPOSITE.get(test.op)
-    left, right = test.ins
-    if op is None:
-        return []
-    sign, reaches = _TESTS[op]
-    if isinstance(left, Const):
-        left, right, sign = right, left, -sign
-    if not isinstance(right, Const) or right.value.ndim or isinstance(left, Const):
-        return []
-    # In the body the count is that before the round, or that after it.
-    late = is_late and left in block.params
-    if left in block.params:
-        k = block.params.index(left)
-    elif is_late and left in body.outs:
-        k = body.outs.index(left)
-    else:
-        return []
-    start, step = starts[k], _step_of(body, k)
-    if not isinstance(start, Const) or start.value.ndim or step is None:
-        return []
-    distance = float(right.value) - float(start.value)
-    sign = sign or (1 if step > 0 else -1)
-    if sign * step <= 0 or not np.isfinite(distance):
-        return []
-    rounds = sign * distance / abs(step)
-    exact = int(np.floor(rounds)) + 1 if reaches else int(np.ceil(rounds))
-    return [max(exact + late, int(is_late))]
-
-
-def _step_of(body: Block, k: int) -> Any:
-    """By how much a round changes what is carried."""
-    out, param = body.outs[k], body.params[k]
-    node = None if isinstance(out, Const) else _makers(body).get(out)
-    if node is None or node.op not in ("add", "sub"):
-        return None
-    a, b = node.ins
-    if node.op == "add" and isinstance(a, Const):
-        a, b = b, a
-    if a is not param or not isinstance(b, Const) or b.value.ndim:
-        return None
-    return float(b.value) * (1 if node.op == "add" else -1)
 
 
 def cond(e, node, which):

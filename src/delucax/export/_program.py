@@ -7,6 +7,7 @@ import numpy as np
 
 from . import _factors, _loops, _reductions, _structural
 from ._blocks import Atom, Block, Const, Node, Var
+from ._bounds import Origins
 from ._elementwise import operation
 from ._emit import same_memory, Writer
 from ._expressions import known
@@ -35,8 +36,9 @@ _WHY = {
 class Program(Writer):
     """Writes the nodes of blocks. `values` are the arrays, by their variables."""
 
-    def __init__(self, unroll: int, shared: Any, most: int | None):
+    def __init__(self, block: Block, unroll: int, shared: Any, most: int | None):
         super().__init__(unroll, shared)
+        self.origins = Origins(block)
         self.values: dict[Var, Value] = {}
         self.most = most
         self.bounds: list[tuple[str, int]] = []

@@ -20,6 +20,8 @@ def suffix(dtype: Any) -> str:
 
 _SCALAR = {
     "square": "static T square_S(T x) { return x * x; }",
+    "one_minus_square": """
+static T one_minus_square_S(T x) { return (1 - x) * (1 + x); }""",
     "maximum": """
 /* The larger number, or NaN if there is one. */
 static T maximum_S(T a, T b) { return a > b || a != a ? a : b; }""",

@@ -46,6 +46,20 @@ def reshape(e, node, x):
     return reshaped(e.packed(x), shape) if same is None else same
 
 
+def tile(e, node, x):
+    out, reps = node.outs[0], node.params["reps"]
+    own = x.shape
+    if e.is_few(out):
+        index = lambda i: tuple(known(k.const % n) for k, n in zip(i, own, strict=True))
+        return _mapped(e, x, out.shape, index)
+    place, x = e.new_view(out.shape, out.dtype), e.indexable(x)
+    with e.over(reps) as copy:
+        begin = [known(0).plus(k, n) for k, n in zip(copy, own, strict=True)]
+        index = lambda i: tuple(b.plus(k) for b, k in zip(begin, i, strict=True))
+        e.fill(remapped(place, own, index), x)
+    return place
+
+
 def transpose(e, node, x):
     order = node.params["permutation"]
     inverse = [list(order).index(axis) for axis in range(len(order))]
@@ -380,6 +394,7 @@ RULES: dict[str, Rule] = {
     "reshape": reshape,
     "squeeze": reshape,
     "expand_dims": reshape,
+    "tile": tile,
     "transpose": transpose,
     "slice": slice_,
     "rev": reverse,

@@ -26,13 +26,18 @@ Indices = tuple[Index, ...]
 
 
 class Buffer:
-    """Memory: an argument, or a part of an array on the stack."""
+    """Memory: an argument, or a part of an array on the stack.
 
-    __slots__ = ("block", "dtype", "holders", "is_own", "name", "size")
+    `home` is the scope that it was made in, and `block` the one in which it may be
+    changed.
+    """
+
+    __slots__ = ("block", "dtype", "holders", "home", "is_own", "name", "size")
 
     def __init__(self, name: str, dtype: Any, size: int, block: Any, is_own: bool):
         self.name, self.dtype, self.size = name, np.dtype(dtype), size
-        self.block, self.is_own, self.holders = block, is_own, 0
+        self.block = self.home = block
+        self.is_own, self.holders = is_own, 0
 
 
 class Value:

@@ -1,0 +1,168 @@
+"""How often a loop goes round at most.
+
+It counts its rounds in what it carries, and proceeds while the count is on one side of
+a number. The test may be in its condition, or in the round before, which sets a flag.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ._blocks import Atom, Block, Const, Node, Var
+
+
+class Origins:
+    """Where the values of a program come from."""
+
+    def __init__(self, block: Block):
+        self.made: dict[Var, Node] = {}
+        self.carried: dict[Var, tuple[Atom, Atom]] = {}
+        """The first value of what a loop carries, and that after a round."""
+        self._add(block)
+
+    def _add(self, block: Block) -> None:
+        for node in block.nodes:
+            for out in node.outs:
+                self.made[out] = node
+            for inner in node.blocks:
+                self._add(inner)
+            if node.op in ("scan", "while"):
+                body = node.blocks[-1]
+                count = node.params.get("carried", len(node.ins))
+                parts = body.params[:count], node.ins, body.outs
+                for param, start, out in zip(*parts, strict=False):
+                    self.carried[param] = start, out
+
+
+class Bound(NamedTuple):
+    """A loop whose rounds are bounded: its blocks, its first values, and the origins of
+    all that it reads."""
+
+    cond: Block
+    body: Block
+    starts: Any
+    origins: Origins
+
+    def rounds(self) -> int | None:
+        """The most rounds; `None` if they are not counted."""
+        return self._while(self.cond, self.cond.outs[0], True)
+
+    def _made(self, atom: Atom) -> Node | None:
+        return None if isinstance(atom, Const) else self.origins.made.get(atom)
+
+    def _while(self, block: Block, atom: Any, value: bool) -> int | None:
+        """The round from which on a truth value is never this one."""
+        if atom in block.params and block is self.cond:
+            # A flag that the round before has set.
+            return self._while(
+                self.body, self.body.outs[block.params.index(atom)], value
+            )
+        node = self._made(atom)
+        if node is None:
+            return None
+        if node.op == "not":
+            return self._while(block, node.ins[0], not value)
+        if node.op in ("and", "or", "convert_element_type"):
+            found = [self._while(block, a, value) for a in node.ins]
+            known = [n for n in found if n is not None]
+            if node.op == ("or" if value else "and"):
+                return max(known) if len(known) == len(found) else None
+            return min(known, default=None)
+        return self._counted(node, value, block is self.body)
+
+    def _counted(self, test: Node, value: bool, is_late: bool) -> int | None:
+        """The rounds while a test has a value, if it is one of a count."""
+        op = test.op if value else _OPPOSITE.get(test.op, "")
+        if op not in _TESTS:
+            return None
+        sign, reaches = _TESTS[op]
+        left, right = test.ins
+        block = self.body if is_late else self.cond
+        k = self._counter(block, left)
+        if k is None:
+            left, right, sign = right, left, -sign
+            k = self._counter(block, left)
+        if k is None:
+            return None
+        # In the body the count is that before the round, or that after it.
+        late = int(is_late and left in block.params)
+        start, steps = self.starts[k], self._steps(k)
+        if not isinstance(start, Const) or start.value.ndim or steps is None:
+            return None
+        first, step = steps
+        sign = sign or (1 if step > 0 else -1)
+        limit = self._limit(right, sign)
+        if limit is None or sign * step <= 0:
+            return None
+        rounds = sign * (limit - float(start.value) - first) / abs(step)
+        if not np.isfinite(rounds):
+            return None
+        exact = int(np.floor(rounds)) + 1 if reaches else int(np.ceil(rounds))
+        return max(exact + 1 + late, int(is_late))
+
+    def _counter(self, block: Block, atom: Any) -> int | None:
+        """Which of the values that are carried it is."""
+        if isinstance(atom, Const):
+            return None
+        for group in (block.params, self.body.outs if block is self.body else []):
+            if atom in group:
+                return group.index(atom)
+        return None
+
+    def _limit(self, atom: Atom, sign: int, seen: tuple[Var, ...] = ()) -> float | None:
+        """The largest that a number can be; the smallest if the sign is -1."""
+        if isinstance(atom, Const):
+            ends = atom.value.max, atom.value.min
+            return float(ends[sign < 0]()) if atom.value.size else None
+        node, is_any = self._made(atom), False
+        if atom in self.origins.carried and atom not in seen:
+            seen = (*seen, atom)
+            parts = self.origins.carried[atom]
+        elif node is None or node.op not in _BETWEEN:
+            return None
+        else:
+            parts = node.ins[1:] if node.op == "select_n" else node.ins
+            is_any = node.op == ("min" if sign > 0 else "max")
+        found = [self._limit(a, sign, seen) for a in parts]
+        known = [sign * n for n in found if n is not None]
+        if not known or not is_any and len(known) < len(found):
+            return None
+        return sign * (min(known) if is_any else max(known))
+
+    def _steps(self, k: int) -> tuple[float, float] | None:
+        """By how much the first round changes what is carried, and by how much each
+        later one."""
+        param, node = self.body.params[k], self._made(self.body.outs[k])
+        if node is None or node.op not in ("add", "sub"):
+            return None
+        a, b = node.ins
+        if node.op == "add" and a is not param:
+            a, b = b, a
+        if a is not param:
+            return None
+        turn = 1 if node.op == "add" else -1
+        while (node := self._made(b)) is not None:
+            if node.op != "convert_element_type":
+                return None
+            (b,) = node.ins
+        first = later = b
+        if not isinstance(b, Const) and b in self.body.params:
+            # Such as a flag that is set from the second round on.
+            j = self.body.params.index(b)
+            first, later = self.starts[j], self.body.outs[j]
+        pair = [a.value for a in (first, later) if isinstance(a, Const)]
+        if len(pair) < 2 or any(value.ndim for value in pair):
+            return None
+        return turn * float(pair[0]), turn * float(pair[1])
+
+
+_BETWEEN = "select_n", "convert_element_type", "min", "max", "squeeze"
+_TESTS = {
+    "lt": (1, 0),
+    "le": (1, 1),
+    "gt": (-1, 0),
+    "ge": (-1, 1),
+    "ne": (0, 0),
+    "eq": (0, 1),
+}
+_OPPOSITE = {"lt": "ge", "le": "gt", "gt": "le", "ge": "lt", "eq": "ne", "ne": "eq"}
