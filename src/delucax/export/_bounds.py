@@ -133,6 +133,8 @@ class Bound(NamedTuple):
         """By how much the first round changes what is carried, and by how much each
         later one."""
         param, node = self.body.params[k], self._made(self.body.outs[k])
+        if node is not None and node.op == "cond":
+            node = self._counting(node, self.body.outs[k], param)
         if node is None or node.op not in ("add", "sub"):
             return None
         a, b = node.ins
@@ -154,6 +156,31 @@ class Bound(NamedTuple):
         if len(pair) < 2 or any(value.ndim for value in pair):
             return None
         return turn * float(pair[0]), turn * float(pair[1])
+
+    def _counting(self, node: Node, out: Any, param: Var) -> Node | None:
+        """The node that counts in one branch, if the other, which leaves the count as
+        it is, is taken in the last round alone."""
+        if len(node.blocks) != 2:
+            return None
+        at = node.outs.index(out)
+        counts = [block.outs[at] for block in node.blocks]
+        if param not in counts:
+            return None
+        same = counts.index(param)
+        which, ends = node.ins[0], bool(same)
+        while (maker := self._made(which)) is not None:
+            if maker.op not in ("convert_element_type", "not"):
+                break
+            ends = ends != (maker.op == "not")
+            (which,) = maker.ins
+        if not ends or which not in self.body.outs:
+            return None
+        flag = self.body.params[self.body.outs.index(which)]
+        test = self._made(self.cond.outs[0])
+        if test is None or test.op != "not":
+            return None
+        is_flag = test.ins[0] is self.cond.params[self.body.params.index(flag)]
+        return self._made(counts[1 - same]) if is_flag else None
 
 
 _BETWEEN = "select_n", "convert_element_type", "min", "max", "squeeze"

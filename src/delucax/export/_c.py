@@ -58,8 +58,8 @@ def c(
     - `dtype`: `"float32"` or `"float64"`, of all real numbers; by default that of the
         arrays in what is given. It need not be the one of this process.
     - `example`: the inputs of a function, a tuple of arrays, numbers or
-        `jax.ShapeDtypeStruct`, of which the shapes count; of a controller an
-        observation, where its size cannot be found out.
+        `jax.ShapeDtypeStruct`, or pytrees of them, of which the shapes count; of a
+        controller an observation, where its size cannot be found out.
     - `fallback`: the control where a step fails, shape `(m,)`; by default the last good
         one.
     - `max_iterations`: the most rounds of a loop for which no bound is found.

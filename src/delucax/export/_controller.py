@@ -43,12 +43,18 @@ class _Traced:
             start = _first_state(controller, dtype)
             arrays, static = eqx.partition(start, eqx.is_array)
             leaves, structure = jax.tree_util.tree_flatten_with_path(arrays)
-            self.start = [np.asarray(leaf) for _, leaf in leaves]
-            self.paths = [jax.tree_util.keystr(path) for path, _ in leaves]
-            kinds = [(leaf.shape, leaf.dtype) for leaf in self.start]
+            # C has no arrays without entries.
+            kept = [bool(leaf.size) for _, leaf in leaves]
+            full = [pair for pair in leaves if pair[1].size]
+            self.start = [np.asarray(leaf) for _, leaf in full]
+            self.paths = [jax.tree_util.keystr(path) for path, _ in full]
+            kinds = [(leaf.shape, leaf.dtype) for _, leaf in leaves]
 
             def unflatten(flat):
-                return eqx.combine(jax.tree.unflatten(structure, flat), static)
+                rest = iter(flat)
+                pairs = zip(leaves, kept, strict=True)
+                every = [next(rest) if used else leaf for (_, leaf), used in pairs]
+                return eqx.combine(jax.tree.unflatten(structure, every), static)
 
             def flatten(state):
                 flat, after = jax.tree.flatten(eqx.filter(state, eqx.is_array))
@@ -60,7 +66,8 @@ class _Traced:
                     )
                 return [
                     jnp.asarray(leaf, kind)
-                    for leaf, (_, kind) in zip(flat, kinds, strict=True)
+                    for leaf, (_, kind), used in zip(flat, kinds, kept, strict=True)
+                    if used
                 ]
 
             def step(t, y, *flat):
@@ -71,7 +78,7 @@ class _Traced:
                 return flatten(controller.applied(u, cost, unflatten(flat)))
 
             number = jax.ShapeDtypeStruct((), dtype)
-            state = [jax.ShapeDtypeStruct(s, d) for s, d in kinds]
+            state = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self.start]
             y = _observation(step, number, state, dtype, example)
             self.step = trace(step, number, y, *state)
             self.observations, self.controls = y.shape[0], self.step.outs[0].shape

@@ -171,8 +171,10 @@ class Writer:
         if isinstance(value, View):
             return value
         if isinstance(value, Table):
-            name = self.shared.table(value.array)
-            return View(Buffer(name, value.dtype, value.size, None, False), value.shape)
+            least, strides = value.least()
+            name = self.shared.table(least)
+            buffer = Buffer(name, value.dtype, least.size, None, False)
+            return View(buffer, value.shape, strides)
         # What was stored in a branch is not there after it.
         if id(value) in self._stored:
             scope, same, view = self._stored[id(value)]

@@ -100,17 +100,20 @@ def export_function(
     """The header and the source of a function, and its report without the files."""
     function = cast(function, dtype)
     with precision(dtype):
-        shapes = [_shape(value, dtype, k) for k, value in enumerate(example)]
+        given, structure = jax.tree_util.tree_flatten_with_path(tuple(example))
+        shapes = [_shape(value, dtype, path) for path, value in given]
         paths: list[str] = []
 
         def flat(*args):
-            leaves, _ = jax.tree_util.tree_flatten_with_path(function(*args))
+            outs = function(*jax.tree.unflatten(structure, args))
+            leaves, _ = jax.tree_util.tree_flatten_with_path(outs)
             paths[:] = [_word(path) for path, _ in leaves]
             return [jnp.asarray(leaf) for _, leaf in leaves]
 
         block = trace(flat, *shapes)
-    given = labels or _names_of(function, len(shapes))
-    names = _file.free_names(given, [name])
+    heads = labels or _names_of(function, len(example))
+    words = [f"{heads[path[0].idx]}_{_word(path[1:])}" for path, _ in given]
+    names = _file.free_names((word.strip("_") for word in words), [name])
     outs = _file.free_names([p or "out" for p in paths], [name, *names])
     inputs = [
         Array(n, s.shape, str(s.dtype)) for n, s in zip(names, shapes, strict=True)
@@ -172,8 +175,9 @@ def _word(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator="_")
 
 
-def _shape(value: Any, dtype: np.dtype, k: int) -> Any:
+def _shape(value: Any, dtype: np.dtype, path: Any) -> Any:
     """The shape and the type of an input."""
+    where = f"export.c: example{jax.tree_util.keystr(path)}"
     try:
         kind = getattr(value, "dtype", None)
         if kind is None:
@@ -182,16 +186,15 @@ def _shape(value: Any, dtype: np.dtype, k: int) -> Any:
         kind = np.dtype(kind)
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"export.c: example[{k}] must be an array, a number or a "
-            f"jax.ShapeDtypeStruct, got {value!r}."
+            f"{where} must be an array, a number or a jax.ShapeDtypeStruct, got "
+            f"{value!r}."
         ) from error
     if kind.kind == "f":
         kind = dtype
     kind = np.dtype(jax.dtypes.canonicalize_dtype(kind))
     if not is_supported(kind):
         raise ValueError(
-            f"export.c: example[{k}] must be of real numbers, whole numbers or "
-            f"booleans, got {kind}."
+            f"{where} must be of real numbers, whole numbers or booleans, got {kind}."
         )
     return jax.ShapeDtypeStruct(tuple(value.shape), kind)
 

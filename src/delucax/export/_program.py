@@ -19,19 +19,6 @@ _RULES: dict[str, Any] = (
     _structural.RULES | _reductions.RULES | _factors.RULES | _loops.RULES
 )
 
-_WHY = {
-    "random_bits": "it draws random numbers",
-    "random_wrap": "it draws random numbers",
-    "random_split": "it draws random numbers",
-    "random_fold_in": "it draws random numbers",
-    "random_seed": "it draws random numbers",
-    "threefry2x32": "it draws random numbers",
-    "eigh": "there is no routine for eigenvalues",
-    "eig": "there is no routine for eigenvalues",
-    "svd": "there is no routine for singular values",
-    "schur": "there is no routine for it",
-}
-
 
 class Program(Writer):
     """Writes the nodes of blocks. `values` are the arrays, by their variables."""
@@ -106,8 +93,7 @@ class Program(Writer):
         elif node.op in _RULES:
             made = _RULES[node.op](self, node, *ins)
         else:
-            why = _WHY.get(node.op, "there is no form of it in C")
-            raise refuse(node.op, why, node.where)
+            raise refuse(node.op, "there is no form of it in C", node.where)
         made = made if isinstance(made, list) else [made]
         for var, value in zip(node.outs, made, strict=True):
             self.bind(var, value)

@@ -48,7 +48,10 @@ class Report(NamedTuple):
             ("stack", f"{self.stack} bytes"),
             ("operations", f"{self.operations} a call"),
             ("lines of C", str(self.lines)),
-            *((f"loop at {line}", f"{n} rounds") for line, n in self.bounds),
+            *(
+                (f"loop at {line}" if line else "loop", f"{n} rounds")
+                for line, n in self.bounds
+            ),
         ]
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)

@@ -39,12 +39,24 @@ def trace(function: Callable[..., Any], *shapes: Any) -> Block:
     return block
 
 
+_WHY = {
+    "eig": "there is no routine for eigenvalues",
+    "eigh": "there is no routine for eigenvalues",
+    "svd": "there is no routine for singular values",
+    "schur": "there is no routine for it",
+    "threefry2x32": "it draws random numbers",
+    "conv_general_dilated": "there is no routine for convolutions",
+}
+
+
 class Unsupported(ValueError):
     """What C cannot take."""
 
 
 def refuse(name: str, why: str, where: str) -> Unsupported:
     """The error for an operation that has no form in C."""
+    why = "it draws random numbers" if name.startswith("random") else why
+    why = _WHY.get(name, why)
     line = f" at {where}" if where else ""
     return Unsupported(f"export.c: {name}{line} cannot be exported: {why}.")
 
@@ -120,18 +132,26 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
         # What is for every platform avoids what only XLA has.
         index = platforms.index(None) if None in platforms else 0
         return [Const(np.asarray(index, np.int32))]
-    if "callback" in op:
+    if "callback" in op or "debug" in op:
         raise refuse(op, "C cannot call Python", where)
     if is_known:
         return _computed(eqn, ins, outs)
     impl = eqn.primitive.impl
+    if op == "call_hi_primitive":
+        impl = eqn.primitive.to_lojax
+        closed = jax.make_jaxpr(functools.partial(impl, **params))(*_shapes(ins))
+        return _inlined(closed, ins, block, where)
     if not getattr(impl, "__module__", "functools").startswith(("jax", "functools")):
         # One of another library, which it says in terms of others.
         impl = functools.partial(impl, **params)
-        shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in ins]
-        closed = jax.make_jaxpr(lambda *args: jax.tree.leaves(impl(*args)))(*shapes)
+        flat = lambda *args: jax.tree.leaves(impl(*args))
+        closed = jax.make_jaxpr(flat)(*_shapes(ins))
         return _inlined(closed, ins, block, where)
     return _node(op, ins, outs, dict(params), block, where)
+
+
+def _shapes(ins: list[Atom]) -> list[Any]:
+    return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in ins]
 
 
 def _computed(eqn: Any, ins: list[Any], outs: Any) -> list[Atom]:

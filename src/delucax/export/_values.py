@@ -23,6 +23,7 @@ from ._expressions import (
 
 
 Indices = tuple[Index, ...]
+_SMALL = 16
 
 
 class Buffer:
@@ -73,13 +74,26 @@ class Table(Value):
             return literal(self.array[tuple(i.const for i in indices)], self.dtype)
         if self.is_uniform:
             return literal(self.array.flat[0], self.dtype)
-        name = self.named(self.array)
-        index = flat_index(indices, row_major(self.shape), known(0))
+        least, strides = self.least()
+        name = self.named(least)
+        index = flat_index(indices, strides, known(0))
         reads = index.reads | {name}
         low, high = -np.inf, np.inf
         if self.dtype.kind in "iub":
             low, high = float(self.array.min()), float(self.array.max())
         return Expr(f"{name}[{index.text}]", self.dtype, reads, low=low, high=high)
+
+    def least(self) -> tuple[np.ndarray, tuple[int, ...]]:
+        """The array without axes along which nothing changes, and strides to read it
+        with."""
+        least, kept = self.array, []
+        for axis, extent in enumerate(self.shape):
+            first = least.take([0], axis)
+            same = extent > 1 and least.size > _SMALL and np.all(least == first)
+            least = first if same else least
+            kept.append(not same)
+        strides = row_major(least.shape)
+        return least, tuple(s * k for s, k in zip(strides, kept, strict=True))
 
     @property
     def is_uniform(self) -> bool:
