@@ -238,7 +238,7 @@ ARRAYS = {
     "sampled": sampled,
     "windows": windows,
 }
-SHAPES = {"small": (2, 3), "wide": (3, 5), "tall": (5, 4)}
+SHAPES = {"small": (2, 3), "large": (5, 4)}
 
 
 def close(found, expected, tolerance):

@@ -22,7 +22,7 @@ def c(
     function_or_controller: Any,
     directory: Any,
     *,
-    name: str,
+    name: Any,
     dtype: Any = None,
     example: Any = None,
     fallback: Any = None,
