@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from c_programs import exported, needs_compiler
 from jax import lax
 from jax.scipy import linalg, special
@@ -288,3 +289,64 @@ def agree(folder, given, tolerance):
 def test_each_operation(tmp_path):
     x64 = jax.config.jax_enable_x64  # pyright: ignore
     agree(tmp_path, programs(float), 1e-12 if x64 else 2e-4)
+
+
+# Programs at random: each line reads what was computed before, so that arrays have many
+# readers, live long, and are changed in place.
+
+MADE = {
+    "sum": lambda r, a, b: a + b,
+    "product": lambda r, a, b: jnp.tanh(a * b),
+    "matrix": lambda r, a, b: jnp.sin(a @ b.T @ a),
+    "scaled": lambda r, a, b: a * jnp.sum(b, 0) / (1 + jnp.max(jnp.abs(b))),
+    "turned": lambda r, a, b: jnp.roll(a[::-1], r.integers(3), 1) - b,
+    "joined": lambda r, a, b: jnp.concatenate([a, b])[r.integers(2) :: 2][: len(a)],
+    "set": lambda r, a, b: a.at[r.integers(2)].set(b[0]).at[:, 1].add(b[:, 0]),
+    "placed": lambda r, a, b: lax.dynamic_update_slice(
+        a, b[:1, :2], (jnp.argmax(b[:, 0]), r.integers(3))
+    ),
+    "chosen": lambda r, a, b: jnp.where(a > b, a, b[:, :1]),
+    "branch": lambda r, a, b: lax.cond(a[0, 0] > b[1, 1], jnp.sin, lambda a: a + b, a),
+    "loop": lambda r, a, b: lax.scan(
+        lambda c, row: (jnp.cos(c + row), c * row), a[0], b, reverse=bool(r.integers(2))
+    )[1],
+    "swap": lambda r, a, b: lax.fori_loop(
+        0, 3, lambda k, c: (c[1] / 2, c[0].at[k % 2].add(k)), (a, b)
+    )[0],
+    "until": lambda r, a, b: lax.while_loop(
+        lambda c: (c[0] < 5) & (c[1][0, 0] < 2),
+        lambda c: (c[0] + 1, c[1] + a**2),
+        (0, b),
+    )[1],
+    "factor": lambda r, a, b: jnp.linalg.solve(definite(a), b),
+    "sorted": lambda r, a, b: jnp.sort(a, axis=r.integers(2)) + jnp.cumsum(b, 0),
+    "taken": lambda r, a, b: a[jnp.argsort(b[:, 0])],
+    "several": lambda r, a, b: jax.vmap(lambda a, b: a * jnp.sum(a * b))(a, b),
+}
+
+
+def program(seed):
+    """A function of two matrices, of so many lines drawn at random."""
+    kinds = np.random.default_rng(seed).choice(list(MADE), 14)
+
+    def function(x, y):
+        rng, values = np.random.default_rng(seed), [x, y]
+        for kind in kinds:
+            a, b = (values[k] for k in rng.integers(len(values), size=2))
+            made = MADE[kind](rng, a, b)
+            values.append(made / (1 + jnp.max(jnp.abs(made))))
+        return values[-1], sum(values), [values[k] for k in rng.integers(9, size=2)]
+
+    return function
+
+
+def test_programs_at_random(tmp_path):
+    rng = np.random.default_rng(0)
+    shapes = [(2, 3), (4, 3), (5, 4)] * 6
+    given = {
+        f"program{k}": (program(k), tuple(np.asarray(rng.normal(size=(2, *s)), float)))
+        for k, s in enumerate(shapes)
+    }
+    if not jax.config.jax_enable_x64:  # pyright: ignore
+        pytest.skip("Single precision amplifies rounding in branches.")
+    agree(tmp_path, given, 1e-10)

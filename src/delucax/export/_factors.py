@@ -84,6 +84,15 @@ def lu(e, node, x):
     return [place, first, second]
 
 
+def permutation(e, node, pivots):
+    out, pivots = node.outs[0], e.packed(pivots)
+    place, (n, k) = e.new_view(out.shape, out.dtype), (out.shape[-1], pivots.shape[-1])
+    with e.over(out.shape[:-1]) as batch:
+        parts = [(v, _offset(batch, v.shape)) for v in (pivots, place)]
+        _call(e, "permutation", out.dtype, [place], n, k, *parts, cost=3 * k)
+    return place
+
+
 def qr(e, node, x):
     q, r = node.outs
     (m, n), k = x.shape[-2:], min(x.shape[-2:])
@@ -163,6 +172,7 @@ RULES: dict[str, Any] = {
     "cholesky": cholesky,
     "triangular_solve": triangular_solve,
     "lu": lu,
+    "lu_pivots_to_permutation": permutation,
     "qr": qr,
     "geqrf": geqrf,
     "householder_product": householder_product,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _factors, _loops, _reductions, _structural
+from . import _factors, _indexing, _loops, _reductions, _structural
 from ._blocks import Atom, Block, Const, Node, Var
 from ._bounds import Origins
 from ._elementwise import operation
@@ -16,7 +16,11 @@ from ._values import Table, Value, View
 
 
 _RULES: dict[str, Any] = (
-    _structural.RULES | _reductions.RULES | _factors.RULES | _loops.RULES
+    _structural.RULES
+    | _indexing.RULES
+    | _reductions.RULES
+    | _factors.RULES
+    | _loops.RULES
 )
 
 

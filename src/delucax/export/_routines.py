@@ -29,6 +29,9 @@ static T maximum_S(T a, T b) { return a > b || a != a ? a : b; }""",
 /* The smaller number, or NaN if there is one. */
 static T minimum_S(T a, T b) { return a < b || a != a ? a : b; }""",
     "sign": "static T sign_S(T x) { return x > 0 ? 1 : x < 0 ? -1 : x; }",
+    "precedes": """
+/* Whether a comes before b, NaN being last. */
+static int precedes_S(T a, T b) { return a < b || (a == a && b != b); }""",
     "erf_inv": """
 /* The inverse of erf: Winitzki's estimate, then steps of Halley's method. */
 static T erf_inv_S(T x) {
@@ -191,6 +194,16 @@ static void lu_S(int m, int n, T *a, int32_t *pivots, int32_t *order) {
       a[i * n + k] = factor;
       for (int j = k + 1; j < n; ++j) a[i * n + j] -= factor * a[k * n + j];
     }
+  }
+}""",
+    "permutation": """
+/* The order of n rows after k exchanges. */
+static void permutation_S(int n, int k, const T *pivots, T *order) {
+  for (int i = 0; i < n; ++i) order[i] = i;
+  for (int i = 0; i < k; ++i) {
+    const T moved = order[i];
+    order[i] = order[pivots[i]];
+    order[pivots[i]] = moved;
   }
 }""",
     "reflections": """

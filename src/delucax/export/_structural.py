@@ -5,15 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from ._elementwise import operation
-from ._expressions import Expr, Index, index_of, known, literal
+from ._expressions import known
 from ._values import remapped, reshaped, Scalars, Table, Value, View
 
 
 Rule = Callable[..., Any]
 
 
-def _mapped(e: Any, value: Value, shape: Sequence[int], index: Any) -> Value:
+def mapped(e: Any, value: Value, shape: Sequence[int], index: Any) -> Value:
     """As `remapped`, of an array that loops can read if they will."""
     size = int(np.prod(shape, dtype=int))
     if size > e.unroll:
@@ -35,7 +34,7 @@ def broadcast(e, node, x):
             for axis, extent in zip(axes, own, strict=True)
         )
 
-    return _mapped(e, x, shape, index)
+    return mapped(e, x, shape, index)
 
 
 def reshape(e, node, x):
@@ -51,7 +50,7 @@ def tile(e, node, x):
     own = x.shape
     if e.is_few(out):
         index = lambda i: tuple(known(k.const % n) for k, n in zip(i, own, strict=True))
-        return _mapped(e, x, out.shape, index)
+        return mapped(e, x, out.shape, index)
     place, x = e.new_view(out.shape, out.dtype), e.indexable(x)
     with e.over(reps) as copy:
         begin = [known(0).plus(k, n) for k, n in zip(copy, own, strict=True)]
@@ -64,7 +63,7 @@ def transpose(e, node, x):
     order = node.params["permutation"]
     inverse = [list(order).index(axis) for axis in range(len(order))]
     index = lambda i: tuple(i[axis] for axis in inverse)
-    return _mapped(e, x, node.outs[0].shape, index)
+    return mapped(e, x, node.outs[0].shape, index)
 
 
 def slice_(e, node, x):
@@ -75,7 +74,7 @@ def slice_(e, node, x):
         parts = zip(i, starts, steps, strict=True)
         return tuple(known(a).plus(k, step) for k, a, step in parts)
 
-    return _mapped(e, x, node.outs[0].shape, index)
+    return mapped(e, x, node.outs[0].shape, index)
 
 
 def reverse(e, node, x):
@@ -87,7 +86,7 @@ def reverse(e, node, x):
             for axis, (k, n) in enumerate(zip(i, shape, strict=True))
         )
 
-    return _mapped(e, x, shape, index)
+    return mapped(e, x, shape, index)
 
 
 def split(e, node, x):
@@ -102,7 +101,7 @@ def _part(e, x, shape, axis, begin):
     def index(i):
         return tuple(k.plus(begin) if a == axis else k for a, k in enumerate(i))
 
-    return _mapped(e, x, shape, index)
+    return mapped(e, x, shape, index)
 
 
 def unstack(e, node, x):
@@ -110,7 +109,7 @@ def unstack(e, node, x):
 
     def entry(k, out):
         index = lambda i: (*i[:axis], known(k), *i[axis:])
-        return _mapped(e, x, out.shape, index)
+        return mapped(e, x, out.shape, index)
 
     return [entry(k, out) for k, out in enumerate(node.outs)]
 
@@ -118,7 +117,7 @@ def unstack(e, node, x):
 def stack(e, node, *xs):
     axis = node.params["axis"]
     parts = [
-        _mapped(
+        mapped(
             e, x, (*x.shape[:axis], 1, *x.shape[axis:]),
             lambda i: (*i[:axis], *i[axis + 1 :]),
         )
@@ -137,7 +136,7 @@ def _joined(e, out, xs, axis):
         for part, x in zip(grid, xs, strict=True):
             for flat, expr in enumerate(x.entries()):
                 part.flat[flat] = expr
-        return _scalars(out, np.concatenate(grid, axis), xs)
+        return scalars(out, np.concatenate(grid, axis), xs)
     place, begin = e.new_view(out.shape, out.dtype), 0
     for x in xs:
         e.fill(_part(e, place, x.shape, axis, begin), e.indexable(x))
@@ -145,7 +144,7 @@ def _joined(e, out, xs, axis):
     return place
 
 
-def _scalars(out, grid, of):
+def scalars(out, grid, of):
     buffers = frozenset().union(*(v.buffers for v in of))
     return Scalars(out.shape, out.dtype, list(grid.flat), buffers)
 
@@ -165,7 +164,7 @@ def pad(e, node, x, fill):
             ]
             if all(0 <= k < n for k, n in zip(into, out.shape, strict=True)):
                 grid[tuple(into)] = expr
-        return _scalars(out, grid, (x, fill))
+        return scalars(out, grid, (x, fill))
     # Only what falls inside is copied.
     ranges = []
     for n, size, (low, _, inside) in zip(x.shape, out.shape, config, strict=True):
@@ -189,7 +188,7 @@ def pad(e, node, x, fill):
             for k, (first, _, low, step) in parts
         )
 
-    part = _mapped(e, x, kept, source)
+    part = mapped(e, x, kept, source)
     e.fill(remapped(place, kept, target), e.indexable(part))
     return place
 
@@ -200,196 +199,7 @@ def iota(e, node):
     return e.formula(out.shape, out.dtype, at, (), 0)
 
 
-# Indices that are computed
-
-
-def clamped(e: Any, expr: Expr, most: int) -> Index:
-    """A computed index, brought between 0 and `most`."""
-    if expr.value is not None:
-        return known(min(max(int(expr.value), 0), most))
-    if expr.low >= 0 and expr.high <= most:
-        return index_of(e.define(expr))
-    params: Any = {}
-    make, _ = operation("clamp", params, [expr.dtype], expr.dtype, e.shared)
-    ends = literal(0, expr.dtype), literal(most, expr.dtype)
-    return index_of(e.define(make([ends[0], expr, ends[1]])))
-
-
-def dynamic_slice(e, node, x, *starts):
-    sizes = node.params["slice_sizes"]
-    begin = [
-        clamped(e, start.at(()), n - k)
-        for start, n, k in zip(starts, x.shape, sizes, strict=True)
-    ]
-    if not all(b.is_known for b in begin):
-        x = e.indexable(x)
-    index = lambda i: tuple(b.plus(k) for b, k in zip(begin, i, strict=True))
-    return _mapped(e, x, sizes, index)
-
-
-def dynamic_update_slice(e, node, x, update, *starts):
-    begin = [
-        clamped(e, start.at(()), n - k)
-        for start, n, k in zip(starts, x.shape, update.shape, strict=True)
-    ]
-    out = node.outs[0]
-    if e.is_few(out) and all(b.is_known for b in begin):
-        grid = np.empty(out.shape, object)
-        for flat, expr in enumerate(x.entries()):
-            grid.flat[flat] = expr
-        for at, expr in zip(np.ndindex(*update.shape), update.entries(), strict=True):
-            grid[tuple(b.const + k for b, k in zip(begin, at, strict=True))] = expr
-        return _scalars(out, grid, (x, update))
-    place = e.owned(node.ins[0], x)
-    index = lambda i: tuple(b.plus(k) for b, k in zip(begin, i, strict=True))
-    part = remapped(place, update.shape, index)
-    update = e.indexable(update)
-    if place.buffers & update.buffers:
-        update = e.copied(update)
-    e.fill(part, update)
-    return place
-
-
-def _is_clipped(mode: Any) -> bool:
-    return "CLIP" in str(mode)
-
-
-def _is_promised(mode: Any) -> bool:
-    return "PROMISE" in str(mode)
-
-
-def gather(e, node, x, indices):
-    params = node.params
-    numbers, sizes, mode = (
-        params["dimension_numbers"],
-        params["slice_sizes"],
-        params["mode"],
-    )
-    out, x = node.outs[0], e.indexable(x)
-    indices = e.indexable(indices)
-    offset_axes = numbers.offset_dims
-    batch_axes = [a for a in range(len(out.shape)) if a not in offset_axes]
-    hidden = {*numbers.collapsed_slice_dims, *numbers.operand_batching_dims}
-    shown = [a for a in range(len(x.shape)) if a not in hidden]
-    drops = not _is_clipped(mode) and not _is_promised(mode)
-
-    def at(i):
-        batch = [i[a] for a in batch_axes]
-        place, inside = _starts(e, numbers, x.shape, sizes, indices, batch, drops)
-        for operand_axis, a in zip(shown, offset_axes, strict=True):
-            place[operand_axis] = place[operand_axis].plus(i[a])
-        entry = x.at(tuple(place))
-        if inside is None:
-            return entry
-        fill = literal(_fill_of(params, out.dtype), out.dtype)
-        return _chosen(e, inside, entry, fill)
-
-    return e.formula(out.shape, out.dtype, at, (x, indices), 1)
-
-
-def _fill_of(params, dtype):
-    if params["fill_value"] is not None:
-        return params["fill_value"]
-    kind = np.dtype(dtype).kind
-    if kind == "f":
-        return np.nan
-    if kind == "b":
-        return True
-    return np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max
-
-
-def _chosen(e, inside, yes, no):
-    make, _ = operation("select_n", {}, [np.dtype(bool)], yes.dtype, e.shared)
-    return make([inside, no, yes])
-
-
-def _starts(e, numbers, shape, sizes, indices, batch, drops):
-    """Where a window begins, brought inside; and whether it was, if that matters."""
-    is_gather = hasattr(numbers, "start_index_map")
-    axes = (
-        numbers.start_index_map if is_gather else numbers.scatter_dims_to_operand_dims
-    )
-    pairs = zip(
-        numbers.operand_batching_dims,
-        numbers.start_indices_batching_dims if is_gather
-        else numbers.scatter_indices_batching_dims,
-        strict=True,
-    )  # fmt: skip
-    place = [known(0) for _ in shape]
-    for axis, from_axis in pairs:
-        place[axis] = batch[from_axis]
-    inside = None
-    for k, axis in enumerate(axes):
-        expr = indices.at((*batch, known(k)))
-        most = shape[axis] - sizes[axis]
-        if drops and not (expr.low >= 0 and expr.high <= most):
-            expr = e.define(expr)
-            for op, end in (("ge", 0), ("le", most)):
-                make, _ = operation(op, {}, [expr.dtype], bool, e.shared)
-                test = make([expr, literal(end, expr.dtype)])
-                if inside is None:
-                    inside = test
-                else:
-                    both, _ = operation("and", {}, [np.dtype(bool)], bool, e.shared)
-                    inside = both([inside, test])
-        place[axis] = clamped(e, expr, most)
-    if inside is not None and inside.value is None:
-        inside = e.define(inside)
-    return place, inside
-
-
-_COMBINED = {
-    "scatter": None,
-    "scatter-add": "add",
-    "scatter-mul": "mul",
-    "scatter-min": "min",
-    "scatter-max": "max",
-    "scatter-sub": "sub",
-}
-
-
-def scatter(e, node, x, indices, updates):
-    params = node.params
-    numbers, mode = params["dimension_numbers"], params["mode"]
-    combine = _COMBINED[node.op]
-    place = e.owned(node.ins[0], x)
-    updates, indices = e.indexable(updates), e.indexable(indices)
-    if place.buffers & (updates.buffers | indices.buffers):
-        updates, indices = e.copied(updates), e.copied(indices)
-    hidden = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
-    shown = [a for a in range(len(x.shape)) if a not in hidden]
-    windows = numbers.update_window_dims
-    batch_axes = [a for a in range(len(updates.shape)) if a not in windows]
-    sizes = [1] * len(x.shape)
-    for operand_axis, a in zip(shown, windows, strict=True):
-        sizes[operand_axis] = updates.shape[a]
-    drops = not _is_clipped(mode) and not _is_promised(mode)
-    with e.over([updates.shape[a] for a in batch_axes]) as batch:
-        begin, inside = _starts(e, numbers, x.shape, sizes, indices, batch, drops)
-
-        def write(_=None):
-            with e.over([updates.shape[a] for a in windows]) as window:
-                at: list[Any] = [None] * len(updates.shape)
-                into = list(begin)
-                for a, index in zip(batch_axes, batch, strict=True):
-                    at[a] = index
-                for a, b, index in zip(windows, shown, window, strict=True):
-                    at[a], into[b] = index, into[b].plus(index)
-                entry = updates.at(tuple(at))
-                if combine is not None:
-                    kind = [place.dtype] * 2
-                    make, _ = operation(combine, {}, kind, place.dtype, e.shared)
-                    entry = make([place.at(tuple(into)), entry])
-                e.store(place, into, entry)
-
-        if inside is None or inside.value:
-            write()
-        elif inside.value is None:
-            e.choose(inside, 2, lambda k: write() if k else None)
-    return place
-
-
-RULES: dict[str, Rule] = {
+RULES: dict[str, Any] = {
     "broadcast_in_dim": broadcast,
     "reshape": reshape,
     "squeeze": reshape,
@@ -404,8 +214,4 @@ RULES: dict[str, Rule] = {
     "concatenate": concatenate,
     "pad": pad,
     "iota": iota,
-    "dynamic_slice": dynamic_slice,
-    "dynamic_update_slice": dynamic_update_slice,
-    "gather": gather,
-    **dict.fromkeys(_COMBINED, scatter),
 }
