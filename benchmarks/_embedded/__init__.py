@@ -25,7 +25,8 @@ COMMON = ("-O2", "-ffp-contract=off", "-std=c99")
 TARGET = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
 AGREEMENT = {"float32": 2e-6, "float64": 1e-13}
 """Of `max(1, |u|)`, where a function of `math.h` that rounds as it likes is called."""
-EXACT = {"fabs", "sqrt", "floor", "ceil", "trunc", "copysign", "fmin", "fmax", "fmod"}
+EXACT = {"ceil", "copysign", "fabs", "floor", "fma", "fmax", "fmin", "fmod", "lrint"}
+EXACT |= {"nearbyint", "rint", "round", "sqrt", "trunc"}
 """Functions of `math.h` that have one right answer."""
 SECONDS = 300.0
 HERE = Path(__file__).parent
@@ -81,8 +82,7 @@ def run(folder: Path, name: str, table: np.ndarray, dtype: str) -> Run:
     """
     with tempfile.TemporaryDirectory() as made:
         build = Path(made)
-        (build / "controller.h").write_text(f'#include "{name}.h"\n')
-        (build / "table.h").write_text(_table(table, name))
+        write_headers(build, name, table)
         sources = HERE / "main.c", folder / f"{name}.c"
         flags = (*COMMON, f"-DNAME={name}", f"-I{build}", f"-I{folder}")
         host = _host(build, sources, flags)
@@ -105,7 +105,16 @@ def run(folder: Path, name: str, table: np.ndarray, dtype: str) -> Run:
     )
 
 
-def _table(table: np.ndarray, name: str) -> str:
+def write_headers(folder: Path, name: str, table: np.ndarray) -> None:
+    """The headers that a program needs to run a controller over a table."""
+    sizes = "OBSERVATION_SIZE", "CONTROL_SIZE"
+    lines = [f'#include "{name}.h"']
+    lines += [f"#define {size} {name.upper()}_{size}" for size in sizes]
+    (folder / "controller.h").write_text("\n".join([*lines, ""]))
+    (folder / "table.h").write_text(_in_c(table, name))
+
+
+def _in_c(table: np.ndarray, name: str) -> str:
     """The rows as C."""
     rows = ["    {" + ", ".join(map(_number, row)) + "}," for row in table.tolist()]
     head = f"#define ROWS {len(table)}\n"
@@ -127,19 +136,19 @@ def _number(value: float) -> str:
 
 def _host(build: Path, sources: tuple[Path, ...], flags: tuple[str, ...]) -> str:
     program = build / "host"
-    _call("cc", *flags, *sources, "-o", program, "-lm")
-    return _call(program)
+    call("cc", *flags, *sources, "-o", program, "-lm")
+    return call(program)
 
 
 def _board(build: Path, sources: tuple[Path, ...], flags: tuple[str, ...]) -> str:
     program = build / "board.elf"
     link = ("-nostartfiles", "--specs=rdimon.specs", f"-T{HERE / 'link.ld'}")
     startup = HERE / "startup.c"
-    _call(
+    call(
         f"{PREFIX}gcc", *TARGET, *flags, "-DBOARD", startup, *sources, *link,
         "-o", program, "-lm",
     )  # fmt: skip
-    return _call(
+    return call(
         QEMU, "-machine", "mps2-an386", "-nographic", "-monitor", "none",
         "-serial", "none", "-icount", "shift=0", "-semihosting-config",
         "enable=on,target=native", "-kernel", program,
@@ -151,13 +160,11 @@ def _object(
 ) -> tuple[int, tuple[str, ...]]:
     """Bytes in ROM of one object, and the functions it calls that may round."""
     made = build / "alone.o"
-    _call(f"{PREFIX}gcc", *TARGET, *flags, "-c", source, "-o", made)
-    sections = [
-        line.split() for line in _call(f"{PREFIX}size", "-A", made).splitlines()
-    ]
+    call(f"{PREFIX}gcc", *TARGET, *flags, "-c", source, "-o", made)
+    sections = [line.split() for line in call(f"{PREFIX}size", "-A", made).splitlines()]
     kept = (".text", ".rodata", ".data")
     rom = sum(int(s[1]) for s in sections if s and s[0].startswith(kept))
-    names = [line.split()[-1] for line in _call(f"{PREFIX}nm", "-u", made).splitlines()]
+    names = [line.split()[-1] for line in call(f"{PREFIX}nm", "-u", made).splitlines()]
     plain = lambda name: name.removesuffix("f")
     own = {"memcpy", "memset"}
     rounding = [
@@ -167,8 +174,8 @@ def _object(
     return rom, tuple(rounding)
 
 
-def _call(*command: object) -> str:
-    """What a command prints.
+def call(*command: object) -> str:
+    """What a command prints on standard output.
 
     **Raises:** `RuntimeError` with its words if it fails.
     """

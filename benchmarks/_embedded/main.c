@@ -7,7 +7,7 @@
 #include <stdio.h>
 #include <string.h>
 
-#include "controller.h" /* includes NAME.h */
+#include "controller.h" /* includes NAME.h, and defines its sizes */
 #include "table.h"      /* ROWS, and rows of t, y, the control applied and its cost */
 
 #define JOIN_(a, b) a##b
@@ -64,7 +64,7 @@ static void print(const real *u, int flag, unsigned long ticks)
 {
     size_t i, k;
     printf("%d %lu", flag, ticks);
-    for (i = 0; i < OF(_CONTROL_SIZE); i++) {
+    for (i = 0; i < CONTROL_SIZE; i++) {
         unsigned char bytes[sizeof(real)];
         memcpy(bytes, u + i, sizeof(real));
         printf(" ");
@@ -76,7 +76,7 @@ static void print(const real *u, int flag, unsigned long ticks)
 int main(void)
 {
     size_t row;
-    real u[OF(_CONTROL_SIZE)];
+    real u[CONTROL_SIZE];
     unsigned long ticks = 0;
 #ifdef BOARD
     uint32_t before, empty, *here, *deepest;
@@ -110,8 +110,8 @@ int main(void)
         ticks = since(before);
 #endif
         print(u, flag, ticks);
-        OF(_applied)(&state, table[row] + 1 + OF(_OBSERVATION_SIZE),
-                     table[row][1 + OF(_OBSERVATION_SIZE) + OF(_CONTROL_SIZE)]);
+        OF(_applied)(&state, table[row] + 1 + OBSERVATION_SIZE,
+                     table[row][1 + OBSERVATION_SIZE + CONTROL_SIZE]);
     }
     return 0;
 }
