@@ -1,6 +1,8 @@
 """What several test files share."""
 
 import contextlib
+import os
+import shutil
 
 import equinox as eqx
 import jax
@@ -18,6 +20,11 @@ needs_x32 = pytest.mark.skipif(bool(jax.config.jax_enable_x64), reason="float32 
 minutes = pytest.mark.minutes
 once = pytest.mark.skipif(
     bool(jax.config.jax_enable_x64), reason="precision plays no part: float32 will do"
+)
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, (os.environ.get("CC") or "cc", "gcc", "clang"))),
+    reason="no C compiler is there",
 )
 
 

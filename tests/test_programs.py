@@ -113,9 +113,9 @@ def test_what_was_not_used_for_longest_is_deleted(tmp_path):
         path.write_bytes(b"0" * 100)
         os.utime(path, (1e9 - age, 1e9 - age))
     (tmp_path / "notes.txt").write_bytes(b"0" * 1000)
-    programs._prune(tmp_path, 400)
+    programs.prune(tmp_path, 400)
     assert len(list(tmp_path.iterdir())) == 5
-    programs._prune(tmp_path, 399)
+    programs.prune(tmp_path, 399)
     kept = {path.name for path in tmp_path.iterdir()}
     assert kept == {"a-cache", "b-cache", "notes.txt"}
 

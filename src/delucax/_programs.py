@@ -50,7 +50,7 @@ def keep_programs(
         warnings.warn(f"compiled programs are not kept on disk: {error}", stacklevel=2)
         return None
     if not theirs:
-        _prune(kept, _LIMIT)
+        prune(kept, _LIMIT)
     _set("jax_compilation_cache_dir", str(kept))
     threshold = "jax_persistent_cache_min_compile_time_secs"
     if threshold.upper() not in os.environ:
@@ -63,8 +63,8 @@ def forget_programs() -> None:
     _set("jax_enable_compilation_cache", False)
 
 
-def user_folder() -> Path:
-    """The folder of programs among the user's caches."""
+def user_folder(kind: str = "programs") -> Path:
+    """A folder of ours among the user's caches, by default that of programs."""
     home = Path.home()
     if sys.platform == "win32":
         name, caches = "LOCALAPPDATA", home / "AppData" / "Local"
@@ -72,7 +72,7 @@ def user_folder() -> Path:
         name, caches = "XDG_CACHE_HOME", home / "Library" / "Caches"
     else:
         name, caches = "XDG_CACHE_HOME", home / ".cache"
-    return Path(os.environ.get(name) or caches) / "delucax" / "programs"
+    return Path(os.environ.get(name) or caches) / "delucax" / kind
 
 
 def _set(name: str, value: str | float | bool) -> None:
@@ -81,7 +81,7 @@ def _set(name: str, value: str | float | bool) -> None:
     os.environ[name.upper()] = str(value)
 
 
-def _prune(folder: Path, limit: int) -> None:
+def prune(folder: Path, limit: int) -> None:
     """Delete programs until three quarters of `limit` are left, if there are more.
 
     JAX's own limit needs another package, and a lock for every program that is read.

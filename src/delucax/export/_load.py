@@ -1,0 +1,99 @@
+"""Exported C, compiled and called."""
+
+import contextlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .._files import as_path
+from .._message import did_you_mean
+from ._compiler import find_compiler, FLAGS, shared_library
+from ._description import described, Description
+from ._loaded import LoadedController, LoadedFunction
+
+
+def load(
+    directory: str | os.PathLike,
+    *,
+    name: str | None = None,
+    compiler: str | None = None,
+    flags: Sequence[str] = FLAGS,
+) -> LoadedController | LoadedFunction:
+    """What [`delucax.export.c`][] wrote, compiled here and ready to be called.
+
+    The library is kept among the user's caches, and is compiled again only if the C,
+    the compiler or the flags change. Nothing is written to `directory`.
+
+    **Arguments:**
+
+    - `directory`: the folder that holds `NAME.h` and `NAME.c`.
+    - `name`: which of them, if there are several.
+    - `compiler`: the command of a C compiler. By default that of the variable `CC`, or
+        the first of `cc`, `gcc` and `clang` that is there.
+    - `flags`: given to it, by default those of an exact comparison with JAX:
+        `-ffp-contract=off` keeps products and sums apart.
+
+    **Returns:** a [`delucax.export.LoadedController`][] for a controller, a
+    [`delucax.export.LoadedFunction`][] for a function.
+
+    **Raises:** `ValueError` if the folder has no export, or several and no `name` is
+    given; if there is no compiler, or it fails, whose words are shown.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        import tempfile
+
+        env = dlx.make("pendulum")
+        law = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        with tempfile.TemporaryDirectory() as folder:
+            dlx.export.c(law, folder, name="law")
+            controller = dlx.export.load(folder)
+        dlx.rollout(env, controller, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+    """
+    where = "export.load"
+    folder = as_path(directory, "directory", where)
+    if not isinstance(flags, Sequence) or isinstance(flags, str):
+        raise ValueError(
+            f"{where}: flags must be a sequence of the compiler's arguments, such as "
+            f"{FLAGS}, got {flags!r}."
+        )
+    description = _find(folder, name, where)
+    source = folder / f"{description.name}.c"
+    command = find_compiler(compiler, where)
+    library = shared_library(source, command, tuple(map(str, flags)), where)
+    kinds: Any = {"controller": LoadedController, "function": LoadedFunction}
+    return kinds[description.kind](str(library), description)
+
+
+def _find(folder: Path, name: str | None, where: str) -> Description:
+    """The description of the export in a folder."""
+    if not folder.is_dir():
+        raise ValueError(f"{where}: directory must be a folder, got {str(folder)!r}.")
+    headers = [h for h in sorted(folder.glob("*.h")) if h.with_suffix(".c").exists()]
+    found: dict[str, Description] = {}
+    for header in headers:
+        with contextlib.suppress(ValueError):  # it may be of another program
+            found[header.stem] = described(header)
+    if not found:
+        raise ValueError(
+            f"{where}: directory must hold what delucax.export.c wrote, and "
+            f"{str(folder)!r} has none."
+        )
+    if name is None and len(found) > 1:
+        raise ValueError(
+            f"{where}: name must say which, for {str(folder)!r} holds "
+            f"{', '.join(found)}."
+        )
+    which = next(iter(found)) if name is None else name
+    if which not in found:
+        raise ValueError(
+            f"{where}: no export is called {which!r} in {str(folder)!r}; "
+            f"{did_you_mean(str(which), found)}"
+        )
+    return found[which]
