@@ -25,7 +25,7 @@ from ..._module import as_float_array
 from ..._typing import PRNGKey, State
 from ...environments import Environment
 from .. import _episode as episodes
-from .._episode import EpisodeState, HashableEnvironment, StepOutcome
+from .._episode import EpisodeState, HashableEnvironment, NO_SIGNALS, StepOutcome
 from .._spaces import action_ends, observation_ends
 
 
@@ -67,6 +67,7 @@ def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:
     return Discrete(len(actions)) if discrete else box(action_ends(env)), observations
 
 
+BACKENDS = ("jax", "c")
 REWARD, TERMINATED, TRUNCATED, FAILED, STEP = range(-5, 0)
 # The memory that JAX shares with NumPy begins at a multiple of it.
 _ALIGNMENT = 64
@@ -103,6 +104,28 @@ def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
     return written, jax.dlpack.from_dlpack(written, copy=False)
 
 
+def stepper(program: Program) -> Any:
+    """Given a size and a dtype: what makes the step of an episode from its signals, the
+    memory of the packed array and the action, and that of the packed array after it."""
+
+    def allocate(size, dtype):
+        given, in_jax = shared(size, dtype)
+        after = np.zeros(program.size, dtype)
+
+        def begin(signals):
+            signals = jax.device_put(signals, in_jax.device)
+            drawn = (signals,) if jax.tree.leaves(signals) else ()
+
+            def advance():
+                after[...] = program.step(in_jax, *drawn)
+
+            return advance
+
+        return begin, given, after
+
+    return allocate
+
+
 def draw_key(generator: np.random.Generator) -> PRNGKey:
     """A random key from a generator of NumPy's, which Gymnasium seeds."""
     return jr.key(int(generator.integers(2**32)))
@@ -125,12 +148,9 @@ def _compiled(same: HashableEnvironment, discrete: bool, truncate: bool) -> Prog
         outcome = StepOutcome(jnp.zeros((), episode.state.dtype), no, no, no)
         return _packed(env, episode, outcome), episode.signals
 
-    def step(packed, action, signals):
-        action = action[0].astype(int) if discrete else action
-        now = EpisodeState(packed[:n], packed[STEP].astype(int), signals)
-        return _packed(env, *episodes.step(env, now, action, truncate))
+    step = functools.partial(step_packed, env, discrete, truncate)
 
-    def step_in_place(given, signals=episodes.NO_SIGNALS):
+    def step_in_place(given, signals=NO_SIGNALS):
         return step(given[:size], given[size:], signals)
 
     start_batch = jax.vmap(start)
@@ -138,6 +158,16 @@ def _compiled(same: HashableEnvironment, discrete: bool, truncate: bool) -> Prog
     compiled = jax.jit(start), jax.jit(step_in_place), jax.jit(start_batch)
     step_batch = jax.jit(step_batch, static_argnums=0)
     return Program(*compiled, step_batch, slice(n), slice(n, end), size)
+
+
+def step_packed(
+    env: Environment, discrete: bool, truncate: bool, packed, action, signals
+) -> Array:
+    """The packed array after a step."""
+    action = action[0].astype(int) if discrete else action
+    x, time = packed[: env.state_size], packed[STEP].astype(int)
+    now = EpisodeState(x, time, signals)
+    return _packed(env, *episodes.step(env, now, action, truncate))
 
 
 def _packed(env: Environment, episode: EpisodeState, outcome: StepOutcome) -> Array:

@@ -49,6 +49,7 @@ def make(
     *,
     discrete: bool | None = None,
     render_mode: str | None = None,
+    backend: str = "jax",
     **kwargs: Any,
 ) -> GymnasiumEnv:
     """The task of that name as a `gymnasium.Env`.
@@ -60,7 +61,8 @@ def make(
     **Arguments:**
 
     - `task`: a name that [`delucax.make`][] knows.
-    - `discrete`, `render_mode`: of [`delucax.interop.gymnasium.GymnasiumEnv`][].
+    - `discrete`, `render_mode`, `backend`: of
+        [`delucax.interop.gymnasium.GymnasiumEnv`][].
     - `**kwargs`: passed to the task. The random plants of `lds` and `neural` are drawn
         with the fixed key `jax.random.key(0)` unless a `key` or a plant is given; so
         does `gymnasium.make`.
@@ -77,8 +79,8 @@ def make(
         env.reset(seed=0)
         ```
     """
-    env = _made(task, kwargs)
-    return GymnasiumEnv(env, discrete=discrete, render_mode=render_mode)
+    options: Any = dict(discrete=discrete, render_mode=render_mode, backend=backend)
+    return GymnasiumEnv(_made(task, kwargs), **options)
 
 
 def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
@@ -88,7 +90,8 @@ def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
     explicit horizon, with disturbances or noise, which are drawn for all of it, or with
     an explicit cost that has a final cost.
     """
-    own = {k: kwargs.pop(k) for k in ("discrete", "render_mode") if k in kwargs}
+    options = "discrete", "render_mode", "backend"
+    own = {name: kwargs.pop(name) for name in options if name in kwargs}
     env = _made(task, kwargs)
     ends = "horizon" in kwargs or has_signals(env)
     if kwargs.get("cost") is not None:

@@ -5,7 +5,6 @@ import operator
 from typing import Any, NoReturn
 
 import gymnasium
-import jax
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 
@@ -38,10 +37,14 @@ class GymnasiumEnv(gymnasium.Env):
     - `truncate`: whether episodes are truncated at the horizon, True by default. False
         leaves that to a wrapper, such as Gymnasium's `TimeLimit`, where nothing is
         drawn for the whole episode; no final cost is charged at its limit.
+    - `backend`: `"jax"` (default), or `"c"`: a step is then a call of C, which is
+        exported and compiled when the environment is made, and kept on disk. It needs a
+        C compiler. Resets are those of JAX.
 
     `reset(seed=..., options={"state": x})` starts at the state `x`.
 
-    **Raises:** `ValueError` on a wrong argument. `step` raises
+    **Raises:** `ValueError` on a wrong argument; for `backend="c"`, on an environment
+    that [`delucax.export.c`][] refuses, and where there is no compiler. `step` raises
     `gymnasium.error.ResetNeeded` before `reset` and after the end,
     `gymnasium.error.InvalidAction` on an action of the wrong shape or kind, not finite,
     or not in the table; and `RuntimeError` if the simulation fails.
@@ -67,10 +70,12 @@ class GymnasiumEnv(gymnasium.Env):
         discrete: bool | None = None,
         render_mode: str | None = None,
         truncate: bool = True,
+        backend: str = "jax",
     ):
         where = "GymnasiumEnv"
         check_instance(env, Environment, "env", where)
         check_choice(render_mode, (*RENDER_MODES, None), "render_mode", where)
+        check_choice(backend, programs.BACKENDS, "backend", where)
         if not check_bool(truncate, "truncate", where) and has_signals(env):
             raise ValueError(
                 f"{where}: truncate must be True where there are disturbances or "
@@ -78,18 +83,28 @@ class GymnasiumEnv(gymnasium.Env):
             )
         self.environment = env
         self.discrete = has_discrete_actions(env, discrete, where)
-        self.truncate = bool(truncate)
+        self.truncate, self.backend = bool(truncate), backend
         self.render_mode = render_mode
         fps = int(np.clip(np.round(1 / float(env.dt)), 1, 60))
         self.metadata = type(self).metadata | {"render_fps": fps}
         self.action_space, self.observation_space = programs.spaces(env, self.discrete)
-        self._program = programs.program(env, self.discrete, self.truncate)
+        self._program, self._stepper = self._compile()
         self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
         self._count, self._shape = len(self._table), (env.control_size,)
         self._read: Any = operator.index if self.discrete else np.asarray
         self._buffer: Any = None
         self._ended = True
         self._picture: Any = None
+
+    def _compile(self) -> tuple[programs.Program, Any]:
+        """The program, and what makes a step in given memory."""
+        given = self.environment, self.discrete, self.truncate
+        program = programs.program(*given)
+        if self.backend == "jax":
+            return program, programs.stepper(program)
+        from ._exported import exported_stepper
+
+        return program, exported_stepper(*given)
 
     @property
     def state(self) -> np.ndarray:
@@ -112,13 +127,14 @@ class GymnasiumEnv(gymnasium.Env):
         """
         super().reset(seed=seed)
         state, _ = programs.read_options(options, self.environment, "GymnasiumEnv")
-        packed, signals = self._program.start(programs.draw_key(self.np_random), state)
+        key = programs.draw_key(self.np_random)
+        packed, self._signals = self._program.start(key, state)
         packed = np.asarray(packed)
         if self._buffer is None or self._buffer.dtype != packed.dtype:
             self._allocate(packed.dtype)
-        self._signals = jax.device_put(signals, self._shared.device)
-        self._continue_from(packed)
+        self._packed[...] = packed
         self._action[...] = 0
+        self._advance = self._step_in_place(self._signals)
         self._ended, self._stepped = False, False
         if self.render_mode == "human":
             self.render()
@@ -127,35 +143,31 @@ class GymnasiumEnv(gymnasium.Env):
     def _allocate(self, dtype: Any) -> None:
         """Make the arrays that steps are taken in."""
         size, actions = self._program.size, self.action_space.shape or (1,)
-        # The packed array with the action after it, and views of its parts.
-        self._buffer, self._shared = programs.shared(size + actions[0], dtype)
+        # The packed array with the action after it, and the packed array of the next
+        # step, with views of their parts.
+        self._step_in_place, self._buffer, self._after = self._stepper(
+            size + actions[0], dtype
+        )
         self._packed, self._action = np.split(self._buffer, [size])
-        self._outcome = self._packed[programs.REWARD :]
-        view, single = self._packed[self._program.observation], np.float32
+        self._outcome = self._after[programs.REWARD :].tolist
+        view, single = self._after[self._program.observation], np.float32
         copy = functools.partial(view.astype, single)
         self._observation = view.copy if view.dtype == single else copy
 
-    def _continue_from(self, packed: np.ndarray) -> None:
-        """Go on from here."""
-        # `_last` is restored if a step fails.
-        self._packed[...] = self._last = packed
-        drawn = (self._signals,) if has_signals(self.environment) else ()
-        self._advance = functools.partial(self._program.step, self._shared, *drawn)
-
     def __getstate__(self):
         """The attributes to copy: all but compiled functions and views."""
-        views = "_program _shared _packed _action _outcome _observation _advance"
-        state = {k: v for k, v in self.__dict__.items() if k not in views.split()}
+        views = "_program _stepper _packed _action _after _outcome _observation"
+        drop = {*views.split(), "_step_in_place", "_advance"}
+        state = {k: v for k, v in self.__dict__.items() if k not in drop}
         return state | {"_picture": None}
 
     def __setstate__(self, state):
         self.__dict__.update(state)
-        self._program = programs.program(self.environment, self.discrete, self.truncate)
-        given = self._buffer
-        if given is not None:
+        self._program, self._stepper = self._compile()
+        if (given := self._buffer) is not None:
             self._allocate(given.dtype)
-            self._continue_from(np.asarray(self._last))
             self._buffer[...] = given
+            self._advance = self._step_in_place(self._signals)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step.
@@ -182,11 +194,12 @@ class GymnasiumEnv(gymnasium.Env):
         if not is_valid:
             self._invalid_action(action)
         self._action[...] = control
-        self._packed[...] = after = self._advance()
-        reward, terminated, truncated, failed, _ = self._outcome.tolist()
-        if failed:
+        flag = self._advance()
+        reward, terminated, truncated, failed, _ = self._outcome()
+        if flag or failed:
             self._fail(action)
-        self._last, self._stepped = after, True
+        self._packed[...] = self._after
+        self._stepped = True
         self._ended = bool(terminated or truncated)
         if self.render_mode == "human":
             self.render()
@@ -207,7 +220,6 @@ class GymnasiumEnv(gymnasium.Env):
 
     def _fail(self, action: Any) -> NoReturn:
         """Raise after a failed step. An invalid action leaves the episode unchanged."""
-        self._packed[...] = self._last
         if not np.all(np.isfinite(action)):
             raise InvalidAction(f"GymnasiumEnv: action must be finite, got {action}.")
         self._ended = True
