@@ -29,20 +29,21 @@ SYNC = "Gymnasium SyncVectorEnv"
 VECTOR = "Gymnasium vectorised"
 
 
-def single(name: str, steps: int) -> list[Contender]:
-    """One environment of an id, by us and by Gymnasium, plain and as it is made."""
+def single(name: str, steps: int, **options: Any) -> list[Contender]:
+    """One environment of an id, by us with `options` and by Gymnasium, plain and as it
+    is made."""
     return [
         contender
         for wrapped in (False, True)
         for contender in (
-            _single(f"delucax/{name}", OURS, steps, wrapped),
+            _single(f"delucax/{name}", OURS, steps, wrapped, **options),
             _single(name, THEIRS, steps, wrapped),
         )
     ]
 
 
-def _single(id: str, who: str, steps: int, wrapped: bool) -> Contender:
-    env = gymnasium.make(id)
+def _single(id: str, who: str, steps: int, wrapped: bool, **options: Any) -> Contender:
+    env = gymnasium.make(id, **options)
     space = env.action_space
     if not wrapped:
         env = env.unwrapped

@@ -40,10 +40,10 @@ def run_in_parts(
     draw: Callable[[dict[str, Any]], Any],
 ) -> None:
     """The command of a study in float64: run its parts, or one of them again, write
-    each when it is done, and draw what they found."""
+    each when it is done, and draw or judge what they found."""
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{program}")
     parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--draw", action="store_true", help="the figure alone, again")
+    parser.add_argument("--draw", action="store_true", help="from the file alone")
     parser.add_argument("--part", choices=tuple(parts), help="one part alone, again")
     options = parser.parse_args()
     if options.draw:
@@ -60,4 +60,4 @@ def run_in_parts(
             content = updated(results, lambda before, found=found: about | found)
     if all(name in content for name in parts):
         draw(content)
-        print(f"\nwritten: {results}, and its figure")
+        print(f"\nwritten: {results}")
