@@ -233,10 +233,16 @@ def dot(e, node, a, b):
     with e.over(outer) as before:
         with e.loop(last) as k:
             e.store(place, (*before, k), literal(0, out.dtype))
-        with e.over(extents) as inner, e.loop(last) as k:
-            at = (*before, k)
-            term = times(list(factors(at, inner)))
-            e.store(place, at, plus([place.at(at), term]))
+        with e.over(extents) as inner:
+            # A compiler does not know that it stays as it is while sums are written.
+            held, same = None, 0 if free_b else 1
+            if free_a or free_b:
+                held = e.define(factors((*before, known(0)), inner)[same])
+            with e.loop(last) as k:
+                at = (*before, k)
+                pair = list(factors(at, inner))
+                pair[same] = pair[same] if held is None else held
+                e.store(place, at, plus([place.at(at), times(pair)]))
     return place
 
 
