@@ -201,6 +201,9 @@ ARRAYS = {
         jnp.sort(x),
         jnp.argsort(x, axis=0),
         lax.sort((jnp.round(x), x), num_keys=2),
+        jnp.searchsorted(jnp.sort(x[0]), x[1]),
+        jnp.searchsorted(np.arange(4), jnp.round(x[0]).astype(jnp.int32), side="right"),
+        jnp.interp(x[0], np.array([-1.0, 0, 2]), np.array([1.0, 4, 2])),
     ),
     "factors": lambda x: (
         jnp.linalg.cholesky(definite(x)),
