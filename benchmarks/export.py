@@ -59,9 +59,10 @@ GYMNASIUM = {"CartPole-v1": 0.6, "MountainCarContinuous-v0": 1.5}
 """The step of these, over Gymnasium's own; the others are faster than it."""
 ALLOWED = {"memcpy", "memset"}
 MATH = """acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc
-exp exp2 expm1 fabs floor fma fmax fmin fmod hypot ldexp lgamma log log10 log1p log2
-lrint nearbyint nextafter pow remainder rint round sin sinh sqrt tan tanh tgamma
-trunc"""
+exp exp2 expm1 fabs fdim floor fma fmax fmin fmod frexp hypot ilogb ldexp lgamma log
+log10 log1p log2 logb lrint lround modf nearbyint nextafter pow remainder rint round
+scalbn sin sincos sinh sqrt tan tanh tgamma trunc"""
+"""Those of `math.h`; `sincos` is how GCC calls a sine and a cosine of one number."""
 LIMIT = 1.0
 """Of each control of the bounded problem, as in `benchmarks.qp`."""
 HPIPM = """
