@@ -5,15 +5,16 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import delucax as dlx
 
 
 c = dlx.controllers
 DT = 0.1
-A = jnp.array([[1.0, DT], [0.3 * DT, 0.98]])
-B = jnp.array([[0.0], [DT]])
-FEEDBACK = jnp.array([[1.0, 1.5]])
+A = np.array([[1.0, DT], [0.3 * DT, 0.98]])
+B = np.array([[0.0], [DT]])
+FEEDBACK = np.array([[1.0, 1.5]])
 
 
 class Case(NamedTuple):
