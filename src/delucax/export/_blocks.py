@@ -89,8 +89,14 @@ def _keep(block: Block, needed: set[Var], drops: bool) -> None:
                 _narrow(node, live, needed)
                 for inner in node.blocks:
                     _keep(inner, needed, True)
-            given = zip(node.ins, _is_given(node, live), strict=True)
-            needed.update(a for a, used in given if used and isinstance(a, Var))
+            # What is left after that is of use.
+            used = range(len(node.ins)) if drops else live
+            count = 0 if drops else _carried(node)
+            needed.update(
+                a
+                for k, a in enumerate(node.ins)
+                if isinstance(a, Var) and (k in used or k >= count)
+            )
             continue
         for inner in node.blocks:
             _keep(inner, needed, drops)
@@ -117,8 +123,9 @@ def _live(node: Node, needed: set[Var]) -> set[int]:
     }
     outs = body.outs
     while True:
-        wanted = [k in live if k < count else node.outs[k] in needed
-                  for k in range(len(outs))]  # fmt: skip
+        wanted = [
+            k in live if k < count else node.outs[k] in needed for k in range(len(outs))
+        ]
         body.outs = [out for out, use in zip(outs, wanted, strict=True) if use]
         _keep(body, needed, False)
         body.outs = outs
@@ -128,27 +135,24 @@ def _live(node: Node, needed: set[Var]) -> set[int]:
         live = more
 
 
-def _is_given(node: Node, live: set[int]) -> list[bool]:
-    """Which inputs of a loop are of use; after `_narrow` all are."""
-    if len(node.ins) == len(node.blocks[-1].params) and "narrow" in node.params:
-        return [True] * len(node.ins)
-    count = _carried(node)
-    return [k in live or k >= count for k in range(len(node.ins))]
-
-
 def _narrow(node: Node, live: set[int], needed: set[Var]) -> None:
     """Leave out what a loop carries, reads or stacks to no use."""
     body, count = node.blocks[-1], _carried(node)
-    ins = [k for k in range(len(node.ins)) if k in live or k >= count
-           and body.params[k] in needed]  # fmt: skip
-    outs = [k for k, out in enumerate(node.outs) if k in live or k >= count
-            and out in needed]  # fmt: skip
+    ins = [
+        k
+        for k in range(len(node.ins))
+        if k in live or k >= count and body.params[k] in needed
+    ]
+    outs = [
+        k
+        for k, out in enumerate(node.outs)
+        if k in live or k >= count and out in needed
+    ]
     node.ins = [node.ins[k] for k in ins]
     for inner in node.blocks:
         inner.params = [inner.params[k] for k in ins]
     body.outs = [body.outs[k] for k in outs]
     node.outs = [node.outs[k] for k in outs]
-    node.params["narrow"] = True
     if "carried" in node.params:
         node.params["carried"] = len(live)
 

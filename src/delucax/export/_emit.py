@@ -59,7 +59,6 @@ class Writer:
         self.unroll, self.shared = unroll, shared
         self.scope = self.top = Scope()
         self.buffers: list[Buffer] = []
-        self.loops: list[tuple[str, int]] = []
         self._count = itertools.count()
         self._stored: dict[Any, tuple[Scope, Value, View]] = {}
 
@@ -113,8 +112,8 @@ class Writer:
         self.line(text, reads, view.buffer.name, expr.cost)
 
     @contextlib.contextmanager
-    def loop(self, length: int, stop: Any = None) -> Iterator[Index]:
-        """A loop over an index; `stop` is called first in each round."""
+    def loop(self, length: int) -> Iterator[Index]:
+        """A loop over an index."""
         if length == 1:
             yield known(0)
             return
@@ -272,8 +271,12 @@ class Writer:
                 parts = [self.copy_of(e) if e.text in others else e for e in parts]
                 value = Scalars(value.shape, value.dtype, parts, frozenset())
             elif isinstance(place, Scalars):
-                value = Scalars(value.shape, value.dtype, [
-                    self.define(e) for e in value.entries()], frozenset())  # fmt: skip
+                value = Scalars(
+                    value.shape,
+                    value.dtype,
+                    [self.define(e) for e in value.entries()],
+                    frozenset(),
+                )
             elif value.buffers & changed:
                 value = self.copied(value)
             ready.append((place, value))

@@ -118,10 +118,11 @@ def _starts(e, numbers, shape, sizes, indices, batch, drops):
     )
     pairs = zip(
         numbers.operand_batching_dims,
-        numbers.start_indices_batching_dims if is_gather
+        numbers.start_indices_batching_dims
+        if is_gather
         else numbers.scatter_indices_batching_dims,
         strict=True,
-    )  # fmt: skip
+    )
     place = [known(0) for _ in shape]
     for axis, from_axis in pairs:
         place[axis] = batch[from_axis]

@@ -118,11 +118,13 @@ def stack(e, node, *xs):
     axis = node.params["axis"]
     parts = [
         mapped(
-            e, x, (*x.shape[:axis], 1, *x.shape[axis:]),
+            e,
+            x,
+            (*x.shape[:axis], 1, *x.shape[axis:]),
             lambda i: (*i[:axis], *i[axis + 1 :]),
         )
         for x in xs
-    ]  # fmt: skip
+    ]
     return _joined(e, node.outs[0], parts, axis)
 
 
