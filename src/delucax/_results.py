@@ -63,6 +63,22 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No step lowered the cost, although the gradient is not zero: the problem may "
         "not be smooth there, or the tolerance may be below rounding."
     )
+    too_many_events = (
+        "More events than max_events fell in one interval, and the state is held after "
+        "the last: they may accumulate, or a reset may leave its guard at zero. Raise "
+        "max_events, take a smaller dt, or add a mode in which the guard is not "
+        "enabled."
+    )
+    beyond_guard = (
+        "A state is beyond an enabled guard at the start of an interval or after a "
+        "reset, so its event cannot fire: start on the other side, or say in `enabled` "
+        "where the guard counts."
+    )
+    grazing = (
+        "A guard touches zero and hardly crosses it: the derivatives of the event are "
+        "NaN."
+    )
+    unknown_mode = "The mode of a state is not one of the modes of its system."
     plan_failed = (
         'A plan of the controller did not succeed. Where "incidents" are in `keep`, '
         "as by default, `trajectory.incident_counts` says how many did not."

@@ -1,5 +1,12 @@
 """Integration code shared by `Discretized` and `simulate`."""
 
+from ._events import (
+    any_of as any_of,
+    Crossings as Crossings,
+    crossings as crossings,
+    locate as locate,
+    pick as pick,
+)
 from ._field import (
     check_returned as check_returned,
     evaluate_field as evaluate_field,

@@ -39,5 +39,5 @@ from ._derivatives import (
     nan_tangent as nan_tangent,
     value_and_jacobians as value_and_jacobians,
 )
-from ._loops import in_parts as in_parts
+from ._loops import bounded_while as bounded_while, in_parts as in_parts
 from ._normal import normal as normal

@@ -1,8 +1,10 @@
-"""Loops that XLA compiles in parts."""
+"""Loops that XLA compiles in parts, and loops that end early and have derivatives."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -36,3 +38,26 @@ def _zero_by_call(count: Array) -> Array:
     one = (1 + 0 * count.astype(jnp.float32)).reshape(1, 1)
     root = lax.linalg.cholesky(one, symmetrize_input=False)[0, 0]
     return (root - 1).astype(count.dtype)
+
+
+def bounded_while(
+    needed: Callable[[Any], Array], turn: Callable[[Any], Any], state: Any, most: int
+) -> Any:
+    """`state` after `turn` as often as it is `needed`, `most` times at most.
+
+    It has a derivative in both modes, which stores the state at each turn and computes
+    the rest again. Turns that are not needed are skipped: by one test where none is, in
+    blocks where few are. In a batch a turn is needed if one member needs it, so `turn`
+    must leave the others as they are.
+    """
+    turn = jax.checkpoint(turn)
+
+    def repeated(inner, times):
+        def body(state, _):
+            run = eqxi.unvmap_any(needed(state))
+            return lax.cond(run, inner, lambda state: state, state), None
+
+        return lambda state: lax.scan(body, state, length=times)[0]
+
+    block = max(1, math.isqrt(most))
+    return repeated(repeated(repeated(turn, block), -(-most // block)), 1)(state)

@@ -73,6 +73,30 @@ class AbstractDynamics(AbstractPlant):
         **Returns:** `(x_next, result)`, the latter one of `delucax.RESULTS`.
         """
 
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """The names of the events of a hybrid system; none by default."""
+        return ()
+
+    def advance_with_events(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result, Any]:
+        """As `advance`, with the events of the step.
+
+        A wrapper of dynamics that have `event_names` writes it beside `advance`.
+
+        **Arguments:** `t`, `x`, `u`, `w`: as `advance`.
+
+        **Returns:** `(x_next, result, events)`, the latter
+        [`delucax.dynamics.Events`][], or `None` without events.
+        """
+        if self.event_names:
+            raise ValueError(
+                f"{type(self).__name__}: events are reported by advance_with_events, "
+                "which it does not define."
+            )
+        return *self.advance(t, x, u, w), None
+
     def __call__(
         self, t: RealScalar, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
     ) -> Array:
@@ -197,6 +221,11 @@ class Forwarding(AbstractDynamics):
     state_units = _forwarded_units("state")
     control_units = _forwarded_units("control")
     time_unit = _forwarded("time_unit")
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """Those of the wrapped plant."""
+        return tuple(getattr(self._inside, "event_names", ()))
 
     @property
     def observes_state(self) -> bool:

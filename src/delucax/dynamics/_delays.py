@@ -2,6 +2,7 @@
 
 import abc
 import math
+from typing import Any
 
 import equinox as eqx
 import jax.lax as lax
@@ -142,6 +143,14 @@ class Delayed(_AbstractDelay):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
+        return self._advance(self.dynamics.advance, t, x, u, w)
+
+    def advance_with_events(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result, Any]:
+        return self._advance(self.dynamics.advance_with_events, t, x, u, w)
+
+    def _advance(self, advance, t, x, u, w):
         own, controls, observed = self._cut(x)
         acting, late = u, []
         # The newest comes first, and the oldest acts, or is read. Slices of no entries
@@ -154,8 +163,8 @@ class Delayed(_AbstractDelay):
         if self.sensor:
             y = self.dynamics.observe(t, own).astype(x.dtype)
             late += [y, observed[: -y.shape[0]]] if self.sensor > 1 else [y]
-        after, result = self.dynamics.advance(t, own, acting, w)
-        return jnp.concatenate([after, *late]), result
+        after, *rest = advance(t, own, acting, w)
+        return jnp.concatenate([after, *late]), *rest
 
     def observe(self, t: Time, x: State) -> Observation:
         own, _, observed = self._cut(x)
@@ -271,22 +280,31 @@ class TransportDelay(_AbstractDelay):
         whole, rest = self._in_steps(delay)
         return (whole < 0) | (whole + (rest > 0) > memory)
 
-    def _part(
-        self, t: RealScalar, x: Array, u: Array, w: Array | None, h: Array
-    ) -> tuple[Array, Result]:
-        """The state after a part `h` of an interval."""
+    def _part(self, recorded: bool, t, x, u, w, h) -> tuple[Array, Result, Any]:
+        """A part `h` of an interval: the state after it, the status and the events."""
         part = eqx.tree_at(lambda inner: inner.dt, self.dynamics, h)
-        return part.advance(t, x, u, w)
+        if recorded:
+            return part.advance_with_events(t, x, u, w)
+        return *part.advance(t, x, u, w), None
 
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
+        x_next, result, _ = self._advance(False, t, x, u, w)
+        return x_next, result
+
+    def advance_with_events(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result, Any]:
+        return self._advance(True, t, x, u, w)
+
+    def _advance(self, recorded: bool, t, x, u, w) -> tuple[Array, Result, Any]:
         own, pending, observed = self._cut(x)
         dt, m = self.dynamics.dt, u.shape[0]
         held = None if self.noise == "additive" else w
         if not self._kept[0]:
             switch, middle, first, second = 0.0, own, u, u
-            after, result = self.dynamics.advance(t, own, u, w)
+            after, result, events = self._part(recorded, t, own, u, w, dt)
         else:
             newest = jnp.concatenate([u.astype(x.dtype), pending])
             table, most = newest.reshape(-1, m), self._kept[0]
@@ -296,8 +314,10 @@ class TransportDelay(_AbstractDelay):
             first = table[jnp.clip(index + 1, 0, most)]
             second = table[jnp.clip(index, 0, most)]
             switch = rest * dt
-            middle, early = self._part(t, own, first, held, switch)
-            after, late = self._part(t + switch, middle, second, w, dt - switch)
+            middle, early, events = self._part(recorded, t, own, first, held, switch)
+            later = t + switch, middle, second, w, dt - switch
+            after, late, more = self._part(recorded, *later)
+            events = events if events is None else events.then(more)
             failed = self._is_beyond(self.controls, most)
             result = first_failure(early, late)
             result = choose(failed, RESULTS.delay_beyond_memory, result)
@@ -310,7 +330,8 @@ class TransportDelay(_AbstractDelay):
             start = jnp.where(before, own, middle)
             since = jnp.where(before, 0.0, switch)
             acting = jnp.where(before, first, second)
-            read, failure = self._part(t + since, start, acting, held, at - since)
+            given = t + since, start, acting, held, at - since
+            read, failure, _ = self._part(False, *given)
             if self.noise == "additive" and w is not None:
                 read = read + jnp.where(rest > 0, 0, w)
             y = self.dynamics.observe(t + at, read).astype(x.dtype)
@@ -318,7 +339,8 @@ class TransportDelay(_AbstractDelay):
             failed = self._is_beyond(self.sensor, self._kept[1] - 1)
             result = first_failure(result, failure)
             result = choose(failed, RESULTS.delay_beyond_memory, result)
-        return jnp.concatenate([after, pending, observed]).astype(x.dtype), result
+        x_next = jnp.concatenate([after, pending, observed]).astype(x.dtype)
+        return x_next, result, events
 
     def observe(self, t: Time, x: State) -> Observation:
         own, _, observed = self._cut(x)

@@ -25,10 +25,12 @@ from .._integration import (
 )
 from .._jax import by_components, join_state, split_state
 from .._module import parameter
-from .._results import choose, first_of, or_none, promote, Result, RESULTS
+from .._results import first_of, or_none, Result, RESULTS
 from .._typing import Real, RealScalar
-from ..systems import AbstractSystem
+from ..systems import AbstractHybridSystem, AbstractSystem
 from ._base import AbstractDiscretization
+from ._hybrid import ahead_of_steps, Events, HybridFlow, Intervals, Outcome
+from ._solver_steps import apply, BrownianTerm, field, solver_step
 
 
 # Euler and ItoMilstein converge to the solution in Itô's sense, the others to that in
@@ -70,6 +72,30 @@ class Discretized(AbstractDiscretization):
     one of Euler (Euler-Maruyama, Itô), ItoMilstein, EulerHeun, Heun, Midpoint, Ralston
     or StratonovichMilstein (all Stratonovich).
 
+    A [`delucax.systems.AbstractHybridSystem`][] is integrated from event to event. A
+    crossing is found by the cubic through a guard and its rate at both ends of each
+    step, so that one there and back within a step is seen, and located on the step
+    itself, taken shorter, to rounding: states have the order of the solver. Up to
+    `max_events` events, and cuts where a guard that is not enabled crosses zero, may
+    fall in an interval. Of guards that cross together the first of `event_names` fires,
+    and the others are judged after its reset. Derivatives are those of the computed
+    trajectory in both modes and of any order: the event's time moves with the state
+    (the saltation matrix); under a batch members without an event are masked. What goes
+    wrong has a status:
+
+    - `RESULTS.too_many_events`: the state is held after the last that was handled, as
+        where events accumulate or a reset leaves its guard at zero.
+    - `RESULTS.beyond_guard`: at the start of the interval or after a reset the state is
+        beyond an enabled guard, whose event does not fire until it has come back.
+    - `RESULTS.grazing`: a guard hardly crosses zero. The state is right, and
+        derivatives are NaN. A guard that is nearer to zero than the cubic's error, and
+        does not cross, may be missed or found.
+    - `RESULTS.unknown_mode`: the mode is not one of the system's.
+
+    Additive disturbances jump the state at the end of an interval, which may take it
+    beyond a guard: name disturbances to hold them in the field instead. The field must
+    be defined a little beyond a guard.
+
     **Arguments:**
 
     - `system`: the continuous-time system.
@@ -85,12 +111,14 @@ class Discretized(AbstractDiscretization):
         they are written. `diffrax.BacksolveAdjoint()` has no gradient with respect to
         `dt`, and raises if one is asked for.
     - `max_steps`: the most adaptive steps in an interval, 256 by default.
+    - `max_events`: the most events in an interval, 16 by default; of a hybrid system.
 
     **Raises:** `ValueError` if `dt` is not positive, if `solver` does not fit the
     system or the kind of step, or if `adjoint` or `max_steps` is given without a
-    `stepsize_controller`.
+    `stepsize_controller`, or `max_events` without events.
 
-    Source: Hairer, Nørsett and Wanner, 1993; Kidger, 2021 (Diffrax).
+    Source: Hairer, Nørsett and Wanner, 1993; Kidger, 2021 (Diffrax); Aizerman and
+    Gantmacher, 1958 (derivatives through events).
 
     !!! example
 
@@ -118,6 +146,7 @@ class Discretized(AbstractDiscretization):
     stepsize_controller: diffrax.AbstractStepSizeController | None = None
     adjoint: diffrax.AbstractAdjoint | None = None
     max_steps: int | None = eqx.field(default=None, static=True)
+    max_events: int | None = eqx.field(default=None, static=True)
 
     def __post_init__(self):
         system, where = self.system, "Discretized"
@@ -130,11 +159,26 @@ class Discretized(AbstractDiscretization):
                 self.adjoint = diffrax.RecursiveCheckpointAdjoint()
             steps = 256 if self.max_steps is None else self.max_steps
             self.max_steps = check_count(steps, "max_steps", where)
+        if isinstance(system, AbstractHybridSystem):
+            most = 16 if self.max_events is None else self.max_events
+            self.max_events = check_count(most, "max_events", where)
 
     def __check_init__(self):
         where, system, solver = "Discretized", self.system, self.solver
         check_instance(system, AbstractSystem, "system", where)
         noisy = system.noise == "brownian"
+        hybrid = isinstance(system, AbstractHybridSystem)
+        if self.max_events is not None and not hybrid:
+            raise ValueError(
+                f"{where}: max_events needs a system with events, "
+                f"delucax.systems.AbstractHybridSystem, got {type(system).__name__}."
+            )
+        if hybrid and isinstance(self.adjoint, diffrax.BacksolveAdjoint):
+            raise ValueError(
+                f"{where}: adjoint BacksolveAdjoint does not fit a system with events, "
+                "whose steps are searched for them; use "
+                "diffrax.RecursiveCheckpointAdjoint()."
+            )
         fixed = self.stepsize_controller is None
         if fixed and self.adjoint is not None:
             raise ValueError(
@@ -174,27 +218,34 @@ class Discretized(AbstractDiscretization):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        system, noise = self.system, self.noise
-        # A system uses w in one of three ways: in its field, held; as increments of
-        # Brownian motions; or, where it names no disturbances, added to the next state.
-        given: Any = w
-        if w is None and noise != "additive":
-            given = jnp.zeros(self.disturbance_size, x.dtype)
-        added = given if noise == "additive" else None
-        held = given if noise is None else None
-        increments = given.reshape(self.substeps, -1) if noise == "brownian" else None
-        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
-        # and so would the length of the interval be.
-        t = jnp.asarray(t, x.dtype)
-        start = TimeOffset(t, lambda t: evaluate_field(system, t, x, u, held))
-        args = system, start, u, held
-        if self.stepsize_controller is not None:
-            x_next, result = self._adaptive(x, args)
+        return self._advance(t, x, u, w)[:2]
+
+    def advance_with_events(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result, Events | None]:
+        return self._advance(t, x, u, w, record=True)
+
+    def _advance(self, t, x, u, w, record: bool = False):
+        system = self.system
+        added, held, increments = self._parts_of(x, w)
+        args = self._args(t, x, u, held)
+        events = None
+        if isinstance(system, AbstractHybridSystem):
+            outcome = self._hybrid(x, args, record)
+            x_next, result, events = outcome.x, outcome.result, outcome.events
+        elif self.stepsize_controller is not None:
+            solution, result = self.solve(jnp.zeros((), x.dtype), x, self.dt, args)
+            x_next = solution.ys[0]  # pyright: ignore
         else:
-            noisy = increments is not None
-            step = self._noisy_step(x, args) if noisy else self._fixed_step(args)
+            h = self.dt / self.substeps
+            if increments is not None:
+                step = self._noisy_step(x, args)
+            else:
+                flow = self.flow(args)
+                step = lambda s, x, _: flow(s, x, h)
             if self.substeps == 1:
-                x_next, result = step(0, x, increments[0] if noisy else None)
+                first = None if increments is None else increments[0]
+                x_next, result = step(0, x, first)
             else:
                 x_next, result = self._repeat(step, x, increments)
         # Once per interval, not per substep: the field is also defined off the
@@ -203,27 +254,74 @@ class Discretized(AbstractDiscretization):
         check_returned(x_next, x, system, "project")
         if added is not None:
             x_next = x_next + added
-        return x_next.astype(x.dtype), result
+        return x_next.astype(x.dtype), result, events
 
-    def _fixed_step(self, args):
-        """A substep, as a function of the time in the interval and the state."""
+    def until_event(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None, event: int
+    ) -> Outcome:
+        """The interval of a system with events, which stops at one of them.
+
+        **Arguments:** `t`, `x`, `u`, `w`: as `advance`. `event`: an index in
+            `event_names`.
+
+        **Returns:** the state at the event or at the end, when that is, and whether it
+        is at the event.
+        """
+        _, held, _ = self._parts_of(x, w)
+        args = self._args(t, x, u, held)
+        return self._hybrid(x, args, record=False, until=event)
+
+    def _parts_of(self, x, w):
+        """What of `w` is added to the next state, is held in the field, and drives it
+        as increments. A system uses it in one of the three ways."""
+        noise, given = self.noise, w
+        # Where the system names no disturbances, w is added to the next state.
+        if w is None and noise != "additive":
+            given = jnp.zeros(self.disturbance_size, x.dtype)
+        added = given if noise == "additive" else None
+        held = given if noise is None else None
+        is_driven = noise == "brownian"
+        return added, held, given.reshape(self.substeps, -1) if is_driven else None
+
+    def _args(self, t, x, u, held):
+        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
+        # and so would the length of the interval be.
+        system, t = self.system, jnp.asarray(t, x.dtype)
+        start = TimeOffset(t, lambda t: evaluate_field(system, t, x, u, held))
+        return system, start, u, held
+
+    def _hybrid(self, x, args, record=True, until: int | None = None) -> Outcome:
+        """The interval of a system with events."""
+        system, start, u, _ = args
+        guards = lambda t: jnp.stack(list(system.guards(t, x, u)))
+        plant = HybridFlow(self, args, TimeOffset(start.t, guards))
+        look_ahead = plant.ahead
+        if self.stepsize_controller is not None:
+            look_ahead = functools.partial(ahead_of_steps, plant)
+        assert self.max_events is not None
+        through = Intervals(plant, look_ahead, self.max_events, until)
+        return through(x, self.dt, self.substeps, record)
+
+    def flow(self, args: Any) -> Any:
+        """One step of the solver, `(s, x, h) -> (x_next, result)`: of `h` from `x` at
+        `s` after the start of the interval."""
         system, start, u, held = args
         assert self.solver is not None
-        h, tableau = self.dt / self.substeps, tableau_of(self.solver)
+        tableau = tableau_of(self.solver)
         if tableau is None:
-            solver, term = as_fixed_step_solver(self.solver), diffrax.ODETerm(_field)
-            return lambda s, x, _: _solver_step(solver, term, s, x, h, args)
+            solver, term = as_fixed_step_solver(self.solver), diffrax.ODETerm(field)
+            return lambda s, x, h: solver_step(solver, term, s, x, h, args)
 
-        def field(s, x):
+        def checked(s, x):
             dx = system.vector_field(start.t + s, x, u, held)
             check_returned(dx, x, system, "vector_field")
             return dx
 
         # The field itself is in the loop where nothing is to be corrected: fewer frames
         # lie between it and an error that it raises.
-        rhs = (lambda s, x: _field(s, x, args)) if start.is_corrected else field
+        rhs = (lambda s, x: field(s, x, args)) if start.is_corrected else checked
         step = functools.partial(runge_kutta_step, tableau, rhs)
-        return lambda s, x, _: (step(s, x, h), RESULTS.successful)
+        return lambda s, x, h: (step(s, x, h), RESULTS.successful)
 
     def _noisy_step(self, x, args):
         """A substep with an increment of the Brownian motions."""
@@ -240,10 +338,10 @@ class Discretized(AbstractDiscretization):
             # Euler and Maruyama's method; Diffrax's takes a term with a path of its
             # own.
             if type(self.solver) is diffrax.Euler:
-                x_next = x + h * _field(s, x, args) + _apply(g(s, x), dB)
+                x_next = x + h * field(s, x, args) + apply(g(s, x), dB)
                 return x_next, RESULTS.successful
-            term = diffrax.MultiTerm(diffrax.ODETerm(_field), _BrownianTerm(g, dB))
-            return _solver_step(self.solver, term, s, x, h, args)
+            term = diffrax.MultiTerm(diffrax.ODETerm(field), BrownianTerm(g, dB))
+            return solver_step(self.solver, term, s, x, h, args)
 
         return step
 
@@ -263,79 +361,39 @@ class Discretized(AbstractDiscretization):
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts), first_of(results)
 
-    def _adaptive(self, x, args):
+    def solve(
+        self, s: Array, x: Array, end: Array, args: Any, every_step: bool = False
+    ) -> tuple[diffrax.Solution, Result]:
+        """The solve by a step-size controller from `x` at `s` to `end`; its result.
+
+        Its `ys` are those at the end; with `every_step` also those of all steps.
+        """
         solver, controller, adjoint = (
             self.solver,
             self.stepsize_controller,
             self.adjoint,
         )
         assert solver is not None and controller is not None and adjoint is not None
+        saved: Any = dict(t1=True)
+        if every_step:
+            steps = diffrax.SubSaveAt(t0=True, steps=True)
+            saved = dict(subs=[diffrax.SubSaveAt(t1=True), steps])
         # Without `dt0` Diffrax estimates a first step from the field (Hairer, Nørsett
         # and Wanner, 1993, II.4): the last step of the interval before was cut off at
         # its end and tells little. Without `throw`, because one member of a batch that
         # fails must not stop the others.
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(_field),
+            diffrax.ODETerm(field),
             solver,
-            jnp.zeros((), x.dtype),
-            self.dt,
+            s,
+            end,
             dt0=None,
             y0=x,
             args=args,
+            saveat=diffrax.SaveAt(**saved),
             stepsize_controller=controller,
             adjoint=throwing_adjoint(adjoint),
             max_steps=self.max_steps,
             throw=False,
         )
-        assert solution.ys is not None
-        result = solve_result(solution, controller, x.dtype)
-        return solution.ys[0], result
-
-
-def _apply(g: Array, dB: Array) -> Array:
-    return g * dB if g.ndim == 1 else g @ dB
-
-
-class _BrownianTerm(diffrax.AbstractTerm):
-    """`g dB` with the increment of this step given, where Diffrax's own term would
-    evaluate a path: increments are data here, to be given, kept and differentiated."""
-
-    diffusion: Any
-    increment: Array
-
-    def vf(self, t, y, args):
-        del args
-        return self.diffusion(t, y)
-
-    def contr(self, t0, t1, **kwargs):
-        del t0, t1, kwargs
-        return self.increment
-
-    def prod(self, vf, control):
-        return _apply(vf, control)
-
-
-def _field(s, x, args):
-    """The vector field at `s` after the start of the interval. Adjoints differentiate
-    `args` only, not closures.
-    """
-    system, start, u, held = args
-    return start.evaluate(s, lambda t: evaluate_field(system, t, x, u, held))
-
-
-def _solver_step(solver, term, s, x, h, args):
-    """One Diffrax step of `h` from `s` after the start of the interval. It starts
-    afresh, as it must after a switch of the control.
-    """
-    # In local time, so that t1 - t0 is h to rounding, however late the interval is.
-    t0 = jnp.asarray(s, x.dtype)
-    t1 = t0 + h
-    state = solver.init(term, t0, t1, x, args)
-    x_next, _, _, _, result = solver.step(
-        term, t0, t1, x, args, state, made_jump=jnp.array(True)
-    )
-    if result is diffrax.RESULTS.successful:
-        return x_next, RESULTS.successful
-    # Diffrax's message refers to a step-size controller, which there is not.
-    solved = promote(result) == RESULTS.successful
-    return x_next, choose(solved, RESULTS.successful, RESULTS.stage_not_solved)
+        return solution, solve_result(solution, controller, x.dtype)

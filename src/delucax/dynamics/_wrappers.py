@@ -1,6 +1,7 @@
 """Dynamics with an adversary that acts on the state."""
 
 from dataclasses import KW_ONLY
+from typing import Any
 
 from jaxtyping import Array, Float
 
@@ -86,7 +87,15 @@ class WorstCase(AbstractWrapper):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        added = self.attack(x)
+        return self.dynamics.advance(t, x, u, self._attacked(x, w))
+
+    def advance_with_events(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result, Any]:
+        return self.dynamics.advance_with_events(t, x, u, self._attacked(x, w))
+
+    def _attacked(self, x, w):
         # Added to the environment's own disturbance, which the adversary does not
         # replace.
-        return self.dynamics.advance(t, x, u, added if w is None else w + added)
+        added = self.attack(x)
+        return added if w is None else w + added

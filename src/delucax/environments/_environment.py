@@ -349,13 +349,20 @@ class Environment(eqx.Module):
 
     def _advance(self, t: Time, x: State, u: Control, w: Disturbance) -> Step:
         """A step with arguments that were checked."""
+        step, *_ = self._advance_by(self.dynamics.advance, t, x, u, w)
+        return step
+
+    def _advance_by(
+        self, advance: Callable[..., Any], t: Time, x: State, u: Control, w: Disturbance
+    ) -> tuple[Any, ...]:
+        """The step by a method of the dynamics, and what else that returns."""
         cost = jnp.asarray(self.cost(t, x, u))
         if cost.shape != ():
             raise ValueError(
                 f"{type(self.cost).__name__}: the stage cost must be a scalar, got an "
                 f"array of shape {cost.shape}."
             )
-        x_next, result = self.dynamics.advance(t, x, u, w)
+        x_next, result, *events = advance(t, x, u, w)
         if self.terminated is None:
             terminated = jnp.zeros((), bool)
         else:
@@ -365,7 +372,7 @@ class Environment(eqx.Module):
                     "Environment: terminated must return one boolean, got shape "
                     f"{terminated.shape} and dtype {terminated.dtype}."
                 )
-        return Step(x_next, u, cost, terminated, result)
+        return Step(x_next, u, cost, terminated, result), *events
 
 
 def _identity(y: Any) -> Any:

@@ -28,13 +28,14 @@ from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import Checkpoint, Numbers, PRNGKey
 from ..disturbances import Zero
 from ..environments import Environment
+from ._checked import checked, plant_fields
 from ._controller_calls import (
     call_controller,
     check_control,
     check_state,
     controller_result,
 )
-from ._trajectory import checked, plant_fields, Trajectory
+from ._trajectory import Trajectory
 
 
 KEEP = (
@@ -47,6 +48,8 @@ KEEP = (
     "incidents",
     "controller_state",
 )
+EXTRA = ("events",)
+"""What is kept only when it is asked for."""
 
 
 def rollout(
@@ -88,7 +91,8 @@ def rollout(
         increments: standard normal numbers times `sqrt(dt / substeps)`.
     - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
         `"disturbances"`, `"costs"`, `"terminated"`, `"incidents"` and
-        `"controller_state"`; all by default.
+        `"controller_state"`, all by default, and `"events"` of a hybrid plant, which
+        take room for `max_events` a step.
     - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
         step, and the step is computed again; `"sqrt"`: the state at each of about the
         square root of T steps, for long horizons; `None`: all intermediate values,
@@ -141,11 +145,17 @@ def rollout(
         w = finite_rows(w, environment.disturbance_size, "w", where, horizon)
     keep = (keep,) if isinstance(keep, str) else keep
     named = isinstance(keep, tuple | list | set | frozenset)
-    if not named or not set(keep) <= set(KEEP):
+    known = KEEP + EXTRA
+    if not named or not set(keep) <= set(known):
         raise ValueError(
-            f"{where}: keep must be some of {', '.join(KEEP)}; got {keep!r}."
+            f"{where}: keep must be some of {', '.join(known)}; got {keep!r}."
         )
-    keep = tuple(name for name in KEEP if name in keep)
+    if "events" in keep and not environment.dynamics.event_names:
+        raise ValueError(
+            f"{where}: keep has 'events', but the plant has none; it must be a "
+            "delucax.systems.AbstractHybridSystem."
+        )
+    keep = tuple(name for name in known if name in keep)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
     decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     if isinstance(gradient_decay, int | float) and gradient_decay == 1:
@@ -212,7 +222,9 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         is_action = jnp.issubdtype(jnp.result_type(u), jnp.integer)
         if env.actions is None or not is_action:
             check_control(u, controller, env.control_size, "environment")
-        step = env._advance(t, x, env._applied(u), w)
+        records = "events" in keep
+        advance = dynamics.advance_with_events if records else dynamics.advance
+        step, *events = env._advance_by(advance, t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
         # Broadcasting would otherwise give the loop's state another shape.
@@ -237,6 +249,8 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             cost, applied = jnp.where(done, 0, cost), jnp.where(done, 0, applied)
             x_next = jnp.where(done, join_state(parts), x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
+            if records:
+                events = [events[0].unless(done)]
             # A result that is statically a success stays one, and costs nothing.
             if result is not RESULTS.successful:
                 result = choose(done, RESULTS.successful, result)
@@ -250,6 +264,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             "costs": cost,
             "terminated": ended[0] if can_end else None,
             "incidents": incidents,
+            "events": events[0] if records else None,
         }
         kept = {name: value for name, value in kept.items() if name in keep}
         # Costs that are kept are summed afterwards, in a tree: less rounding.
@@ -310,6 +325,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         recorded_terminated=kept.get("terminated"),
         incidents=kept.get("incidents"),
         controller_state=last if "controller_state" in keep else None,
+        recorded_events=kept.get("events"),
         **plant_fields(dynamics),
     )
 

@@ -31,6 +31,7 @@ from .._results import choose, first_failure, RESULTS
 from .._typing import Numbers, PRNGKey
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
+from ._checked import checked, plant_fields
 from ._controller_calls import check_control, controller_result
 from ._hold import (
     field,
@@ -47,7 +48,7 @@ from ._simulate_checks import (
     check_system,
     count_intervals,
 )
-from ._trajectory import checked, plant_fields, Trajectory
+from ._trajectory import Trajectory
 
 
 def simulate(

@@ -11,14 +11,16 @@ from .._check import check_instance, check_positive, is_concrete
 from .._integration import check_adaptive, check_kind
 from .._message import shortened
 from .._module import as_float_array
-from ..systems import AbstractSystem
+from ..systems import AbstractHybridSystem, AbstractSystem
 
 
 def check_system(system: Any, w: Any, where: str) -> None:
     """Raise unless one solve can integrate `system`."""
     check_instance(system, AbstractSystem, "system", where)
     name = type(system).__name__
-    if system.projects_state:
+    if isinstance(system, AbstractHybridSystem):
+        reason = f"system {name} has events, at which its state jumps"
+    elif system.projects_state:
         reason = f"system {name} projects its state after each interval"
     elif system.noise == "brownian":
         reason = f"system {name} has a diffusion, whose increments are of fixed steps"

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._check import is_concrete
 from .._extras import extra
 from .._jax import host_unless_traced, xp
 from .._results import choose, INCIDENTS, Result, RESULTS
 from .._typing import Array
-from ..systems import AbstractPlant
+from ..dynamics import Events
 
 
 if TYPE_CHECKING:
@@ -54,9 +53,11 @@ class Trajectory(eqx.Module):
     - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
     - `keep`: the names of what was kept.
     - `recorded_times`, `recorded_observations`, `recorded_disturbances`,
-        `recorded_terminated`: the arrays behind `times`, `observations`,
-        `disturbances` and `terminated` where they do not follow from the rest.
-    - `state_names`, `control_names`, `state_units`, `control_units`: tuples of strings.
+        `recorded_terminated`, `recorded_events`: the arrays behind `times`,
+        `observations`, `disturbances`, `terminated` and `events` where they do not
+        follow from the rest.
+    - `state_names`, `control_names`, `state_units`, `control_units`, `event_names`:
+        tuples of strings.
     - `time_unit`: a string.
 
     !!! example
@@ -100,6 +101,37 @@ class Trajectory(eqx.Module):
     time_unit: str = eqx.field(static=True, default="s")
     incidents: dict[str, Array] | None = None
     controller_state: PyTree = None
+    recorded_events: Events | None = None
+    event_names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def events(self) -> Events:
+        """The events of each step, [`delucax.dynamics.Events`][] with a leading axis of
+        T: `times` and `kinds` have the shape `(T, max_events)`.
+
+        **Raises:** `ValueError` if they were not kept.
+        """
+        if self.recorded_events is None:
+            raise ValueError(
+                "Trajectory: events must be kept to be read: give keep= with 'events', "
+                f"got {self.keep}."
+            )
+        return self.recorded_events
+
+    def event_list(self) -> list[tuple[float, str]]:
+        """The events of one trajectory, each as its time and name, in their order.
+
+        **Raises:** `ValueError` if they were not kept, or of a batch.
+        """
+        if self.batch_shape:
+            raise ValueError(
+                "Trajectory: event_list is of one trajectory, got a batch: index it, "
+                "as in trajectory[0]."
+            )
+        times, kinds = np.asarray(self.events.times), np.asarray(self.events.kinds)
+        at = kinds >= 0
+        pairs = zip(times[at], kinds[at], strict=True)
+        return [(float(time), self.event_names[kind]) for time, kind in pairs]
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -231,6 +263,7 @@ class Trajectory(eqx.Module):
             recorded_disturbances=steps(self.recorded_disturbances),
             recorded_terminated=steps(self.recorded_terminated),
             incidents=incidents,
+            recorded_events=steps(self.recorded_events),
             controller_state=self.controller_state if is_end else None,
             steps=stop - start,
         )
@@ -355,31 +388,3 @@ class Trajectory(eqx.Module):
 @host_unless_traced
 def _is_none_of(index: Array, known: list[Any]) -> Array:
     return xp.all(xp.stack(known) != index[..., None], axis=-1)
-
-
-def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
-    """The fields of a trajectory that its plant gives."""
-    names = ("disturbance_size", "state_names", "control_names")
-    names += ("state_units", "control_units", "time_unit")
-    return {name: getattr(plant, name) for name in names}
-
-
-def checked(trajectory: Trajectory, where: str) -> Trajectory:
-    """Raise if the trajectory failed: now if its values are known, else at run time."""
-    failed = trajectory.failed
-    if not is_concrete(failed):
-        # A random key in the controller's state is no argument of a run-time check.
-        numbers, rest = eqx.partition(trajectory, eqx.is_inexact_array)
-        return eqx.combine(trajectory.result.error_if(numbers, failed), rest)
-    if failed:
-        message = f"{where}: {RESULTS[trajectory.result]}"
-        if trajectory.states is not None:
-            bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
-            if bad.any():
-                k = int(np.argmax(bad))
-                message += (
-                    f" The state after step {k} (t = {float(trajectory.times[k]):g}) "
-                    "is the first that is not finite."
-                )
-        raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
-    return trajectory

@@ -11,6 +11,7 @@ from ._general import (
     NeuralSystem as NeuralSystem,
     system as system,
 )
+from ._hybrid_base import AbstractHybridSystem as AbstractHybridSystem
 
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
         MountainCar as MountainCar,
         Pendulum as Pendulum,
     )
+    from ._hybrid import BouncingBall as BouncingBall, RimlessWheel as RimlessWheel
     from ._industrial import (
         CSTR as CSTR,
         PermanentMagnetMotor as PermanentMagnetMotor,
@@ -49,6 +51,7 @@ else:
         __name__,
         {
             "_classic_control": "Acrobot CartPole MountainCar Pendulum",
+            "_hybrid": "BouncingBall RimlessWheel",
             "_industrial": "CSTR PermanentMagnetMotor TwoTank",
             "_oscillators": "DoubleIntegrator Lorenz MassSpringDamper VanDerPol",
             "_quadrotors": "ConstantWind DissipativeWind PlanarQuadrotor Quadrotor "

@@ -1,0 +1,208 @@
+"""Where guards cross zero within a step: detection by cubics, location by steps."""
+
+import functools
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._jax import by_components
+
+
+class Crossings(NamedTuple):
+    """What the guards do along a step, one entry for each event. Times are shares of
+    the step, and a guard times `sign` falls as it fires.
+
+    - `sign`: 1 or -1.
+    - `expected`: whether it crosses zero.
+    - `low`, `high`: it falls between these, from positive to negative.
+    - `guess`: where the cubic through its values and rates at both ends is zero.
+    - `at_once`: whether it starts at zero, and crosses there.
+    - `beyond`: whether it starts beyond zero.
+    - `seen`: whether the end of the step shows that it crosses; else only the cubic
+        does, which dips below zero and comes back.
+    - `slope`: its change over the step, if the rate at the start were constant.
+    - `size`: of its change along the step.
+    """
+
+    sign: Array
+    expected: Array
+    low: Array
+    high: Array
+    guess: Array
+    at_once: Array
+    beyond: Array
+    seen: Array
+    slope: Array
+    size: Array
+
+
+def pick(rows: Iterable[Array], index: Array) -> Array:
+    """The row of an index: by a choice for each, as a batch of gathers is slow."""
+    first, *others = rows
+    for i, row in enumerate(others, 1):
+        first = jnp.where(index == i, row, first)
+    return first
+
+
+def any_of(flags: Iterable[Array]) -> Array:
+    """Whether one of a few flags is set."""
+    return functools.reduce(jnp.logical_or, flags)
+
+
+def least(values: Iterable[Array]) -> tuple[Array, Array]:
+    """The least of a few values, and the first index that has it."""
+    value, *others = values
+    index = jnp.asarray(0)
+    for i, other in enumerate(others, 1):
+        index = jnp.where(other < value, i, index)
+        value = jnp.minimum(value, other)
+    return value, index
+
+
+def crossings(
+    starts: tuple[Array, Array],
+    ends: tuple[Array, Array],
+    slack: Array,
+    margin: Array,
+    directions: Array,
+    enabled: tuple[Array, Array],
+    has_length: Array,
+) -> Crossings:
+    """The crossings of guards along a step.
+
+    **Arguments:**
+
+    - `starts`, `ends`: the guards and their changes over the step, if their rates were
+        constant, at both ends.
+    - `slack`, `margin`: what counts as zero at the start, and at the end.
+    - `directions`: -1 falling, 1 rising, 0 both.
+    - `enabled`: at both ends.
+    - `has_length`: whether the step is more than a rounding of its interval; if it is
+        not, nothing is expected in it, but at the start of the next.
+    """
+    (g0, r0), (g1, r1) = starts, ends
+    on_guard = jnp.abs(g0) <= slack
+    either = directions == 0
+    # A guard that may be crossed either way falls from where it starts.
+    own = jnp.where(jnp.where(on_guard, r0, g0) < 0, -1, 1)
+    sign = jnp.where(either, own, -directions).astype(g0.dtype)
+    g0, r0, g1, r1 = (sign * a for a in (g0, r0, g1, r1))
+    at_once = on_guard & (r0 < 0) & enabled[0]
+    beyond = g0 < -slack
+    # One that is not enabled and is already falling has to come back first.
+    gone = beyond | on_guard & (r0 < 0)
+    # Where it grazes there is nothing to correct.
+    near = -g0 / jnp.where(r0 < 0, r0, -1)
+    near = jnp.where(jnp.abs(near) < jnp.finfo(g0.dtype).eps ** 0.25, near, 0)
+    a = jnp.where(on_guard, 0, g0)
+    # Hermite's cubic a + r0 z + c z^2 + d z^3, and where it is least and largest. Of
+    # each pair of formulas one has no cancellation.
+    c, d = 3 * (g1 - a) - 2 * r0 - r1, 2 * (a - g1) + r0 + r1
+    discriminant = c * c - 3 * d * r0
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    up = c > 0
+    total = jnp.where(up, c + root, root - c)
+    total = jnp.where(total == 0, 1, total)
+    three = jnp.where(d == 0, 1, 3 * d)
+    lowest = jnp.where(up, -r0 / total, jnp.where(d == 0, 2, total / three))
+    highest = jnp.where(up, jnp.where(d == 0, -1, -total / three), r0 / total)
+
+    def cubic(z):
+        return a + z * (r0 + z * (c + z * d)), r0 + z * (2 * c + z * 3 * d)
+
+    inside = lambda z, end: (discriminant > 0) & (z > 0) & (z < end)
+    dips = inside(lowest, 1.0) & (cubic(lowest)[0] < 0)
+    # A guard that is zero at the end, as near as can be told, is left to the start of
+    # the next step: whether it is just below is rounding, which is another in another
+    # program. One that may be crossed either way fires, as that start could not tell.
+    # From the guard to the guard, as in a step of no length, nothing is crossed.
+    margin = jnp.where(on_guard, jnp.maximum(slack, margin), margin)
+    ends_on = either & ~on_guard & (g1 <= margin) & (r1 < 0)
+    ends_beyond = (g1 < -margin) | ends_on
+    high = jnp.where(dips, jnp.clip(lowest, 0, 1), 1.0)
+    low = jnp.where(inside(highest, high), jnp.clip(highest, 0, 1), 0.0)
+
+    expected = ~gone & (dips | ends_beyond) & (enabled[0] | enabled[1])
+    # A few of Newton's steps, from the chord and between the ends: the start of the
+    # search, if there is one, and else not computed.
+    left, right, (v0, v1) = low, high, (cubic(low)[0], cubic(high)[0])
+    guess = low + (high - low) * jnp.clip(v0 / jnp.where(v0 > v1, v0 - v1, 1), 0, 1)
+    for _ in range(4):
+        value, slope = cubic(guess)
+        left = jnp.where(value < 0, left, guess)
+        right = jnp.where(value < 0, guess, right)
+        newton = guess - value / jnp.where(slope == 0, 1, slope)
+        good = (newton >= left) & (newton <= right)
+        guess = jnp.where(good, newton, (left + right) / 2)
+    return Crossings(
+        sign=sign,
+        expected=(expected | at_once) & has_length,
+        low=low,
+        high=high,
+        guess=jnp.where(at_once, near, guess),
+        at_once=at_once & has_length,
+        beyond=beyond & ~either & enabled[0],
+        seen=ends_beyond & ~dips,
+        slope=r0,
+        size=jnp.abs(a) + jnp.abs(g1) + jnp.abs(r0) + jnp.abs(r1),
+    )
+
+
+def locate(
+    guards: Callable[[Array], tuple[Array, Array]], found: Crossings, active: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The first crossing of a step: Newton's method on the step itself, in a bracket.
+
+    **Arguments:**
+
+    - `guards`: from a share of the step to the guards there, and their changes over the
+        step at the rates there.
+    - `found`: the crossings that are expected.
+    - `active`: whether there is one; else nothing is computed.
+
+    **Returns:** `(share, event, crossed, grazes)`: where it is, which event's it is,
+    whether there is one (a cubic may dip below zero where the step does not; the share
+    is then 1), and whether it hardly crosses.
+    """
+    eps = jnp.finfo(found.guess.dtype).eps
+    # The first in the order of their names, of those that cross at the same time.
+    start, event = least(jnp.where(found.expected, found.guess, 2.0))
+    # What was expected elsewhere may, rounded otherwise, not be so here.
+    active = active & any_of(found.expected)
+    at_once = active & any_of(found.at_once)
+    seen = any_of(found.expected & found.seen)
+    high = jnp.where(seen, 1.0, 2.0).astype(start.dtype)
+
+    @by_components
+    def look(state):
+        _, left, right, share, _, _, crossed, count = state
+        g, rate = (found.sign * a for a in guards(share))
+        falling = found.expected & (share >= found.low)
+        below = any_of(falling & (g < 0))
+        left, right = jnp.where(below, left, share), jnp.where(below, share, right)
+        newton = share - g / jnp.where(rate < 0, rate, -1)
+        newton = jnp.where(falling & (rate < 0), newton, 2.0)
+        # Those that do not yet fall here can cross only behind this point.
+        after, event = least(jnp.where(found.expected & ~falling, found.guess, newton))
+        apart = jnp.abs(after - share)
+        # Newton's next error is about the square of its step.
+        near = apart < 0.3 * eps**0.5
+        done = near | (right - left < 2 * eps)
+        inside = near | (after > left) & (after < right)
+        after = jnp.where(inside, after, (left + jnp.minimum(right, 1)) / 2)
+        crossed = crossed | below | near
+        slope = pick(rate, event)
+        more = ~done & (count < 60)
+        return more, left, right, after, event, slope, crossed, count + 1
+
+    left, slope = jnp.zeros_like(start), pick(found.slope, event)
+    state = (active & ~at_once, left, high, start, event, slope, seen, 0)
+    state = lax.while_loop(lambda state: state[0], look, state)
+    _, _, _, share, event, slope, crossed, _ = state
+    crossed = active & (crossed | at_once)
+    # It grazes where its slope is nothing beside what it changes along the step.
+    grazes = crossed & (-slope < eps**0.5 * pick(found.size, event))
+    return jnp.where(crossed, jnp.minimum(share, 1), 1), event, crossed, grazes

@@ -1,0 +1,45 @@
+"""How a trajectory is built from its plant, and how it is checked."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from .._check import is_concrete
+from .._results import RESULTS
+from ..systems import AbstractPlant
+from ._trajectory import Trajectory
+
+
+def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
+    """The fields of a trajectory that its plant gives."""
+    names = ("disturbance_size", "state_names", "control_names")
+    names += ("state_units", "control_units", "time_unit")
+    fields = {name: getattr(plant, name) for name in names}
+    return fields | {"event_names": tuple(getattr(plant, "event_names", ()))}
+
+
+def checked(trajectory: Trajectory, where: str) -> Trajectory:
+    """Raise if the trajectory failed: now if its values are known, else at run time."""
+    failed = trajectory.failed
+    if not is_concrete(failed):
+        # A random key in the controller's state is no argument of a run-time check.
+        numbers, rest = eqx.partition(trajectory, eqx.is_inexact_array)
+        return eqx.combine(trajectory.result.error_if(numbers, failed), rest)
+    if failed:
+        message = f"{where}: {RESULTS[trajectory.result]}"
+        if trajectory.states is not None:
+            bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
+            if bad.any():
+                k = int(np.argmax(bad))
+                message += (
+                    f" The state after step {k} (t = {float(trajectory.times[k]):g}) "
+                    "is the first that is not finite."
+                )
+        events = trajectory.recorded_events
+        if events is not None and np.any(np.asarray(events.fault_kind) >= 0):
+            k = int(np.argmax(np.asarray(events.fault_kind) >= 0))
+            name = trajectory.event_names[int(events.fault_kind[k])]
+            message += f" It was the event {name} at t = {events.fault_time[k]:g}."
+        raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
+    return trajectory

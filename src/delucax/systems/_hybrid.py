@@ -1,0 +1,139 @@
+"""Plants with impacts: a ball that bounces, and a wheel of spokes that rolls."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+
+from .._jax import host_unless_traced, xp
+from .._module import parameter, positive
+from .._typing import Control, Disturbance, Real, Scalar, State, Time
+from ..math import cos, sin
+from ._hybrid_base import AbstractHybridSystem
+
+
+class BouncingBall(AbstractHybridSystem):
+    r"""A ball that falls, with quadratic drag, and bounces off the floor:
+
+    `m d2(height)/dt2 = force - m g - drag velocity |velocity|`
+
+    and `velocity+ = -restitution velocity-` where the height falls to zero. The state
+    is (height [m], velocity [m/s]), the control is (force [N]).
+
+    A bounce that loses energy is followed by infinitely many in finite time. The
+    interval in which they accumulate ends with `RESULTS.too_many_events`, and the ball
+    on the floor.
+
+    **Arguments:**
+
+    - `mass`: m [kg], 1 by default.
+    - `gravity`: g [m/s^2], 9.81 by default.
+    - `drag`: [kg/m], 0 by default.
+    - `restitution`: the share of its speed that the ball keeps, 0.8 by default.
+
+    **Raises:** `ValueError` if the mass or the restitution is not positive, or a number
+    is not finite.
+
+    Source: Goebel, Sanfelice and Teel, 2012 (the model and its accumulation).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        ball = dlx.systems.BouncingBall(restitution=0.9)
+        dynamics = dlx.Discretized(ball, dt=0.1)
+        dlx.open_loop(dynamics, jnp.array([1.0, 0.0]), jnp.zeros((10, 1)))
+        ```
+    """
+
+    mass: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(9.81)
+    drag: Real = parameter(0.0)
+    restitution: Real = parameter(0.8, constraint=positive)
+
+    state_names, state_units = ("height", "velocity"), ("m", "m/s")
+    control_names, control_units = ("force",), ("N",)
+    event_names = ("bounce",)
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        pull = u[0] - self.drag * x[1] * jnp.abs(x[1])
+        return jnp.stack([x[1], pull / self.mass - self.gravity])
+
+    def guards(self, t: Time, x: State, u: Control) -> Sequence[Scalar]:
+        return (x[0],)
+
+    def resets(self, t: Time, x: State, u: Control) -> Sequence[State]:
+        return (jnp.stack([x[0], -self.restitution * x[1]]),)
+
+    @host_unless_traced
+    def equilibrium(self) -> tuple[State, Control]:
+        """Hanging at a height of zero, held by the force."""
+        return xp.zeros(2), xp.stack([self.mass * self.gravity])
+
+
+class RimlessWheel(AbstractHybridSystem):
+    r"""A wheel of spokes without a rim, which rolls down a slope from spoke to spoke:
+
+    `d2(angle)/dt2 = g / l sin(angle) + torque / (m l^2)`
+
+    about the foot of the spoke that stands, at `angle` from the vertical, downhill
+    positive. The next spoke hits the ground where `angle = slope + half`, in which
+    `half` is half the angle between spokes; the angle then falls by `2 half`, and
+    `velocity+ = cos(2 half) velocity-`, as angular momentum about the new foot is kept.
+    Rolling back it is the same the other way. The state is (angle [rad],
+    velocity [rad/s]), the control is (torque [N m]).
+
+    Its rolling is a limit cycle whose multiplier is `cos(2 half)^2`.
+
+    **Arguments:**
+
+    - `length`: l of a spoke [m], 1 by default.
+    - `mass`: m, all of it at the hub [kg], 1 by default.
+    - `gravity`: g [m/s^2], 9.81 by default.
+    - `half`: half the angle between spokes [rad], pi / 8 by default.
+    - `slope`: of the ground [rad], 0.08 by default.
+
+    **Raises:** `ValueError` if the length, mass or half angle is not positive, or a
+    number is not finite.
+
+    Source: McGeer, 1990; Coleman, Chatterjee and Ruina, 1997.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        wheel = dlx.systems.RimlessWheel(slope=0.1)
+        dynamics = dlx.Discretized(wheel, dt=0.05)
+        dlx.open_loop(dynamics, jnp.array([0.0, 1.0]), jnp.zeros((40, 1)))
+        ```
+    """
+
+    length: Real = parameter(1.0, constraint=positive)
+    mass: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(9.81)
+    half: Real = parameter(float(jnp.pi / 8), constraint=positive)
+    slope: Real = parameter(0.08)
+
+    state_names, state_units = ("angle", "velocity"), ("rad", "rad/s")
+    control_names, control_units = ("torque",), ("N m",)
+    event_names = ("step", "step back")
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        drive = u[0] / (self.mass * self.length**2)
+        return jnp.stack([x[1], self.gravity / self.length * sin(x[0]) + drive])
+
+    def guards(self, t: Time, x: State, u: Control) -> Sequence[Scalar]:
+        lean = x[0] - self.slope
+        return self.half - lean, self.half + lean
+
+    def resets(self, t: Time, x: State, u: Control) -> Sequence[State]:
+        lean, kept = x[0] - self.slope, cos(2 * self.half) * x[1]
+        step, back = lean - 2 * self.half, lean + 2 * self.half
+        return tuple(jnp.stack([self.slope + new, kept]) for new in (step, back))
+
+    @host_unless_traced
+    def equilibrium(self) -> tuple[State, Control]:
+        return xp.zeros(2), xp.zeros(1)
