@@ -1,4 +1,5 @@
-"""Analysis of linear models: poles and zeros, Gramians, norms, margins."""
+"""Analysis of linear models: poles and zeros, Gramians, norms, margins. Periodic orbits
+of hybrid systems."""
 
 from ._disk_margin import disk_margin as disk_margin, DiskMargin as DiskMargin
 from ._gains import (
@@ -25,4 +26,10 @@ from ._modes import (
     ModalTest as ModalTest,
     poles as poles,
     zeros as zeros,
+)
+from ._orbits import (
+    periodic_orbit as periodic_orbit,
+    PeriodicOrbit as PeriodicOrbit,
+    poincare_map as poincare_map,
+    Return as Return,
 )

@@ -1,0 +1,235 @@
+"""Periodic orbits of hybrid systems: the map from event to event, its multipliers."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array
+
+from .._check import as_vector, check_bool, check_choice, check_count, check_instance
+from .._jax import bounded_while, jacobian
+from .._module import as_float_array
+from .._results import choose, promote, raise_on_failure, Result, RESULTS
+from .._typing import Numbers, RealScalar
+from ..dynamics import Discretized
+
+
+class Return(eqx.Module):
+    """The state after the next event of a kind, as [`delucax.analysis.poincare_map`][]
+    returns it.
+
+    **Attributes:**
+
+    - `state`: just after the event, shape `(n,)`.
+    - `time`: until the event, a scalar.
+    - `result`: success, `not_converged` if it did not fire within `max_steps`, or what
+        failed on the way.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=0.1)
+        found = dlx.analysis.poincare_map(dynamics, "bounce", [0.0, 3.0])
+        found.state, found.time
+        ```
+    """
+
+    state: Array
+    time: Array
+    result: Result
+
+
+class PeriodicOrbit(eqx.Module):
+    """An orbit that returns to itself, as [`delucax.analysis.periodic_orbit`][] finds.
+
+    **Attributes:**
+
+    - `state`: just after the event, shape `(n,)`.
+    - `period`: a scalar.
+    - `jacobian`: of the map from event to event, shape `(n, n)`.
+    - `multipliers`: its eigenvalues, shape `(n,)`, complex, the largest first. The
+        orbit is stable if all are inside the unit circle; those of directions that
+        leave the event's surface are zero.
+    - `result`: success, or why there is none.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dynamics = dlx.Discretized(dlx.systems.RimlessWheel(slope=0.1), dt=0.05)
+        orbit = dlx.analysis.periodic_orbit(dynamics, "step", [-0.29, 1.2])
+        orbit.jacobian, orbit.result
+        ```
+    """
+
+    state: Array
+    period: Array
+    jacobian: Array
+    multipliers: Array
+    result: Result
+
+
+def poincare_map(
+    dynamics: Discretized,
+    event: str,
+    x: Numbers,
+    u: Numbers | None = None,
+    *,
+    t0: RealScalar = 0.0,
+    max_steps: int = 1000,
+    throw: bool = True,
+) -> Return:
+    """The state just after the next event of a kind, from a state just after one.
+
+    Other events on the way happen, too. The time of return is free: the dynamics say
+    how the system is integrated, and their `dt` is that of its steps, in each of which
+    the same control is held. Differentiable with respect to every array.
+
+    **Arguments:**
+
+    - `dynamics`: a discretised [`delucax.systems.AbstractHybridSystem`][].
+    - `event`: one of its `event_names`.
+    - `x`: the state, shape `(n,)`.
+    - `u`: the control, shape `(m,)`; zero by default.
+    - `t0`: the time of `x`, 0 by default.
+    - `max_steps`: intervals of `dt` until the event, at most; 1000 by default.
+    - `throw`: raise if it fails (default).
+
+    **Returns:** a [`delucax.analysis.Return`][].
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
+    time as `throw` says.
+
+    Source: Guckenheimer and Holmes, 1983.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        wheel = dlx.systems.RimlessWheel(slope=0.1)
+        dynamics = dlx.Discretized(wheel, dt=0.05)
+        dlx.analysis.poincare_map(dynamics, "step", [-0.29, 1.2]).time
+        ```
+    """
+    where = "poincare_map"
+    x, u, index = _arguments(dynamics, event, x, u, where)
+    max_steps = check_count(max_steps, "max_steps", where)
+    check_bool(throw, "throw", where)
+    found = _return(dynamics, index, x, u, as_float_array(t0), max_steps)
+    return raise_on_failure(found, where, throw, "the state that was reached")
+
+
+def _arguments(dynamics, event, x, u, where):
+    check_instance(dynamics, Discretized, "dynamics", where)
+    check_choice(event, tuple(dynamics.event_names), "event", where)
+    x = as_vector(x, dynamics.state_size, "x", where)
+    u = jnp.zeros(dynamics.control_size, x.dtype) if u is None else u
+    u = as_vector(u, dynamics.control_size, "u", where)
+    return x, u, dynamics.event_names.index(event)
+
+
+@eqx.filter_jit
+def _return(dynamics, event, x, u, t0, max_steps) -> Return:
+    def turn(carry):
+        x, time, count, *_ = carry
+        outcome = dynamics.until_event(t0 + time, x, u, None, event)
+        # By products, as a sum of steps would be rounded anew at each of them.
+        after = (count * dynamics.dt + outcome.s).astype(x.dtype)
+        done = outcome.stopped | (outcome.result != RESULTS.successful)
+        new = outcome.x, after, count + 1, done, outcome.result
+        over = carry[3]
+        return jax.tree.map(lambda a, b: jnp.where(over, a, b), carry, new)
+
+    zero = jnp.zeros((), x.dtype)
+    carry = x, zero, jnp.asarray(0), jnp.asarray(False), RESULTS.successful
+    carry = bounded_while(lambda carry: ~carry[3], turn, carry, max_steps)
+    x, time, _, done, result = carry
+    missed = ~done & (result == RESULTS.successful)
+    return Return(x, time, choose(missed, RESULTS.not_converged, result))
+
+
+def periodic_orbit(
+    dynamics: Discretized,
+    event: str,
+    x0: Numbers,
+    u: Numbers | None = None,
+    *,
+    tolerance: float = 1e-10,
+    max_iterations: int = 20,
+    max_steps: int = 1000,
+    throw: bool = True,
+) -> PeriodicOrbit:
+    """The fixed point of [`delucax.analysis.poincare_map`][] near a guess, by Newton's
+    method, and its multipliers.
+
+    The field must not depend on time. The fixed point is differentiable with respect to
+    the dynamics, by the implicit function theorem.
+
+    **Arguments:**
+
+    - `dynamics`, `event`, `u`, `max_steps`, `throw`: as for the map. With a
+        `stepsize_controller` its `adjoint` needs a forward mode,
+        `diffrax.DirectAdjoint()`.
+    - `x0`: the guess, a state just after the event, shape `(n,)`.
+    - `tolerance`: of the state, absolute and relative, 1e-10 by default; not below the
+        rounding of single precision.
+    - `max_iterations`: 20 by default.
+
+    **Returns:** a [`delucax.analysis.PeriodicOrbit`][].
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
+    time as `throw` says.
+
+    Source: McGeer, 1990; Goswami, Thuilot and Espiau, 1998.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        wheel = dlx.systems.RimlessWheel(slope=0.1)
+        dynamics = dlx.Discretized(wheel, dt=0.05)
+        orbit = dlx.analysis.periodic_orbit(dynamics, "step", [-0.29, 1.2])
+        orbit.period, orbit.multipliers
+        ```
+    """
+    where = "periodic_orbit"
+    x0, u, index = _arguments(dynamics, event, x0, u, where)
+    max_steps = check_count(max_steps, "max_steps", where)
+    iterations = check_count(max_iterations, "max_iterations", where)
+    check_bool(throw, "throw", where)
+    least = 8 * float(jnp.finfo(x0.dtype).eps)
+    given = index, x0, u, max(tolerance, least), iterations, max_steps
+    orbit = _orbit(dynamics, *given)
+    return raise_on_failure(orbit, where, throw, "the last iterate")
+
+
+@eqx.filter_jit
+def _orbit(dynamics, event, x0, u, tolerance, iterations, max_steps) -> PeriodicOrbit:
+    zero = jnp.zeros((), x0.dtype)
+
+    def missed(x, given):
+        dynamics, u = given
+        after = _return(dynamics, event, x, u, zero, max_steps).state
+        return dynamics.difference(after, x)
+
+    solver = optx.Newton(rtol=tolerance, atol=tolerance)
+    given = dynamics, u
+    solved = optx.root_find(
+        missed, solver, x0, given, max_steps=iterations, throw=False
+    )
+    x = solved.value
+    again = _return(dynamics, event, x, u, zero, max_steps)
+    J = jacobian(lambda x: _return(dynamics, event, x, u, zero, max_steps).state)(x)
+    values: Any = jnp.linalg.eigvals(J)
+    values = values[jnp.argsort(-jnp.abs(values))]
+    result = promote(solved.result)
+    failed = again.result != RESULTS.successful
+    result = choose(failed, again.result, result)
+    return PeriodicOrbit(x, again.time, J, values, result)

@@ -1,0 +1,44 @@
+"""Maps from event to event, their fixed points and multipliers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, once
+
+import delucax as dlx
+
+
+GUESS = jnp.array([0.1 - np.pi / 8, 1.2])
+
+
+def wheel(slope=0.1, dt=0.005):
+    return dlx.Discretized(dlx.systems.RimlessWheel(slope=slope), dt=dt)
+
+
+@needs_x64
+def test_the_rimless_wheel_has_its_multiplier():
+    """cos(2 half)^2, and the speed of the energy that a step gains."""
+    orbit = dlx.analysis.periodic_orbit(wheel(), "step", GUESS)
+    assert orbit.result == dlx.RESULTS.successful
+    kept = np.cos(np.pi / 4) ** 2
+    assert_close(orbit.multipliers, [kept, 0.0], atol=1e-8)
+    gained = 4 * 9.81 * np.sin(np.pi / 8) * np.sin(0.1)
+    assert_close(orbit.state[1], np.sqrt(kept * gained / (1 - kept)), rtol=1e-9)
+
+
+@needs_x64
+def test_the_time_of_return_has_a_derivative():
+    time = jax.jit(lambda x: dlx.analysis.poincare_map(wheel(dt=0.02), "step", x).time)
+    slope = jax.grad(time)(GUESS)
+    h = jnp.array([0.0, 1e-5])
+    assert_close(slope[1], (time(GUESS + h) - time(GUESS - h)) / 2e-5, rtol=1e-6)
+
+
+@once
+def test_an_event_that_does_not_come():
+    options = dict(max_steps=20, throw=False)
+    missed = dlx.analysis.poincare_map(wheel(dt=0.01), "step back", GUESS, **options)
+    assert missed.result == dlx.RESULTS.not_converged
+    with pytest.raises(ValueError, match="event must be"):
+        dlx.analysis.poincare_map(wheel(), "bounce", GUESS)
