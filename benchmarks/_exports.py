@@ -26,6 +26,8 @@ SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover
 QUICK = ("-std=c99", "-O2")
 PEERS = Path(__file__).parent / "_peers"
 STEPS = PEERS / "steps.c"
+KEY = jax.random.key(0)
+"""Of the draws of all controllers."""
 
 
 class Exported(NamedTuple):
@@ -108,7 +110,8 @@ def write(
 ) -> Path:
     """The C file of a case."""
     example = jnp.zeros(case.observations)
-    dlx.export.c(case.make(), folder, name=name, dtype=dtype, example=example)
+    options = dict(name=name, dtype=dtype, example=example, key=KEY)
+    dlx.export.c(case.make(), folder, **options)
     return folder / f"{name}.c"
 
 

@@ -29,6 +29,7 @@ from benchmarks._exports import (
     build,
     by_hand,
     Exported,
+    KEY,
     lqr,
     mlp,
     nanoseconds,
@@ -92,7 +93,7 @@ def accuracy(quick: bool) -> list[dict[str, Any]]:
 def controls_of(controller: Any, observations: int) -> int:
     """The size of its control."""
     y = jnp.zeros(observations)
-    act = lambda: controller(jnp.zeros(()), y, controller.init(key=jax.random.key(0)))
+    act = lambda: controller(jnp.zeros(()), y, controller.init(key=KEY))
     return jax.eval_shape(act)[0].shape[0]
 
 
@@ -103,10 +104,7 @@ def hygiene(quick: bool) -> list[dict[str, Any]]:
     for name, case in list(ALL.items())[: 4 if quick else None]:
         with tempfile.TemporaryDirectory() as inside:
             folder = Path(inside)
-            try:
-                source = write(case, folder)
-            except ValueError:
-                continue
+            source = write(case, folder)
             row: dict[str, Any] = {"controller": name, "strict": True}
             size = controls_of(case.make(), case.observations)
             # One row in three is not finite: that is computed with too.
@@ -310,7 +308,7 @@ def judge(results: dict[str, Any]) -> None:
     for row in results["accuracy"]:
         who = f"{row['controller']}, {row['dtype']}"
         for what, limit in (("step", "limit"), ("loop", "loop limit")):
-            if "refused" not in row and not (row[what] or 0.0) <= row[limit]:
+            if not row[what] <= row[limit]:
                 missed.append(f"{who}: {what} {row[what]}")
     for row in results["hygiene"]:
         if row["sanitizers"] != "clean" or row["other symbols"]:

@@ -40,6 +40,10 @@ REFUSED = {
         lambda x: jax.random.normal(jax.random.key(x[0].astype(int))),
         "random numbers",
     ),
+    "random_bits": (
+        lambda x: jax.random.normal(x.astype(jnp.uint32)[:2]),
+        "random numbers",
+    ),
     "convert_element_type": (lambda x: jnp.fft.fft(x).real, "type complex"),
     "igamma": (lambda x: jax.scipy.special.gammainc(x, x), "no form of it in C"),
 }
@@ -70,6 +74,13 @@ LAW = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
         (dict(example=np.zeros((2, 2))), "example must be an observation"),
         (dict(fallback=[1.0, 2.0]), "fallback must"),
         (dict(fallback=[np.nan]), "fallback must"),
+        (dict(key=3), "key must be one random key"),
+        (
+            dict(
+                function_or_controller=jnp.sin, example=(ONES,), key=jax.random.key(0)
+            ),
+            "key is given",
+        ),
         (dict(max_iterations=0), "max_iterations must be a whole number"),
         (dict(directory=3), "directory must be the path"),
         (dict(function_or_controller=3), "function_or_controller must be"),

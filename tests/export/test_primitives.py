@@ -46,6 +46,11 @@ UNARY = {
     "root": (jnp.sqrt, 0, 3),
     "tangent": (jnp.tan, -1, 1),
     "tanh": (jnp.tanh, -3, 3),
+    "same_bits": (
+        lambda x: lax.bitcast_convert_type(x, f"uint{8 * x.dtype.itemsize}"),
+        -9,
+        9,
+    ),
     "integers": (lambda x: (x.astype(int), (x > 0).astype(x.dtype)), -9, 9),
     "fewer_digits": (lambda x: lax.reduce_precision(x, 8, 7), -9, 9),
     "finite": (lambda x: jnp.isfinite(1 / (x - x[0])), -3, 3),

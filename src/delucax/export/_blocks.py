@@ -7,19 +7,18 @@ around them.
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+
+from ._keys import as_words
 
 
 class Const:
-    """A known array; a key of `jax.random` stays one of JAX."""
+    """A known array, of their words where it is one of keys."""
 
     __slots__ = ("dtype", "shape", "value")
 
     def __init__(self, value: Any):
-        if not jnp.issubdtype(value.dtype, jax.dtypes.extended):
-            value = np.asarray(value)
+        value = np.asarray(as_words(value))
         self.value, self.shape, self.dtype = value, value.shape, value.dtype
 
 
@@ -52,10 +51,12 @@ class Node:
 
 
 class Block:
-    """Nodes in order, from `params` to `outs`."""
+    """Nodes in order, from `params` to `outs`. `draws`: whether some may draw random
+    numbers."""
 
-    def __init__(self, parent: "Block | None", repeats: bool):
+    def __init__(self, parent: "Block | None", repeats: bool, draws: bool = False):
         self.parent, self.repeats = parent, repeats
+        self.draws: bool = parent.draws if parent else draws
         self.depth: int = parent.depth + 1 if parent else 0
         self.params: list[Var] = []
         self.nodes: list[Node] = []

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._check import check_count
+from .._check import check_count, check_key
 from .._controller import AbstractController
 from .._files import as_path
 from ..dynamics import AbstractDynamics
@@ -26,6 +26,7 @@ def c(
     dtype: Any = None,
     example: Any = None,
     fallback: Any = None,
+    key: Any = None,
     max_iterations: int | None = None,
 ) -> Report:
     """Write a controller, a plant or a function as a program in C.
@@ -62,13 +63,17 @@ def c(
         controller an observation, where its size cannot be found out.
     - `fallback`: the control where a step fails, shape `(m,)`; by default the last good
         one.
+    - `key`: a random key, for a controller that draws, such as
+        [`delucax.controllers.BPC`][]. The state holds its two words, and C draws the
+        numbers that JAX would: those of `init(key=key)`, each time it starts.
     - `max_iterations`: the most rounds of a loop for which no bound is found.
 
     **Returns:** a [`delucax.export.Report`][].
 
-    **Raises:** `ValueError` for what cannot be written in C, such as random draws,
-    eigenvalues and calls of Python, with the line of your code; for a name that is no
-    identifier; and for a directory that cannot be written. Then no file is changed.
+    **Raises:** `ValueError` for what cannot be written in C, such as eigenvalues,
+    calls of Python and random draws of a function, with the line of your code; for a
+    name that is no identifier; and for a directory that cannot be written. Then no file
+    is changed.
 
     !!! example
 
@@ -94,6 +99,8 @@ def c(
             f"such as 'controller', got {name!r}."
         )
     folder = Path(as_path(directory, "directory", where))
+    if key is not None:
+        check_key(key, where)
     if max_iterations is not None:
         check_count(max_iterations, "max_iterations", where)
     if not callable(function_or_controller) and not isinstance(
@@ -108,11 +115,14 @@ def c(
     )
     if isinstance(function_or_controller, AbstractController):
         made = export_controller(
-            function_or_controller, name, real, example, fallback, max_iterations
+            function_or_controller, name, real, example, fallback, key, max_iterations
         )
     else:
-        if fallback is not None:
-            raise ValueError(f"{where}: fallback is given, but there is no controller.")
+        for given, label in ((fallback, "fallback"), (key, "key")):
+            if given is not None:
+                raise ValueError(
+                    f"{where}: {label} is given, but there is no controller."
+                )
         given = _as_function(function_or_controller, example, where)
         function, example, labels, notes = given
         made = export_function(

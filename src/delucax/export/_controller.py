@@ -25,6 +25,7 @@ from ._function import (
     new_program,
     ready,
 )
+from ._keys import as_keys, as_words, is_key, is_ours
 from ._program import Program
 from ._trace import trace, Unsupported
 from ._values import Scalars, Table, Value, View
@@ -36,24 +37,27 @@ _MOST_TRIED = 16
 class _Traced:
     """A controller as programs of arrays."""
 
-    def __init__(self, controller: Any, dtype: np.dtype, example: Any):
+    def __init__(self, controller: Any, dtype: np.dtype, example: Any, key: Any):
         self.dtype = dtype
         with precision(dtype):
             controller = cast(controller, dtype)
-            start = _first_state(controller, dtype)
+            start = _first_state(controller, dtype, key)
             arrays, static = eqx.partition(start, eqx.is_array)
             leaves, structure = jax.tree_util.tree_flatten_with_path(arrays)
             # C has no arrays without entries.
             kept = [bool(leaf.size) for _, leaf in leaves]
             full = [pair for pair in leaves if pair[1].size]
-            self.start = [np.asarray(leaf) for _, leaf in full]
+            self.start = [np.asarray(as_words(leaf)) for _, leaf in full]
             self.paths = [jax.tree_util.keystr(path) for path, _ in full]
             kinds = [(leaf.shape, leaf.dtype) for _, leaf in leaves]
 
             def unflatten(flat):
                 rest = iter(flat)
                 pairs = zip(leaves, kept, strict=True)
-                every = [next(rest) if used else leaf for (_, leaf), used in pairs]
+                every = [
+                    as_keys(next(rest), leaf.dtype) if used else leaf
+                    for (_, leaf), used in pairs
+                ]
                 return eqx.combine(jax.tree.unflatten(structure, every), static)
 
             def flatten(state):
@@ -65,7 +69,7 @@ class _Traced:
                         f"init, {structure}, got {after}."
                     )
                 return [
-                    jnp.asarray(leaf, kind)
+                    jnp.asarray(as_words(leaf), None if is_key(kind) else kind)
                     for leaf, (_, kind), used in zip(flat, kinds, kept, strict=True)
                     if used
                 ]
@@ -80,20 +84,28 @@ class _Traced:
             number = jax.ShapeDtypeStruct((), dtype)
             state = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self.start]
             y = _observation(step, number, state, dtype, example)
-            self.step = trace(step, number, y, *state)
+            self.step = trace(step, number, y, *state, draws=True)
             self.observations, self.controls = y.shape[0], self.step.outs[0].shape
             u = jax.ShapeDtypeStruct(self.controls, dtype)
-            self.applied = trace(applied, u, number, *state)
+            self.applied = trace(applied, u, number, *state, draws=True)
 
 
-def _first_state(controller: AbstractController, dtype: np.dtype) -> Any:
+def _first_state(controller: AbstractController, dtype: np.dtype, key: Any) -> Any:
     try:
-        state = initial_state(controller, None)
+        state = initial_state(controller, key)
     except ValueError as error:
+        if key is not None:
+            raise
         raise Unsupported(
-            f"export.c: {type(controller).__name__} cannot be exported: it needs a "
-            f"random key, and C draws no random numbers ({error})"
+            f"export.c: {type(controller).__name__} cannot be exported without key=, "
+            f"such as jax.random.key(0), that its draws begin with ({error})"
         ) from error
+    for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array)):
+        if is_key(leaf.dtype) and not is_ours(leaf.dtype):
+            raise Unsupported(
+                f"export.c: {type(controller).__name__} cannot be exported: it draws "
+                f"with a {leaf.dtype}, and C has threefry2x32 alone."
+            )
     return cast(state, dtype)
 
 
@@ -131,10 +143,11 @@ def export_controller(
     dtype: np.dtype,
     example: Any,
     fallback: Any,
+    key: Any,
     most: int | None,
 ) -> Any:
     """The header and the source of a controller, and what its report needs."""
-    traced = _Traced(controller, dtype, example)
+    traced = _Traced(controller, dtype, example, key)
     (m,) = traced.controls
     if fallback is not None:
         fallback = np.asarray(finite_vector(fallback, m, "fallback", "export.c"), dtype)

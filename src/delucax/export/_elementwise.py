@@ -101,6 +101,10 @@ def operation(op: str, params: Any, dtypes: list[Any], out: Any, shared: Any) ->
         return _selected, 1
     if op == "convert_element_type":
         return (lambda given: _converted(given[0], out, shared)), 0
+    if op == "bitcast_convert_type":
+        if out.itemsize != kind.itemsize or "b" in (out.kind, kind.kind):
+            return None
+        return (lambda given: _same_bits(given[0], out, shared)), 0
     if op == "integer_pow":
         return (lambda given: _power(given[0], params["y"], shared)), 2
     if op == "round":
@@ -241,6 +245,11 @@ def _converted(given: Expr, out: np.dtype, shared: Any) -> Expr:
             low, high = -math.inf, math.inf
     text = f"(({c_type(out)}){given.text})"
     return Expr(text, out, given.reads, given.cost, None, low, high)
+
+
+def _same_bits(given: Expr, out: np.dtype, shared: Any) -> Expr:
+    name = shared.routine("bits", given.dtype, out)
+    return Expr(f"{name}({given.text})", out, given.reads, given.cost)
 
 
 def _power(given: Expr, exponent: int, shared: Any) -> Expr:

@@ -1,12 +1,13 @@
-"""Factors of matrices, triangular systems and sorting: routines of C, called for each
-matrix of a batch."""
+"""Factors of matrices, triangular systems, sorting and random bits: routines of C,
+called for each matrix, row or entry."""
 
 from typing import Any
 
 import numpy as np
 
 from ._elementwise import operation
-from ._expressions import index_of, known, literal, NOTHING
+from ._expressions import Expr, index_of, known, literal, NOTHING, union
+from ._values import broadcast, Scalars
 
 
 def _call(e, name, dtype, writes, *arguments, cost):
@@ -168,6 +169,30 @@ def sort(e, node, *xs):
     return places
 
 
+def threefry(e, node, *ins):
+    """Two random words of each entry, which the routine returns as one."""
+    shape, word = node.outs[0].shape, node.outs[0].dtype
+    ins = [e.indexable(e.cheap(x)) if not e.is_few(node.outs[0]) else x for x in ins]
+    name, long = e.shared.routine("threefry", word), np.dtype(np.uint64)
+
+    def pair(i):
+        given = [x.at(broadcast(i, x.shape)) for x in ins]
+        text = f"{name}({', '.join(x.text for x in given)})"
+        both = e.define(Expr(text, long, union(x.reads for x in given), 120))
+        texts = f"((uint32_t)({both.text} >> 32))", f"((uint32_t){both.text})"
+        return [Expr(text, word, both.reads) for text in texts]
+
+    if e.is_few(node.outs[0]):
+        pairs = [pair(tuple(map(known, i))) for i in np.ndindex(*shape)]
+        parts = zip(*pairs, strict=True)
+        return [Scalars(shape, word, list(part), frozenset()) for part in parts]
+    places = [e.new_view(shape, word) for _ in node.outs]
+    with e.over(shape) as indices:
+        for place, half in zip(places, pair(indices), strict=True):
+            e.store(place, indices, half)
+    return places
+
+
 RULES: dict[str, Any] = {
     "cholesky": cholesky,
     "triangular_solve": triangular_solve,
@@ -177,4 +202,5 @@ RULES: dict[str, Any] = {
     "geqrf": geqrf,
     "householder_product": householder_product,
     "sort": sort,
+    "threefry2x32": threefry,
 }

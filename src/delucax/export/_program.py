@@ -10,9 +10,8 @@ from ._blocks import Atom, Block, Const, Node, Var
 from ._bounds import Origins
 from ._elementwise import operation
 from ._emit import same_memory, Writer
-from ._expressions import known
 from ._trace import refuse
-from ._values import Table, Value, View
+from ._values import broadcast, Table, Value, View
 
 
 _RULES: dict[str, Any] = (
@@ -114,14 +113,6 @@ class Program(Writer):
             ins = [self.cheap(x) if x.shape != out.shape else x for x in ins]
 
         def at(i):
-            return make([x.at(_broadcast(i, x.shape)) for x in ins])
+            return make([x.at(broadcast(i, x.shape)) for x in ins])
 
         return self.formula(out.shape, out.dtype, at, ins, cost)
-
-
-def _broadcast(indices: Any, shape: Sequence[int]) -> Any:
-    """The index of an operand, whose axes of one entry are read again and again."""
-    if not shape:
-        return ()
-    pairs = zip(indices, shape, strict=True)
-    return tuple(known(0) if extent == 1 else index for index, extent in pairs)

@@ -129,7 +129,28 @@ static void order_S(int n, const T *key, int step, int32_t *order) {
   }
 }"""
 
-_ALGEBRA = {
+_THREEFRY = """
+/* The block of two words that the generator of JAX makes of a key and a count. */
+static uint64_t threefry_S(T key0, T key1, T x, T y) {
+  static const int turns[8] = {13, 15, 26, 6, 17, 29, 16, 24};
+  const T key[3] = {key0, key1, key0 ^ key1 ^ 0x1BD11BDAu};
+  x += key[0];
+  y += key[1];
+  for (T i = 0; i < 5; ++i) {
+    for (int k = 0; k < 4; ++k) {
+      const int turn = turns[4 * (i % 2) + k];
+      x += y;
+      y = (y << turn | y >> (32 - turn)) ^ x;
+    }
+    x += key[(i + 1) % 3];
+    y += key[(i + 2) % 3] + i + 1;
+  }
+  return (uint64_t)x << 32 | y;
+}"""
+
+_OTHERS = {
+    "order": _ORDER,
+    "threefry": _THREEFRY,
     "cholesky": """
 /* The lower factor of a symmetric matrix; all NaN if it is not positive definite. */
 static void cholesky_S(int n, const T *a, T *l) {
@@ -245,6 +266,14 @@ static void orthogonal_S(int m, int c, int n, int k, const T *a, const T *tau, T
 }""",
 }
 
+_BITS = """
+/* The number with these bits. */
+static R bits_S(T x) {
+  R y;
+  memcpy(&y, &x, sizeof y);
+  return y;
+}"""
+
 _TO_INTEGER = """
 /* Towards zero; what is beyond the integers becomes the last one, and NaN zero. */
 static R to_integer_S(T x) {
@@ -260,12 +289,13 @@ def routine(name: str, dtype: Any, out: Any = None) -> tuple[str, str]:
     dtype = np.dtype(dtype)
     if name == "to_integer":
         return _to_integer(dtype, np.dtype(out))
+    if name == "bits":
+        label = f"{suffix(dtype)}_{suffix(out)}"
+        return f"bits_{label}", _word(_typed(_BITS, dtype, label), "R", c_type(out))
     if name.startswith("power"):
         text = _power(int(name[5:]), dtype)
-    elif name == "order":
-        text = _ORDER
-    elif name in _ALGEBRA:
-        text = _ALGEBRA[name]
+    elif name in _OTHERS:
+        text = _OTHERS[name]
     else:
         kinds = {"f": _SCALAR, "u": _UNSIGNED}
         text = kinds.get(dtype.kind, _INTEGER)[name]

@@ -11,6 +11,7 @@ import diffrax
 import equinox
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import lineax
 import numpy as np
 import optax
@@ -24,13 +25,17 @@ from jax.interpreters.partial_eval import dce_jaxpr
 from ._blocks import Atom, Block, Const, count_readers, drop_dead, Node, Var
 from ._expressions import is_supported
 from ._fold import folded, is_all
+from ._keys import as_keys, form, is_key, is_ours, on_words
 
 
-def trace(function: Callable[..., Any], *shapes: Any) -> Block:
-    """The plain program of a function of arrays, which returns a list of arrays."""
+def trace(function: Callable[..., Any], *shapes: Any, draws: bool = False) -> Block:
+    """The plain program of a function of arrays, which returns a list of arrays.
+
+    `draws`: whether it may draw random numbers.
+    """
     closed: Any = jax.make_jaxpr(function)(*shapes)
     jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), True)
-    block = Block(None, False)
+    block = Block(None, False, draws)
     avals: Any = [v.aval for v in jaxpr.invars]
     params = [block.param(a.shape, a.dtype) for a in avals]
     block.outs = _inlined(ClosedJaxpr(jaxpr, closed.consts), params, block, "")
@@ -44,7 +49,6 @@ _WHY = {
     "eigh": "there is no routine for eigenvalues",
     "svd": "there is no routine for singular values",
     "schur": "there is no routine for it",
-    "threefry2x32": "it draws random numbers",
     "conv_general_dilated": "there is no routine for convolutions",
 }
 
@@ -55,7 +59,6 @@ class Unsupported(ValueError):
 
 def refuse(name: str, why: str, where: str) -> Unsupported:
     """The error for an operation that has no form in C."""
-    why = "it draws random numbers" if name.startswith("random") else why
     why = _WHY.get(name, why)
     line = f" at {where}" if where else ""
     return Unsupported(f"export.c: {name}{line} cannot be exported: {why}.")
@@ -63,7 +66,16 @@ def refuse(name: str, why: str, where: str) -> Unsupported:
 
 _LIBRARIES = tuple(
     str(Path(str(module.__file__)).parent) + os.sep
-    for module in (jax, equinox, lineax, diffrax, optax, optimistix, contextlib)
+    for module in (
+        jax,
+        equinox,
+        lineax,
+        diffrax,
+        optax,
+        optimistix,
+        contextlib,
+        jaxtyping,
+    )
 ) + (str(Path(__file__).parents[1]) + os.sep,)
 
 
@@ -114,7 +126,7 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     if op in _SAME:
         return ins
     is_known = all(isinstance(a, Const) for a in ins) and not eqn.effects
-    outs = [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    outs = [form(v.aval) for v in eqn.outvars]
     if is_known and op in ("scan", "while"):
         return _computed(eqn, ins, outs)
     if op in _LOOPS:
@@ -134,6 +146,9 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
         return [Const(np.asarray(index, np.int32))]
     if "callback" in op or "debug" in op:
         raise refuse(op, "C cannot call Python", where)
+    kinds = {v.aval.dtype for v in (*eqn.invars, *eqn.outvars)}
+    if keys := [kind for kind in kinds if is_key(kind)]:
+        return _drawn(eqn, ins, keys, is_known, block, where)
     if is_known:
         return _computed(eqn, ins, outs)
     impl = eqn.primitive.impl
@@ -150,6 +165,21 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     return _node(op, ins, outs, dict(params), block, where)
 
 
+def _drawn(eqn: Any, ins: Any, keys: Any, is_known: bool, block: Block, where: str):
+    """The outputs of an equation on keys."""
+    op = eqn.primitive.name
+    for kind in keys:
+        if not is_ours(kind):
+            why = f"random numbers are drawn by threefry2x32 alone, not with a {kind}"
+            raise refuse(op, why, where)
+    function = on_words(eqn)
+    moves = op in ("random_wrap", "random_unwrap") or not op.startswith("random")
+    if function is None or not (moves or is_known or block.draws):
+        raise refuse(op, "it draws random numbers", where)
+    flat = lambda *args: jax.tree.leaves(function(*args))
+    return _inlined(jax.make_jaxpr(flat)(*_shapes(ins)), ins, block, where)
+
+
 def _shapes(ins: list[Atom]) -> list[Any]:
     return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in ins]
 
@@ -160,7 +190,9 @@ def _computed(eqn: Any, ins: list[Any], outs: Any) -> list[Atom]:
     dtypes = [dtype for _, dtype in outs]
     result = folded(eqn.primitive.name, values, eqn.params, dtypes)
     if result is None:
-        result = eqn.primitive.bind(*map(jnp.asarray, values), **eqn.params)
+        pairs = zip(values, eqn.invars, strict=True)
+        values = [as_keys(jnp.asarray(x), v.aval.dtype) for x, v in pairs]
+        result = eqn.primitive.bind(*values, **eqn.params)
         result = result if eqn.primitive.multiple_results else [result]
     return [Const(value) for value in result]
 
@@ -283,7 +315,7 @@ def _scan(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]
     closed = params["jaxpr"]
     consts, carry, xs = ins[:n], ins[n : n + m], ins[n + m :]
     if length == 0:
-        empty = [Const(np.zeros(v.aval.shape, v.aval.dtype)) for v in eqn.outvars[m:]]
+        empty = [Const(np.zeros(*form(v.aval))) for v in eqn.outvars[m:]]
         return [*carry, *empty]
     body = Block(block, True)
     # What each step leaves as it is, is no part of the carry.
@@ -296,7 +328,7 @@ def _scan(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]
     rows: list[Atom] = [body.param(a.shape[1:], a.dtype) for a in xs]
     _inside(closed, [*consts, *given, *rows], body, where)
     body.outs = [out for i, out in enumerate(body.outs) if i >= m or not fixed[i]]
-    shapes = [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    shapes = [form(v.aval) for v in eqn.outvars]
     wanted = [s for i, s in enumerate(shapes) if i >= m or not fixed[i]]
     details = dict(
         length=length, reverse=params["reverse"], carried=len(starts), blocks=[body]
@@ -339,7 +371,7 @@ def _cond(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]
     for closed in branches:
         inside.append(Block(block, False))
         _inside(closed, args, inside[-1], where)
-    wanted = [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
+    wanted = [form(v.aval) for v in eqn.outvars]
     return _node("cond", [which], wanted, dict(blocks=inside), block, where)
 
 

@@ -177,6 +177,14 @@ class Formula(Value):
         return self._at(indices)
 
 
+def broadcast(indices: Indices, shape: Sequence[int]) -> Indices:
+    """The index of an operand, whose axes of one entry are read again and again."""
+    if not shape:
+        return ()
+    pairs = zip(indices, shape, strict=True)
+    return tuple(known(0) if extent == 1 else index for index, extent in pairs)
+
+
 def remapped(
     value: Value, shape: Sequence[int], index: Callable[[Indices], Indices]
 ) -> Value:
