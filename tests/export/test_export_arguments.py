@@ -3,6 +3,7 @@
 import re
 import subprocess
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,28 +31,34 @@ def printed(x):
     return x
 
 
-REFUSED = {
-    "eigh": (lambda x: jnp.linalg.eigvalsh(jnp.outer(x, x)), "eigenvalues"),
-    "svd": (lambda x: jnp.linalg.svd(jnp.outer(x, x))[1], "singular values"),
-    "pure_callback": (callback, "C cannot call Python"),
-    "debug_print": (printed, "C cannot call Python"),
-    "while_loop": (endless, "give max_iterations"),
-    "random_seed": (
+def filtered(x):
+    return eqx.filter_pure_callback(lambda x: x, x, result_shape_dtypes=x)
+
+
+REFUSED = [
+    ("eigh", lambda x: jnp.linalg.eigvalsh(jnp.outer(x, x)), "eigenvalues"),
+    ("svd", lambda x: jnp.linalg.svd(jnp.outer(x, x))[1], "singular values"),
+    ("pure_callback", callback, "C cannot call Python"),
+    ("pure_callback", filtered, "C cannot call Python"),
+    ("debug_print", printed, "C cannot call Python"),
+    ("while_loop", endless, "give max_iterations"),
+    (
+        "random_seed",
         lambda x: jax.random.normal(jax.random.key(x[0].astype(int))),
         "random numbers",
     ),
-    "random_bits": (
+    (
+        "random_bits",
         lambda x: jax.random.normal(x.astype(jnp.uint32)[:2]),
         "random numbers",
     ),
-    "convert_element_type": (lambda x: jnp.fft.fft(x).real, "type complex"),
-    "igamma": (lambda x: jax.scipy.special.gammainc(x, x), "no form of it in C"),
-}
+    ("convert_element_type", lambda x: jnp.fft.fft(x).real, "type complex"),
+    ("igamma", lambda x: jax.scipy.special.gammainc(x, x), "no form of it in C"),
+]
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_refusal_names_the_operation_and_the_line(tmp_path, name):
-    function, why = REFUSED[name]
+@pytest.mark.parametrize(("name", "function", "why"), REFUSED)
+def test_refusal_names_the_operation_and_the_line(tmp_path, name, function, why):
     with pytest.raises(ValueError, match=why) as error:
         export.c(function, tmp_path, name="f", example=(ONES,))
     pattern = rf"export\.c: {name} at test_export_arguments\.py:\d+ cannot be exported"
@@ -146,7 +153,9 @@ def chained(x, k):
 
     y, rows = lax.scan(body, x[0], x)
     inverse = jnp.linalg.inv(x @ x.T + jnp.eye(x.shape[0]))
-    return y, rows, inverse, x[k], jnp.sort(x), (k * 2**30) // 3
+    short = (k * 9999).astype(jnp.int16)
+    wrapped = (k * 2**30) // 3 + (k * 99999) ** 5 + short * short * short + short**3
+    return y, rows, inverse, x[k], jnp.sort(x), wrapped
 
 
 @needs_compiler

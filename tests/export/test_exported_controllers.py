@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from c_programs import compiled, Controller, needs_compiler
+from c_programs import compiled, Controller, exported, needs_compiler
 from contracts.test_controllers import A, B, CASES
 
 import delucax as dlx
@@ -83,6 +83,35 @@ def test_answer_to_bad_numbers(tmp_path, fallback):
         assert u == (good if fallback is None else 0.25)
     for a, b in zip(program.state, before, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def counted(x):
+    """Errors on whole numbers and booleans, one in a loop, of which no NaN is left."""
+    k = eqx.error_if(jnp.array(3), x[0] > 1, "It is too large.")
+    flag = eqx.error_if(x[1] > 0, x[1] > 2, "It is too large.")
+    body = lambda i, n: eqx.error_if(n + i, n + x[2] > 9, "It is too many.")
+    return k, flag, jax.lax.fori_loop(0, 4, body, 1)
+
+
+class Counting(dlx.AbstractController):
+    """An error on a number that its state counts."""
+
+    def init(self, *, key=None):
+        return jnp.array(0)
+
+    def __call__(self, t, y, state):
+        return y[:1], eqx.error_if(state + 1, y[1] > 1, "It is too large.")
+
+
+def test_errors_without_nan_set_the_flag(tmp_path):
+    function = exported(tmp_path, {"counted": (counted, (np.zeros(3),))})["counted"]
+    for x, flag in (([0, 0, 0], 0), ([2, 0, 0], 2), ([0, 3, 0], 2), ([0, 0, 7], 2)):
+        assert function(np.array(x, float))[0] == flag
+    export.c(Counting(), tmp_path, name="counting", example=ONES)
+    program = Controller(tmp_path, "counting", compiled(tmp_path, ["counting"]))
+    flags = [program.step(0.0, [0.0, y])[0] for y in (0, 2, 0)]
+    assert flags == [0, 2, 0]
+    assert program.state[0] == 2
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

@@ -41,7 +41,7 @@ def c(
     do. A step returns 0, or a flag if its input or what it computes is not finite:
     `NAME_BAD_INPUT` or `NAME_BAD_RESULT`. The control is the last good one then (zeros
     before there is one), and the state stays as it was before the step. What raises an
-    error at run time in Python gives NaN in C, and so that flag.
+    error at run time in Python, such as `equinox.error_if`, gives `NAME_BAD_RESULT`.
 
     Of a function there is `NAME(inputs..., outputs...)`, which takes numbers by value
     and arrays by pointers to their entries, the last index running fastest, writes its

@@ -155,6 +155,9 @@ def export_controller(
     names = [a.name for a in state]
     last = _file.free_names(["last_control"], names)[0] if fallback is None else None
     shared, macro, real = Shared(), name.upper(), f"{name}_real"
+    kept = [(a.name, a.dtype, a.shape) for a in state]
+    kept += [(last, str(dtype), (m,))] if last is not None else []
+    size = np.dtype(kept, align=True).itemsize if kept else 1
     description = Description(
         name,
         "controller",
@@ -162,6 +165,7 @@ def export_controller(
         (Array("t", (), str(dtype)), Array("y", (traced.observations,), str(dtype))),
         (Array("u", (m,), str(dtype)),),
         tuple(state),
+        size,
     )
     step = _step(traced, name, state, last, fallback, shared, most)
     applied = _applied(traced, name, state, shared, most)
@@ -186,8 +190,6 @@ def export_controller(
     ]
     comment = _comment(controller, traced, name, fallback)
     text, constants = _file.source(name, [init, step, applied], shared)
-    size = sum(array.nbytes for array in traced.start)
-    size += m * dtype.itemsize if last is not None else 0
     functions = [init[0], step[0], applied[0]]
     return _file.header(description, comment, body), text, functions, constants, size
 

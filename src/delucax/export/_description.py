@@ -25,8 +25,9 @@ class Description(NamedTuple):
     """What a header says of its program.
 
     **Attributes:** `name`; `kind`, `"controller"` or `"function"`; `dtype` of its real
-    numbers; `inputs`, `outputs` and `state`, tuples of arrays; `macro`, with which the
-    names of its macros begin.
+    numbers; `inputs`, `outputs` and `state`, tuples of arrays; `state_bytes`, the size
+    of its struct where each number lies at a multiple of its own size; `macro`, with
+    which the names of its macros begin.
 
     The inputs of a controller are `t` and `y`, and its output is `u`. A function takes
     its inputs, those without an axis by value, then a pointer for each output.
@@ -38,6 +39,7 @@ class Description(NamedTuple):
     inputs: tuple[Array, ...]
     outputs: tuple[Array, ...]
     state: tuple[Array, ...] = ()
+    state_bytes: int = 0
 
     @property
     def macro(self) -> str:

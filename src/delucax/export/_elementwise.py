@@ -132,7 +132,9 @@ def _written(
     words = dict(f="f" if of == np.float32 else "", t="", u="")
     low, high = -math.inf, math.inf
     if of.kind in "iu":
-        words["t"], words["u"] = c_type(of), c_type(f"uint{8 * of.itemsize}")
+        # Shorter ones would be promoted to int, whose products may overflow.
+        bits = max(8 * of.itemsize, 32)
+        words["t"], words["u"] = c_type(of), c_type(f"uint{bits}")
         low, high = _range(template, given, of)
         if low == high:
             return literal(low, out)

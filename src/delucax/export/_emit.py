@@ -60,6 +60,8 @@ class Writer:
         self.scope = self.top = Scope()
         self.buffers: list[Buffer] = []
         self._count = itertools.count()
+        self.failed: Expr | None = None
+        """Whether an error was raised, in a program that can raise one."""
         self._stored: dict[Any, tuple[Scope, Value, View]] = {}
 
     # Statements
@@ -97,6 +99,15 @@ class Writer:
             text = f"{c_type(dtype)} {name} = {bare(start.text)};"
             self.line(text, start.reads, name, start.cost)
         return Expr(name, np.dtype(dtype), frozenset([name]))
+
+    def failure(self) -> Expr:
+        """The variable that says whether an error was raised."""
+        if self.failed is None:
+            name, boolean = self.name("v"), np.dtype(bool)
+            line = Line(f"{c_type(boolean)} {name} = 0;", NOTHING, name)
+            self.top.items.insert(0, line)
+            self.failed = Expr(name, boolean, frozenset([name]), low=0, high=1)
+        return self.failed
 
     def assign(self, variable: Expr, expr: Expr) -> None:
         """Change a variable."""

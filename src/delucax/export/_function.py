@@ -50,8 +50,10 @@ def memory(name: str, shape: Sequence[int], dtype: Any) -> Buffer:
 
 
 def finite_test(program: Program, values: Sequence[Value]) -> Expr:
-    """Whether all numbers are finite."""
+    """Whether all numbers are finite, and no error was raised until now."""
     parts, names = [], frozenset()
+    if program.failed is not None:
+        parts, names = [f"!{program.failed.text}"], program.failed.reads
     for value in values:
         if value.dtype.kind != "f":
             continue
@@ -127,8 +129,8 @@ def export_function(
     values = [argument(program, a.name, a.shape, a.dtype) for a in inputs]
     for var, value in zip(block.params, values, strict=True):
         program.bind(var, value)
-    results = [ready(program, v) for v in program.run(block)]
     good_in = program.define(finite_test(program, values))
+    results = [ready(program, v) for v in program.run(block)]
     good_out = program.define(finite_test(program, results))
     for array, value in zip(outputs, results, strict=True):
         place = View(memory(array.name, array.shape, array.dtype), array.shape)

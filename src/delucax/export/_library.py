@@ -67,10 +67,7 @@ class ControllerCalls:
         self._init = function_of(path, f"{about.name}_init")
         self._step = function_of(path, f"{about.name}_step")
         self._applied = function_of(path, f"{about.name}_applied")
-        # The C keeps the last good control after the members that are described.
-        last = "the last control", self.controls, about.dtype
-        kinds = [(n, d, shape) for n, shape, d, *_ in (*about.state, last)]
-        self.state_bytes = np.dtype(kinds, align=True).itemsize
+        self.state_bytes = about.state_bytes
 
     def init(self) -> np.ndarray:
         """The bytes of a new state."""

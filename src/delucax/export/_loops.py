@@ -1,4 +1,4 @@
-"""Loops and choices."""
+"""Loops, choices and errors."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from ._bounds import Bound
 from ._emit import Group, Scope
-from ._expressions import Expr, known
+from ._expressions import Expr, known, literal
 from ._trace import refuse
-from ._values import remapped, Scalars, Value, View
+from ._values import remapped, Scalars, Table, Value, View
 
 
 def scan(e, node, *ins):
@@ -100,7 +100,8 @@ def while_(e, node, *starts):
     outs = e.run(body)
     e.put_all(places, outs)
     e.scope = outside
-    header = f"for (int {name} = 0; {name} < {bound}; ++{name}) {{"
+    kind = "int" if bound < 2**31 else "int64_t"
+    header = f"for ({kind} {name} = 0; {name} < {bound}; ++{name}) {{"
     outside.items.append(Group([header], [inside], frozenset()))
     outside.cost += bound * inside.cost
     _hand_back(e, places)
@@ -123,4 +124,14 @@ def cond(e, node, which):
     return [p if p is not None else _unread() for p in places]
 
 
-RULES = {"scan": scan, "while": while_, "cond": cond}
+def error(e, node):
+    """The program goes on, and its flag tells of it."""
+    e.assign(e.failure(), literal(True, bool))
+    fill = lambda out: np.nan if out.dtype.kind == "f" else 0
+    return [
+        Table(np.full(out.shape, fill(out), out.dtype), e.shared.table)
+        for out in node.outs
+    ]
+
+
+RULES = {"scan": scan, "while": while_, "cond": cond, "error": error}

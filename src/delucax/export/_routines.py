@@ -73,7 +73,7 @@ static T rounded_S(T x, int bits) {
 }
 
 _INTEGER = {
-    "square": "static T square_S(T x) { return (T)((U)x * (U)x); }",
+    "square": "static T square_S(T x) { return (T)(1u * (U)x * (U)x); }",
     "maximum": "static T maximum_S(T a, T b) { return a > b ? a : b; }",
     "minimum": "static T minimum_S(T a, T b) { return a < b ? a : b; }",
     "sign": "static T sign_S(T x) { return (x > 0) - (x < 0); }",
@@ -320,16 +320,18 @@ def _word(text: str, old: str, new: str) -> str:
 
 def _power(exponent: int, dtype: np.dtype) -> str:
     lines, left, have = [], exponent, False
+    # Unsigned numbers wrap around, as those of XLA do; short ones would become int.
+    wraps = dtype.kind in "iu"
+    kind, one = ("U", "1u * ") if wraps else ("T", "")
     while left:
         if left & 1:
-            lines.append("y *= x;" if have else "y = x;")
+            lines.append(f"y = {one}y * x;" if have else "y = x;")
             have = True
         left >>= 1
         if left:
-            lines.append("x *= x;")
-    del dtype
-    body = " ".join(lines)
-    return f"static T power{exponent}_S(T x) {{ T y; {body} return y; }}"
+            lines.append(f"x = {one}x * x;")
+    body = f"{kind} x = ({kind})base, y; {' '.join(lines)}"
+    return f"static T power{exponent}_S(T base) {{ {body} return (T)y; }}"
 
 
 def _to_integer(dtype: np.dtype, out: np.dtype) -> tuple[str, str]:

@@ -134,7 +134,7 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     if all(0 in shape for shape, _ in outs) and outs:
         return [Const(np.zeros(shape, dtype)) for shape, dtype in outs]
     if op == "pure_callback" and _is_error(params["callback"]):
-        return _failed(eqn)
+        return _failed(outs, block, where)
     inner = next((params[name] for name in _CALLS if name in params), None)
     if inner is not None:
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
@@ -200,15 +200,14 @@ def _computed(eqn: Any, ins: list[Any], outs: Any) -> list[Atom]:
 def _is_error(callback: Any) -> bool:
     """Whether it is the one with which Equinox raises an error."""
     function = getattr(callback, "callback_func", callback)
-    return getattr(function, "__module__", "").startswith("equinox")
+    return getattr(function, "__module__", "") == "equinox._errors"
 
 
-def _failed(eqn: Any) -> list[Atom]:
-    """What stands in place of an error that is raised at run time: NaN. A value that
-    cannot be NaN is zero."""
-    outs = [v.aval for v in eqn.outvars]
-    fill = lambda a: np.nan if jnp.issubdtype(a.dtype, jnp.floating) else 0
-    return [Const(np.full(a.shape, fill(a), a.dtype)) for a in outs]
+def _failed(outs: Any, block: Block, where: str) -> Sequence[Atom]:
+    """What stands in place of an error that is raised at run time: a node that notes
+    it, whose values are NaN, or zero where they cannot be."""
+    kinds = tuple((shape, str(dtype)) for shape, dtype in outs)
+    return _node("error", [], outs, dict(kinds=kinds), block, where)
 
 
 def _node(
