@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from c_programs import COMPILER, exported, needs_compiler, STRICT
+from c_programs import exported, STRICT
+from helpers import needs_compiler
 from jax import lax
 
 import delucax as dlx
 from delucax import export
+from delucax.export._compiler import find_compiler
 
 
 ONES = np.ones(3)
@@ -192,7 +194,8 @@ def test_sanitizers_find_nothing(tmp_path):
     options = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
     files = [str(tmp_path / f"{name}.c") for name in ("main", "chained", "mpc")]
     program = str(tmp_path / "program")
-    subprocess.run([str(COMPILER), *options, "-o", program, *files, "-lm"], check=True)
+    command = [*find_compiler(None, ""), *options, "-o", program, *files, "-lm"]
+    subprocess.run(command, check=True)
     ran = subprocess.run([program], capture_output=True, text=True)
     assert (ran.returncode, ran.stderr) == (0, "")
 
@@ -209,7 +212,8 @@ def test_parts_of_a_pytree_are_arguments(tmp_path):
     ekf = dlx.estimators.ExtendedKalmanFilter(env.dynamics, *noise)
     belief, y = ekf.init(), np.array([0.1, -0.2])
     update = exported(tmp_path, {"update": (ekf.update, (0.0, y, belief))})["update"]
-    names = [a.name for a in update.about.inputs]
+    about = export.load(tmp_path).description
+    names = [a.name for a in about.inputs]
     assert names == ["t", "y", "state_mean", "state_covariance"]
     expected = jax.tree.leaves(ekf.update(0.0, jnp.asarray(y), belief))
     flag, found = update(0.0, y, *jax.tree.leaves(belief))

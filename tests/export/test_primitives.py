@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from c_programs import exported, needs_compiler
+from c_programs import exported
+from helpers import needs_compiler
 from jax import lax
 from jax.scipy import linalg, special
 
