@@ -176,7 +176,7 @@ def test_no_derivative(controller, function, pendulum, key):
         (lambda c, f: f(np.zeros(3)), "got 1 argument"),
         (lambda c, f: jax.jit(f)(jnp.zeros(2), 1), r"shape \(3,\), got"),
         (lambda c, f: f(np.zeros(3), 2**40), "k must fit in int32"),
-        (lambda c, f: c(0.0, np.zeros(3), c.init()), "observation of size 2, got"),
+        (lambda c, f: c(0.0, np.zeros(3), c.init()), "y must have shape \\(2,\\), got"),
         (lambda c, f: c(0.0, np.zeros(2), None), "state must be one that init"),
         (lambda c, f: c.applied(np.zeros(2), 0.0, c.init()), r"u must have .*\(1,\)"),
         (lambda c, f: c.running().step(0.0, np.zeros(3)), r"y must be .*\(2,\)"),

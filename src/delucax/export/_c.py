@@ -10,7 +10,7 @@ from .._check import check_count, check_key
 from .._controller import AbstractController
 from .._files import as_path
 from ..dynamics import AbstractDynamics
-from ..systems import AbstractSystem
+from ..systems import AbstractPlant, AbstractSystem
 from . import _file
 from ._cast import dtype_of
 from ._controller import export_controller, unit_lines
@@ -27,6 +27,7 @@ def c(
     example: Any = None,
     fallback: Any = None,
     key: Any = None,
+    plant: AbstractPlant | None = None,
     max_iterations: int | None = None,
 ) -> Report:
     """Write a controller, a plant or a function as a program in C.
@@ -66,7 +67,10 @@ def c(
     - `key`: a random key, for a controller that draws, such as
         [`delucax.controllers.BPC`][]. The state holds its two words, and C draws the
         numbers that JAX would: those of `init(key=key)`, each time it starts.
-    - `max_iterations`: the most rounds of a loop for which no bound is found.
+    - `plant`: whose names and units the header of a controller tells; by default those
+        of a plant that the controller holds.
+    - `max_iterations`: the most rounds of each loop for which no bound is found. A loop
+        that would go on is left there, and the flag is `NAME_BAD_RESULT`.
 
     **Returns:** a [`delucax.export.Report`][].
 
@@ -93,10 +97,11 @@ def c(
         ```
     """
     where = "export.c"
-    if not isinstance(name, str) or not _file.is_free(name):
+    if not isinstance(name, str) or not _file.is_public(name):
         raise ValueError(
-            f"{where}: name must be an identifier in C that it does not use itself, "
-            f"such as 'controller', got {name!r}."
+            f"{where}: name must be an identifier in C of at most 63 letters, such as "
+            "'controller', that neither C and its headers use, nor the routines in the "
+            f"file, such as 'minimum_f32', got {name!r}."
         )
     folder = Path(as_path(directory, "directory", where))
     if key is not None:
@@ -115,10 +120,21 @@ def c(
     )
     if isinstance(function_or_controller, AbstractController):
         made = export_controller(
-            function_or_controller, name, real, example, fallback, key, max_iterations
+            function_or_controller,
+            name,
+            real,
+            example,
+            fallback,
+            key,
+            plant,
+            max_iterations,
         )
     else:
-        for given, label in ((fallback, "fallback"), (key, "key")):
+        for given, label in (
+            (fallback, "fallback"),
+            (key, "key"),
+            (plant, "plant"),
+        ):
             if given is not None:
                 raise ValueError(
                     f"{where}: {label} is given, but there is no controller."

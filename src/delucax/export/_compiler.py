@@ -73,7 +73,7 @@ def shared_library(
         made = Path(inside) / source.stem
         call = [*command, *flags, "-shared", "-fPIC", "-o", made, source, "-lm"]
         done = subprocess.run(call, capture_output=True, text=True, errors="replace")
-        if done.returncode:
+        if done.returncode or not made.exists():
             words = (done.stderr or done.stdout).strip()[-2000:]
             raise ValueError(
                 f"{where}: {command[0]} could not compile {source.name} with "

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._check import finite_vector
+from .._check import check_instance, finite_vector
 from .._controller import AbstractController, initial_state
 from .._module import parts_of
 from ..systems import AbstractPlant
@@ -32,6 +32,8 @@ from ._values import Scalars, Table, Value, View
 
 
 _MOST_TRIED = 16
+_LEAVE = "return"
+"""As if it were a variable that is needed, for it stands alone in its branch."""
 
 
 class _Traced:
@@ -61,12 +63,16 @@ class _Traced:
                 return eqx.combine(jax.tree.unflatten(structure, every), static)
 
             def flatten(state):
-                flat, after = jax.tree.flatten(eqx.filter(state, eqx.is_array))
+                changing, rest = eqx.partition(state, eqx.is_array)
+                flat, after = jax.tree.flatten(changing)
                 shapes = [jnp.shape(leaf) for leaf in flat]
-                if after != structure or shapes != [s for s, _ in kinds]:
+                alike = after == structure and shapes == [s for s, _ in kinds]
+                if not alike or not eqx.tree_equal(rest, static):
                     raise ValueError(
-                        "export.c: the controller must return a state like that of "
-                        f"init, {structure}, got {after}."
+                        f"export.c: {type(controller).__name__} must return a state "
+                        f"like that of init, {eqx.tree_pformat(start)}, got "
+                        f"{eqx.tree_pformat(state)}. What changes must be a JAX array "
+                        "from the start."
                     )
                 return [
                     jnp.asarray(as_words(leaf), None if is_key(kind) else kind)
@@ -86,6 +92,11 @@ class _Traced:
             y = _observation(step, number, state, dtype, example)
             self.step = trace(step, number, y, *state, draws=True)
             self.observations, self.controls = y.shape[0], self.step.outs[0].shape
+            if len(self.controls) != 1 or not all(self.controls):
+                raise ValueError(
+                    f"export.c: {type(controller).__name__} must return a control of "
+                    f"shape (m,), got shape {self.controls}."
+                )
             u = jax.ShapeDtypeStruct(self.controls, dtype)
             self.applied = trace(applied, u, number, *state, draws=True)
 
@@ -144,11 +155,19 @@ def export_controller(
     example: Any,
     fallback: Any,
     key: Any,
+    plant: Any,
     most: int | None,
 ) -> Any:
     """The header and the source of a controller, and what its report needs."""
     traced = _Traced(controller, dtype, example, key)
     (m,) = traced.controls
+    if plant is not None:
+        check_instance(plant, AbstractPlant, "plant", "export.c")
+        if plant.control_size != m:
+            raise ValueError(
+                f"export.c: plant must have {m} controls, as many as the controller "
+                f"gives, got {plant.control_size}."
+            )
     if fallback is not None:
         fallback = np.asarray(finite_vector(fallback, m, "fallback", "export.c"), dtype)
     state = _members(traced)
@@ -188,7 +207,7 @@ def export_controller(
         "",
         *(f"{f.signature};" for f, _ in (init, step, applied)),
     ]
-    comment = _comment(controller, traced, name, fallback)
+    comment = _comment(controller, plant, traced, name, fallback)
     text, constants = _file.source(name, [init, step, applied], shared)
     functions = [init[0], step[0], applied[0]]
     return _file.header(description, comment, body), text, functions, constants, size
@@ -315,7 +334,7 @@ def _applied(traced, name, state, shared, most):
 
         def leave(k):
             if not k:
-                program.line("return;", frozenset(), None)
+                program.line("return;", frozenset(), _LEAVE)
 
         program.choose(good, 2, leave)
         program.put_all([p for p, *_ in changed], [v for _, v, _ in changed])
@@ -323,7 +342,7 @@ def _applied(traced, name, state, shared, most):
     signature = (
         f"void {name}_applied({name}_state *state, const {real} *u, {real} cost)"
     )
-    roots = {f"state->{a.name}" for a in state}
+    roots = {_LEAVE, *(f"state->{a.name}" for a in state)}
     return _file.Function(signature, program, roots, ""), ["state", "u", "cost"]
 
 
@@ -339,7 +358,7 @@ def _is_same(place: Value, value: Value) -> bool:
     return pair[0][0].text == pair[1][0].text
 
 
-def _comment(controller, traced, name, fallback) -> list[str]:
+def _comment(controller, plant, traced, name, fallback) -> list[str]:
     (m,), p = traced.controls, traced.observations
     answer = "fallback" if fallback is not None else "the last good control, or 0"
     lines = [
@@ -355,7 +374,8 @@ def _comment(controller, traced, name, fallback) -> list[str]:
         "",
         "A step returns 0; or a flag if t or y, or what it computes, is not finite.",
         f"The control is {answer} then, and the state is as before the step.",
-        *_named(controller, m, p),
+        "What applied computes is not kept either if it is not finite.",
+        *_named(controller, plant, m, p),
     ]
     if fallback is not None:
         numbers = ", ".join(literal(x, traced.dtype).text for x in fallback)
@@ -363,13 +383,14 @@ def _comment(controller, traced, name, fallback) -> list[str]:
     return lines
 
 
-def _named(controller: Any, m: int, p: int) -> list[str]:
+def _named(controller: Any, plant: Any, m: int, p: int) -> list[str]:
     """The names of controls and observations, where a plant is known."""
-    plants = parts_of(controller, AbstractPlant)
+    plants = [plant] if plant is not None else parts_of(controller, AbstractPlant)
     if not plants or plants[0].control_size != m:
         return []
     plant = plants[0]
-    lines = ["", *unit_lines("u", plant.control_names, plant.control_units)]
+    lines = ["", f"  t [{plant.time_unit}]"]
+    lines += unit_lines("u", plant.control_names, plant.control_units)
     if plant.state_size == p and plant.observes_state:
         lines += unit_lines("y", plant.state_names, plant.state_units)
     return lines

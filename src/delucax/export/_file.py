@@ -32,15 +32,29 @@ _RESERVED = frozenset(
     isnan j0 j1 jn ldexp lgamma log log10 log1p log2 logb lrint lround modf nan
     nearbyint nextafter pow remainder rint round scalbn signbit signgam sin sinh sqrt
     tan tanh tgamma trunc y0 y1 yn
+    NAN NULL INFINITY HUGE_VAL size_t ptrdiff_t printf malloc free
     """.split()
 )
+_HEADERS = frozenset(["math", "string", "stdint", "stddef", "stdio", "stdlib"])
+_LONGEST = 63
+"""Letters of a name that C99 tells apart."""
 _OWN = re.compile(r"[vbci][0-9]+|work_.*|.*_[fiub][0-9]+|.*_b")
 
 
 def is_free(name: str) -> bool:
     """Whether a name may be one in C."""
     simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
-    return simple and name not in _RESERVED and not _OWN.fullmatch(name)
+    known = name in _RESERVED or name.endswith("f") and name[:-1] in _RESERVED
+    return simple and not known and not _OWN.fullmatch(name)
+
+
+def is_public(name: str) -> bool:
+    """Whether a program may have this name: one that is free among those of C, of its
+    headers, and of the routines in the file."""
+    simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
+    ours = re.fullmatch(r".*_[fiu](8|16|32|64)|work|.*_(MAX|MIN)", name) is not None
+    fits = simple and not ours and len(name) <= _LONGEST
+    return fits and name not in _RESERVED | _HEADERS
 
 
 def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
@@ -107,6 +121,10 @@ def source(name: str, functions: list[tuple[Function, list[str]]], shared: Share
     bodies = [f.text(arguments) for f, arguments in functions]
     lines = [
         f'#include "{name}.h"',
+        "",
+        "#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__",
+        '#error "compile this without -ffast-math, which removes the tests for NaN"',
+        "#endif",
         "",
         "#include <math.h>",
         "#include <string.h>",

@@ -113,10 +113,25 @@ def export_function(
             return [jnp.asarray(leaf) for _, leaf in leaves]
 
         block = trace(flat, *shapes)
+    empty = [
+        path or "the result"
+        for path, a in zip(paths, block.outs, strict=True)
+        if 0 in a.shape
+    ]
+    empty += [
+        f"example[{p[0].idx}]"
+        for (p, _), a in zip(given, shapes, strict=True)
+        if 0 in a.shape
+    ]
+    if empty:
+        raise ValueError(
+            f"export.c: {empty[0]} must have entries; C has no empty arrays."
+        )
     heads = labels or _names_of(function, len(example))
     words = [f"{heads[path[0].idx]}_{_word(path[1:])}" for path, _ in given]
-    names = _file.free_names((word.strip("_") for word in words), [name])
-    outs = _file.free_names([p or "out" for p in paths], [name, *names])
+    own = [name, f"{name}_real"]
+    names = _file.free_names((word.strip("_") for word in words), own)
+    outs = _file.free_names([p or "out" for p in paths], [*own, *names])
     inputs = [
         Array(n, s.shape, str(s.dtype)) for n, s in zip(names, shapes, strict=True)
     ]

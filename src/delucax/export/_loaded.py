@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._controller import AbstractController, Tally, wrong_observation
+from .._controller import AbstractController, Tally
 from .._message import shortened
 from .._typing import Array, PRNGKey, RealScalar
 from ._description import Description
@@ -76,7 +76,10 @@ class LoadedController(AbstractController):
     ) -> tuple[Any, LoadedState]:
         calls, memory = self._calls, self._memory_of(state)
         if jnp.shape(y) != calls.observations:
-            raise wrong_observation(self, calls.observations[0], jnp.asarray(y))
+            raise ValueError(
+                f"{self.description.name}: y must have shape {calls.observations}, got "
+                f"shape {jnp.shape(y)}."
+            )
         if _on_host(t, y, memory):
             u, memory, flag = calls.step(t, y, memory)
             declared = state.declared.add(jnp.array(True)) if flag else state.declared

@@ -77,6 +77,7 @@ def _hand_back(e, places):
 def while_(e, node, *starts):
     cond, body = node.blocks
     bound = Bound(cond, body, node.ins, e.origins).rounds()
+    is_sure = bound is not None
     if bound is None:
         bound = e.most
     if bound is None:
@@ -93,7 +94,16 @@ def while_(e, node, *starts):
         e.bind(var, place)
     (proceeds,) = e.run(cond)
     (test,) = proceeds.entries()
-    e.line(f"if (!{test.text}) break;", test.reads, None, test.cost)
+    if is_sure:
+        e.line(f"if (!{test.text}) break;", test.reads, None, test.cost)
+    else:
+        # Another round than the last that is allowed is a failure of the step.
+        test = e.define(test)
+        over = f"({name} == {bound} && {test.text})"
+        failed = e.failure()
+        reads = failed.reads | test.reads
+        e.assign(failed, Expr(f"{failed.text} || {over}", np.dtype(bool), reads, 2))
+        e.line(f"if ({name} == {bound} || !{test.text}) break;", test.reads, None, 1)
     _adopt(e, places)
     for var, place in zip(body.params, places, strict=True):
         e.bind(var, place)
@@ -101,7 +111,8 @@ def while_(e, node, *starts):
     e.put_all(places, outs)
     e.scope = outside
     kind = "int" if bound < 2**31 else "int64_t"
-    header = f"for ({kind} {name} = 0; {name} < {bound}; ++{name}) {{"
+    last = bound if is_sure else bound + 1
+    header = f"for ({kind} {name} = 0; {name} < {last}; ++{name}) {{"
     outside.items.append(Group([header], [inside], frozenset()))
     outside.cost += bound * inside.cost
     _hand_back(e, places)

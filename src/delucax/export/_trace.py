@@ -18,6 +18,7 @@ import optax
 import optimistix
 from jax.extend.core import (
     ClosedJaxpr,  # pyright: ignore[reportPrivateImportUsage]
+    jaxpr_as_fun,
     Literal,
 )
 from jax.interpreters.partial_eval import dce_jaxpr
@@ -113,7 +114,8 @@ def _array(value: Any) -> Any:
     return value if hasattr(value, "dtype") else np.asarray(value)
 
 
-_SAME = "stop_gradient", "optimization_barrier", "copy", "copy_p", "sharding_constraint"
+_SAME = "device_put", "stop_gradient", "optimization_barrier", "copy", "copy_p"
+_SAME += ("sharding_constraint",)
 _CALLS = "jaxpr", "call_jaxpr", "fun_jaxpr"
 
 
@@ -338,7 +340,12 @@ def _scan(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]
 
 def _while(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
     params = eqn.params
+    if params["cond_jaxpr"].out_avals[0].shape:
+        params = params | _of_batch(params)
     n, m = params["cond_nconsts"], params["body_nconsts"]
+    if params is not eqn.params:
+        ins = [*ins[:n], *ins[:n], *ins[n:]]
+        m += n
     in_cond, in_body, carry = ins[:n], ins[n : n + m], ins[n + m :]
     body, cond = Block(block, True), Block(block, True)
     inner = params["body_jaxpr"].jaxpr
@@ -358,6 +365,27 @@ def _while(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     details = dict(blocks=[cond, body])
     made = iter(_node("while", starts, wanted, details, block, where))
     return [a if same else next(made) for a, same in zip(carry, fixed, strict=True)]
+
+
+def _of_batch(params: Any) -> dict[str, Any]:
+    """One loop for a batch of them: it goes on while one member does, and those that
+    have ended keep their values."""
+    n, m = params["cond_nconsts"], params["body_nconsts"]
+    cond, body = params["cond_jaxpr"], params["body_jaxpr"]
+    tests, turn = jaxpr_as_fun(cond), jaxpr_as_fun(body)
+
+    def proceeds(*args):
+        return [jnp.any(tests(*args)[0])]
+
+    def after(*args):
+        (going,) = tests(*args[:n], *args[n + m :])
+        lanes = lambda a: going.reshape(going.shape + (1,) * (a.ndim - going.ndim))
+        pairs = zip(turn(*args[n:]), args[n + m :], strict=True)
+        return [jnp.where(lanes(old), new, old) for new, old in pairs]
+
+    given = [*cond.in_avals[:n], *body.in_avals]
+    made = jax.make_jaxpr(proceeds)(*cond.in_avals), jax.make_jaxpr(after)(*given)
+    return dict(zip(("cond_jaxpr", "body_jaxpr"), made, strict=True))
 
 
 def _cond(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
