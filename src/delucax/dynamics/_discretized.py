@@ -218,43 +218,40 @@ class Discretized(AbstractDiscretization):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        return self._advance(t, x, u, w)[:2]
+        added, held, increments = self._parts_of(x, w)
+        args = self._args(t, x, u, held)
+        if isinstance(self.system, AbstractHybridSystem):
+            outcome = self._hybrid(x, args, record=False)
+            x_next, result = outcome.x, outcome.result
+        elif self.stepsize_controller is not None:
+            solution, result = self.solve(jnp.zeros((), x.dtype), x, self.dt, args)
+            x_next = solution.ys[0]  # pyright: ignore
+        elif increments is not None or self.substeps > 1:
+            x_next, result = self._repeat(x, args, increments)
+        else:
+            # Few frames lie between this and the field.
+            x_next, result = self.flow(args)(0, x, self.dt)
+        return self._finished(x, x_next, added), result
 
     def advance_with_events(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result, Events | None]:
-        return self._advance(t, x, u, w, record=True)
+        if not isinstance(self.system, AbstractHybridSystem):
+            return *self.advance(t, x, u, w), None
+        added, held, _ = self._parts_of(x, w)
+        outcome = self._hybrid(x, self._args(t, x, u, held), record=True)
+        x_next = self._finished(x, outcome.x, added)
+        return x_next, outcome.result, outcome.events
 
-    def _advance(self, t, x, u, w, record: bool = False):
-        system = self.system
-        added, held, increments = self._parts_of(x, w)
-        args = self._args(t, x, u, held)
-        events = None
-        if isinstance(system, AbstractHybridSystem):
-            outcome = self._hybrid(x, args, record)
-            x_next, result, events = outcome.x, outcome.result, outcome.events
-        elif self.stepsize_controller is not None:
-            solution, result = self.solve(jnp.zeros((), x.dtype), x, self.dt, args)
-            x_next = solution.ys[0]  # pyright: ignore
-        else:
-            h = self.dt / self.substeps
-            if increments is not None:
-                step = self._noisy_step(x, args)
-            else:
-                flow = self.flow(args)
-                step = lambda s, x, _: flow(s, x, h)
-            if self.substeps == 1:
-                first = None if increments is None else increments[0]
-                x_next, result = step(0, x, first)
-            else:
-                x_next, result = self._repeat(step, x, increments)
+    def _finished(self, x, x_next, added):
+        """The next state from that at the end of the interval."""
         # Once per interval, not per substep: the field is also defined off the
         # manifold.
-        x_next = system.project(x_next)
-        check_returned(x_next, x, system, "project")
+        x_next = self.system.project(x_next)
+        check_returned(x_next, x, self.system, "project")
         if added is not None:
             x_next = x_next + added
-        return x_next.astype(x.dtype), result, events
+        return x_next.astype(x.dtype)
 
     def until_event(
         self, t: RealScalar, x: Array, u: Array, w: Array | None, event: int
@@ -345,9 +342,16 @@ class Discretized(AbstractDiscretization):
 
         return step
 
-    def _repeat(self, step, x, increments):
+    def _repeat(self, x, args, increments):
         """`substeps` steps one after the other, the state carried by its components."""
         h = self.dt / self.substeps
+        if increments is not None:
+            step = self._noisy_step(x, args)
+            if self.substeps == 1:
+                return step(0, x, increments[0])
+        else:
+            flow = self.flow(args)
+            step = lambda s, x, _: flow(s, x, h)
 
         @by_components
         def body(parts, index_and_increment):
@@ -368,11 +372,8 @@ class Discretized(AbstractDiscretization):
 
         Its `ys` are those at the end; with `every_step` also those of all steps.
         """
-        solver, controller, adjoint = (
-            self.solver,
-            self.stepsize_controller,
-            self.adjoint,
-        )
+        solver, adjoint = self.solver, self.adjoint
+        controller = self.stepsize_controller
         assert solver is not None and controller is not None and adjoint is not None
         saved: Any = dict(t1=True)
         if every_step:
