@@ -128,6 +128,8 @@ SYSTEMS = {
         lambda: s.BouncingBall(drag=0.1), [0.1, -5.0], [3.0, 5.0], *box(5.0), 0.02
     ),
     "RimlessWheel": Case(s.RimlessWheel, [-0.3, -2.0], [0.45, 2.0], *box(1.0), 0.02),
+    "SimplestWalker": Case(s.SimplestWalker, *box(0.3, 0.3, 0.6, 0.6), *box(0.1), 0.05),
+    "CompassGait": Case(s.CompassGait, *box(0.4, 0.4, 2.0, 2.0), *box(5.0), 0.01),
     "TwoTank": Case(s.TwoTank, [0.0, 0.0], [20.0, 20.0], [0.0], [30.0], 1.0),
     "CSTR": Case(s.CSTR, [0.3, 340.0], [0.7, 360.0], [280.0], [320.0], 0.05),
     "PermanentMagnetMotor": Case(

@@ -27,6 +27,37 @@ def test_the_rimless_wheel_has_its_multiplier():
     assert_close(orbit.state[1], np.sqrt(kept * gained / (1 - kept)), rtol=1e-9)
 
 
+def walk(slope, guess):
+    """The gait of the simplest walker, from its first two states."""
+    dynamics = dlx.Discretized(dlx.systems.SimplestWalker(slope=slope), dt=0.05)
+    angle, rate = guess
+    rest = 2 * angle, (1 - jnp.cos(2 * angle)) * rate
+    return dlx.analysis.periodic_orbit(dynamics, "step", jnp.array([*guess, *rest]))
+
+
+@needs_x64
+def test_the_simplest_walker_is_that_of_its_paper():
+    orbit = walk(0.009, (0.2, -0.2))
+    assert_close(orbit.state[:2], [0.200311, -0.199832], atol=1e-6)
+    pair = -0.19010 + 0.55760j
+    assert_close(jnp.sort(orbit.multipliers)[:2], [pair.conjugate(), pair], atol=1e-5)
+    # Its period doubles where a multiplier passes -1.
+    between = walk(0.012, orbit.state[:2])
+    before = walk(0.0150, between.state[:2])
+    beyond = walk(0.0152, before.state[:2])
+    assert jnp.abs(before.multipliers[0]) < 1 < jnp.abs(beyond.multipliers[0])
+
+
+@needs_x64
+def test_the_compass_gait_is_that_of_its_paper():
+    dynamics = dlx.Discretized(dlx.systems.CompassGait(), dt=0.02)
+    guess = [-0.323, 0.218, -0.378, -1.092]
+    orbit = dlx.analysis.periodic_orbit(dynamics, "step", guess)
+    assert_close(orbit.period, 0.7347, atol=1e-3)
+    assert_close(jnp.abs(orbit.multipliers[:2]), abs(-0.1997 + 0.5445j), atol=1e-3)
+    assert_close(orbit.multipliers[2], 0.1316, atol=1e-3)
+
+
 @needs_x64
 def test_the_time_of_return_has_a_derivative():
     time = jax.jit(lambda x: dlx.analysis.poincare_map(wheel(dt=0.02), "step", x).time)

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         KinematicBicycle as KinematicBicycle,
         Reacher as Reacher,
     )
+    from ._walkers import CompassGait as CompassGait, SimplestWalker as SimplestWalker
 else:
     # The catalogue is imported as it is used.
     __getattr__, __dir__ = _lazily(
@@ -57,6 +58,7 @@ else:
             "_quadrotors": "ConstantWind DissipativeWind PlanarQuadrotor Quadrotor "
             "VortexWind",
             "_robots": "DynamicBicycle KinematicBicycle Reacher",
+            "_walkers": "CompassGait SimplestWalker",
         },
     )
 del TYPE_CHECKING
