@@ -102,7 +102,7 @@ ALL = OURS | {
     for name, case in CASES.items()
 }
 ON_THE_BOARD = (*OURS, "LQI", "LQG", "HInfinity", "PID", "GRU", "Scheduled")
-ON_THE_BOARD += ("FiniteHorizonLQR", "OutputFeedback", "GPC", "SafetyFilter")
+ON_THE_BOARD += ("FiniteHorizonLQR", "OutputFeedback", "GPC", "BPC", "SafetyFilter")
 
 
 def write(

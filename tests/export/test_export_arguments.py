@@ -68,6 +68,7 @@ def test_refusal_names_the_operation_and_the_line(tmp_path, name, function, why)
     assert not any(tmp_path.iterdir())
 
 
+PLANT = dlx.LinearDynamics([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], dt=0.1)
 LAW = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
 
 
@@ -77,6 +78,8 @@ LAW = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
         (dict(name="1st"), "name must be an identifier in C"),
         (dict(name="while"), "name must be an identifier in C"),
         (dict(name="sin"), "name must be an identifier in C"),
+        (dict(name="sinf"), "name must be an identifier in C"),
+        (dict(name="malloc"), "name must be an identifier in C"),
         (dict(name="a b"), "name must be an identifier in C"),
         (dict(name=3), "name must be an identifier in C"),
         (dict(dtype="float16"), "dtype must be 'float32' or 'float64'"),
@@ -97,6 +100,14 @@ LAW = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
         (
             dict(function_or_controller=jnp.sin, example=("a",)),
             r"example\[0\] must be of real numbers",
+        ),
+        (
+            dict(function_or_controller=jnp.sin, example=(jax.random.key(0),)),
+            r"example\[0\] must be an array, a number or",
+        ),
+        (
+            dict(function_or_controller=lambda x: "a", example=(ONES,)),
+            "the function must return arrays and numbers, got 'a'",
         ),
         (
             dict(function_or_controller=jnp.sin, example=(ONES,), fallback=[0.0]),
@@ -139,6 +150,10 @@ def test_report_and_header(tmp_path):
     ((line, rounds),) = report.bounds
     assert line.startswith("test_export_arguments.py:")
     assert rounds == 8
+    cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
+    mpc = dlx.controllers.MPC(PLANT, cost, 3)
+    ours = export.c(mpc, tmp_path, name="mpc").bounds
+    assert ours[0][0].endswith("_descent.py, optimise")
     assert "8 rounds" in repr(report)
     assert report.constants == report.state == 0
     # A round is at least two products and the sum of the test.
@@ -164,8 +179,7 @@ def chained(x, k):
 def test_sanitizers_find_nothing(tmp_path):
     x = np.random.default_rng(0).normal(size=(4, 6))
     cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
-    plant = dlx.LinearDynamics([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], dt=0.1)
-    mpc = dlx.controllers.MPC(plant, cost, 15, bounds=(-1.0, 1.0), real_time=True)
+    mpc = dlx.controllers.MPC(PLANT, cost, 15, bounds=(-1.0, 1.0), real_time=True)
     export.c(chained, tmp_path, name="chained", example=(x, 0), dtype="float64")
     export.c(mpc, tmp_path, name="mpc", dtype="float64")
     numbers = ", ".join(map(repr, x.ravel().tolist()))

@@ -1,5 +1,7 @@
 """Every controller of the catalogue in C: in closed loop as in JAX."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -171,3 +173,66 @@ def test_draws_without_a_key_or_of_another_generator(tmp_path):
         with pytest.raises(ValueError, match=words):
             export.c(given, tmp_path, name="tossing", example=ONES, key=key)
     assert not any(tmp_path.iterdir())
+
+
+class Returning(dlx.AbstractController):
+    """Returns these."""
+
+    control: tuple = (1.0,)
+    start: Any = None
+    after: Any = None
+
+    def init(self, *, key=None):
+        return jax.tree.map(jnp.asarray, self.start)
+
+    def __call__(self, t, y, state):
+        return jnp.array(self.control), jax.tree.map(jnp.asarray, self.after)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (dict(control=1.0), r"a control of shape \(m,\), got shape \(\)"),
+        (dict(control=()), r"a control of shape \(m,\), got shape \(0,\)"),
+        (dict(after=1.0), "a state like that of init"),
+        (dict(start=1, after=1.5), "a state like that of init"),
+        (dict(start=[1.0], after=[[1.0, 2.0]]), "a state like that of init"),
+        (dict(start=np.ones(1), after=np.ones(2)), r"init, f..\[1\], got f..\[2\]"),
+    ],
+)
+def test_wrong_controllers(tmp_path, given, words):
+    with pytest.raises(ValueError, match=words):
+        export.c(Returning(**given), tmp_path, name="law", example=ONES)
+    assert not any(tmp_path.iterdir())
+
+
+class Unusual(dlx.AbstractController):
+    """A state of many kinds, with names that C uses itself."""
+
+    gain: Any = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float16))
+
+    def init(self, *, key=None):
+        names = "y u t state last_control v1 INFINITY NULL sin sinf int32_t unix a_b"
+        rest = {name: jnp.zeros(1) for name in [*names.split(), "a b", "*/", "é"]}
+        parts = [jnp.zeros(2), None, "word", 3, (jnp.array(1, jnp.int16),)]
+        more = {"empty": np.zeros((0, 3)), "flags": jnp.array([True, False])}
+        return {"rest": rest, "parts": parts, "one": 2.0, "call": abs, **more}
+
+    def __call__(self, t, y, state):
+        x, *_, k, (count,) = state["parts"]
+        rest = {name: 0.5 * x + y[:1] for name, x in state["rest"].items()}
+        u = self.gain * x[:1] + k + state["one"] + sum(rest.values()) + count
+        parts = [x + y, None, "word", 3, (count * 3,)]
+        u = jnp.where(state["flags"][0], u, -u)
+        return u, state | {"rest": rest, "parts": parts, "flags": ~state["flags"]}
+
+
+def test_unusual_states(tmp_path):
+    controller, y = Unusual(0.3), np.array([0.2, -0.1])
+    export.c(controller, tmp_path, name="unusual", example=ONES)
+    loaded, state = load(tmp_path, "unusual"), controller.init()
+    mine = loaded.init()
+    for k in range(12):
+        expected, state = controller(0.1 * k, jnp.asarray(y), state)
+        u, mine = loaded(0.1 * k, y, mine)
+        np.testing.assert_allclose(u, expected, rtol=tolerance(1e-5, 1e-12))

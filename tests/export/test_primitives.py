@@ -44,6 +44,7 @@ UNARY = {
     "signs": (jnp.sign, -3, 3),
     "sine": (jnp.sin, -9, 9),
     "sinh": (jnp.sinh, -3, 3),
+    "sinc": (jnp.sinc, -3, 3),
     "root": (jnp.sqrt, 0, 3),
     "tangent": (jnp.tan, -1, 1),
     "tanh": (jnp.tanh, -3, 3),
@@ -229,6 +230,7 @@ ARRAYS = {
         jnp.linalg.qr(x.T),
         jnp.linalg.qr(x, "r"),
     ),
+    "empty": lambda x: (x[:0], jnp.sum(x[:0], 0), jnp.concatenate([x[:0], x])),
     "derivatives": lambda x: (
         jax.grad(lambda x: jnp.sum(jnp.tanh(x @ x.T)))(x),
         jax.jacfwd(lambda x: jnp.sin(x) * x[0])(x[1]),

@@ -87,9 +87,7 @@ def test_what_no_c_can_do_is_refused(tmp_path):
     y = np.zeros(2)
     for given, example, words in (
         (Counts(), y, "What changes must be a JAX array"),
-        (Scalar(), y, r"Scalar must return a control of shape \(m,\), got"),
-        (lambda x: x[:0], (y,), "the result must have entries"),
-        (jnp.sum, (y[:0],), r"example\[0\] must have entries"),
+        (Scalar(), y, r"must return a control of shape \(m,\), got"),
     ):
         with pytest.raises(ValueError, match=words):
             export.c(given, tmp_path, name="none", example=example)

@@ -1,4 +1,4 @@
-"""Plain programs: nodes in blocks, and those that nothing needs left out.
+"""Programs as nodes in blocks, and the elimination of dead code.
 
 Loops and branches have blocks of their own, which may read the values of the blocks
 around them.
@@ -23,7 +23,8 @@ class Const:
 
 
 class Var:
-    """An array that is computed. `weight` counts its readers, one in a loop twice."""
+    """An array that is computed. `weight` counts its uses, one in a loop twice;
+    `remaining` counts those that are still to be written."""
 
     __slots__ = ("depth", "dtype", "remaining", "shape", "weight")
 
@@ -46,7 +47,7 @@ class Node:
 
     @property
     def blocks(self) -> "list[Block]":
-        """Those inside."""
+        """The bodies of a loop, or the branches of a choice."""
         return self.params.get("blocks", [])
 
 
@@ -70,13 +71,14 @@ class Block:
         return var
 
 
-def drop_dead(block: Block) -> None:
-    """Leave out the nodes that nothing needs, and what loops carry to no use."""
+def eliminate_dead_code(block: Block) -> None:
+    """Remove the nodes that no result depends on, and what loops carry to no use."""
     _keep(block, set(), True)
 
 
 def _keep(block: Block, needed: set[Var], drops: bool) -> None:
-    """Add what a block needs for its results; and leave out the rest, if so told."""
+    """Add to `needed` what the results of a block depend on; with `drops`, remove
+    the rest."""
     needed.update(a for a in block.outs if isinstance(a, Var))
     kept = []
     for node in reversed(block.nodes):
@@ -111,8 +113,8 @@ def _carried(node: Node) -> int:
 
 
 def _live(node: Node, needed: set[Var]) -> set[int]:
-    """Which of the values that a loop carries are of use. What its body reads becomes
-    needed."""
+    """The indices of the carried values that are of use. What the body reads is added
+    to `needed`."""
     *tests, body = node.blocks
     count = _carried(node)
     for test in tests:
@@ -137,7 +139,7 @@ def _live(node: Node, needed: set[Var]) -> set[int]:
 
 
 def _narrow(node: Node, live: set[int], needed: set[Var]) -> None:
-    """Leave out what a loop carries, reads or stacks to no use."""
+    """Remove what a loop carries, reads or stacks to no use."""
     body, count = node.blocks[-1], _carried(node)
     ins = [
         k

@@ -11,8 +11,8 @@ import numpy as np
 from ._blocks import Atom, Block, Const, Node, Var
 
 
-class Origins:
-    """Where the values of a program come from."""
+class Definitions:
+    """The node that defines each value of a program."""
 
     def __init__(self, block: Block):
         self.made: dict[Var, Node] = {}
@@ -35,20 +35,20 @@ class Origins:
 
 
 class Bound(NamedTuple):
-    """A loop whose rounds are bounded: its blocks, its first values, and the origins of
-    all that it reads."""
+    """A loop whose rounds are bounded: its blocks, its first values, and the
+    definitions of all that it reads."""
 
     cond: Block
     body: Block
     starts: Any
-    origins: Origins
+    definitions: Definitions
 
     def rounds(self) -> int | None:
         """The most rounds; `None` if they are not counted."""
         return self._while(self.cond, self.cond.outs[0], True)
 
     def _made(self, atom: Atom) -> Node | None:
-        return None if isinstance(atom, Const) else self.origins.made.get(atom)
+        return None if isinstance(atom, Const) else self.definitions.made.get(atom)
 
     def _while(self, block: Block, atom: Any, value: bool) -> int | None:
         """The round from which on a truth value is never this one."""
@@ -115,9 +115,9 @@ class Bound(NamedTuple):
             ends = atom.value.max, atom.value.min
             return float(ends[sign < 0]()) if atom.value.size else None
         node, is_any = self._made(atom), False
-        if atom in self.origins.carried and atom not in seen:
+        if atom in self.definitions.carried and atom not in seen:
             seen = (*seen, atom)
-            parts = self.origins.carried[atom]
+            parts = self.definitions.carried[atom]
         elif node is None or node.op not in _BETWEEN:
             return None
         else:

@@ -27,7 +27,8 @@ from ._function import (
 )
 from ._keys import as_keys, as_words, is_key, is_ours
 from ._program import Program
-from ._trace import trace, Unsupported
+from ._refusal import Unsupported
+from ._trace import trace
 from ._values import Scalars, Table, Value, View
 
 
@@ -65,12 +66,15 @@ class _Traced:
             def flatten(state):
                 changing, rest = eqx.partition(state, eqx.is_array)
                 flat, after = jax.tree.flatten(changing)
-                shapes = [jnp.shape(leaf) for leaf in flat]
-                alike = after == structure and shapes == [s for s, _ in kinds]
+                # The precision may be that of the process, of which C knows none.
+                alike = after == structure and all(
+                    leaf.shape == shape
+                    and (is_key(kind) or leaf.dtype.kind == kind.kind)
+                    for leaf, (shape, kind) in zip(flat, kinds, strict=True)
+                )
                 if not alike or not eqx.tree_equal(rest, static):
-                    raise ValueError(
-                        f"export.c: {type(controller).__name__} must return a state "
-                        f"like that of init, {eqx.tree_pformat(start)}, got "
+                    raise Unsupported(
+                        f"{_UNLIKE}, {eqx.tree_pformat(start)}, got "
                         f"{eqx.tree_pformat(state)}. What changes must be a JAX array "
                         "from the start."
                     )
@@ -82,7 +86,7 @@ class _Traced:
 
             def step(t, y, *flat):
                 u, after = controller(t, y, unflatten(flat))
-                return [jnp.asarray(u, dtype), *flatten(after)]
+                return [_control(u, dtype), *flatten(after)]
 
             def applied(u, cost, *flat):
                 return flatten(controller.applied(u, cost, unflatten(flat)))
@@ -92,20 +96,27 @@ class _Traced:
             y = _observation(step, number, state, dtype, example)
             self.step = trace(step, number, y, *state, draws=True)
             self.observations, self.controls = y.shape[0], self.step.outs[0].shape
-            if len(self.controls) != 1 or not all(self.controls):
-                raise ValueError(
-                    f"export.c: {type(controller).__name__} must return a control of "
-                    f"shape (m,), got shape {self.controls}."
-                )
             u = jax.ShapeDtypeStruct(self.controls, dtype)
             self.applied = trace(applied, u, number, *state, draws=True)
+
+
+_UNLIKE = "export.c: the controller must return a state like that of init"
+
+
+def _control(u: Any, dtype: np.dtype) -> Any:
+    if jnp.ndim(u) != 1 or not jnp.size(u):
+        raise Unsupported(
+            "export.c: the controller must return a control of shape (m,), got shape "
+            f"{jnp.shape(u)}."
+        )
+    return jnp.asarray(u, dtype)
 
 
 def _first_state(controller: AbstractController, dtype: np.dtype, key: Any) -> Any:
     try:
         state = initial_state(controller, key)
     except ValueError as error:
-        if key is not None:
+        if key is not None or "key" not in str(error):
             raise
         raise Unsupported(
             f"export.c: {type(controller).__name__} cannot be exported without key=, "
@@ -226,7 +237,8 @@ def _extent(array: Array) -> str:
 
 def _words(array: Array) -> str:
     shape = "x".join(map(str, array.shape))
-    return f"{array.path or 'state'}, {shape}" if shape else array.path or "state"
+    path = array.path.replace("*/", "* /") or "state"
+    return f"{path}, {shape}" if shape else path
 
 
 def _members(traced: _Traced) -> list[Array]:

@@ -32,29 +32,50 @@ _RESERVED = frozenset(
     isnan j0 j1 jn ldexp lgamma log log10 log1p log2 logb lrint lround modf nan
     nearbyint nextafter pow remainder rint round scalbn signbit signgam sin sinh sqrt
     tan tanh tgamma trunc y0 y1 yn
-    NAN NULL INFINITY HUGE_VAL size_t ptrdiff_t printf malloc free
+    HUGE_VAL HUGE_VALF HUGE_VALL I INFINITY NAN NULL errno linux math_errhandling
+    ptrdiff_t size_t unix
+    """.split()
+)
+_LIBRARY = frozenset(
+    """
+    abort abs alloca atexit atof atoi atol bcmp bcopy bsearch bzero calloc div drem exit
+    exp10 ffs fprintf fputc fputs free getenv index isalnum isalpha isdigit islower
+    isspace isupper labs ldiv malloc memchr memcmp memmove pow10 printf putc putchar
+    puts qsort rand realloc rindex scanf signal significand sincos snprintf sprintf
+    srand sscanf strcat strchr strcmp strcpy strcspn strlen strncat strncmp strncpy
+    strrchr strspn strstr system time tolower toupper
     """.split()
 )
 _HEADERS = frozenset(["math", "string", "stdint", "stddef", "stdio", "stdlib"])
 _LONGEST = 63
 """Letters of a name that C99 tells apart."""
 _OWN = re.compile(r"[vbci][0-9]+|work_.*|.*_[fiub][0-9]+|.*_b")
+_MACROS = re.compile(r"(FP|M|MATH|SIZE|U?INT\w*)_[A-Z0-9_]+")
 
 
 def is_free(name: str) -> bool:
     """Whether a name may be one in C."""
     simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
-    known = name in _RESERVED or name.endswith("f") and name[:-1] in _RESERVED
-    return simple and not known and not _OWN.fullmatch(name)
+    taken = _OWN.fullmatch(name) or _MACROS.fullmatch(name)
+    return simple and not _is_in(name, _RESERVED) and not taken
 
 
 def is_public(name: str) -> bool:
-    """Whether a program may have this name: one that is free among those of C, of its
-    headers, and of the routines in the file."""
+    """Whether a program may have this name, whose functions others link with: one that
+    is free among those of C, its library and headers, and of the routines in the
+    file."""
     simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
-    ours = re.fullmatch(r".*_[fiu](8|16|32|64)|work|.*_(MAX|MIN)", name) is not None
-    fits = simple and not ours and len(name) <= _LONGEST
-    return fits and name not in _RESERVED | _HEADERS
+    ours = re.fullmatch(r".*_[fiu](8|16|32|64)|work", name) is not None
+    fits = simple and not ours and not _MACROS.fullmatch(name)
+    taken = _is_in(name, _RESERVED | _LIBRARY) or name in _HEADERS
+    return fits and not taken and len(name) <= _LONGEST
+
+
+def _is_in(name: str, names: frozenset[str]) -> bool:
+    """Whether a name is taken: of most functions there are those of float and long
+    double."""
+    single = name[:-1] if name[-1:] in ("f", "l") else name
+    return not names.isdisjoint((name, single))
 
 
 def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
@@ -80,7 +101,7 @@ class Function:
 
     def __init__(self, signature: str, program: Program, roots: set[str], exits: str):
         self.signature, self.program, self.exits = signature, program, exits
-        self.needed = _layout.pruned(program.top, roots)
+        self.needed = _layout.eliminate_dead_stores(program.top, roots)
         self.memory, self.bytes = _layout.placed(program.buffers, program.top)
 
     @property

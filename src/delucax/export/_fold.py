@@ -1,4 +1,4 @@
-"""What is known when a program is exported is computed then, by NumPy."""
+"""Constant folding, by NumPy."""
 
 from collections.abc import Callable
 from typing import Any

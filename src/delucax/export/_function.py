@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._message import shortened
 from . import _file
 from ._blocks import Block
 from ._cast import cast, precision
@@ -76,6 +77,8 @@ def finite_test(program: Program, values: Sequence[Value]) -> Expr:
 
 def ready(program: Program, value: Value) -> Value:
     """The array computed: in variables, or in memory."""
+    if not value.size:
+        return Scalars(value.shape, value.dtype, [], frozenset())
     if isinstance(value, Scalars):
         parts = [program.define(p) for p in value.parts]
         return Scalars(value.shape, value.dtype, parts, frozenset())
@@ -110,23 +113,15 @@ def export_function(
             outs = function(*jax.tree.unflatten(structure, args))
             leaves, _ = jax.tree_util.tree_flatten_with_path(outs)
             paths[:] = [_word(path) for path, _ in leaves]
+            for _, leaf in leaves:
+                if not hasattr(leaf, "dtype") and not isinstance(leaf, float | int):
+                    raise ValueError(
+                        "export.c: the function must return arrays and numbers, got "
+                        f"{shortened(leaf)}."
+                    )
             return [jnp.asarray(leaf) for _, leaf in leaves]
 
         block = trace(flat, *shapes)
-    empty = [
-        path or "the result"
-        for path, a in zip(paths, block.outs, strict=True)
-        if 0 in a.shape
-    ]
-    empty += [
-        f"example[{p[0].idx}]"
-        for (p, _), a in zip(given, shapes, strict=True)
-        if 0 in a.shape
-    ]
-    if empty:
-        raise ValueError(
-            f"export.c: {empty[0]} must have entries; C has no empty arrays."
-        )
     heads = labels or _names_of(function, len(example))
     words = [f"{heads[path[0].idx]}_{_word(path[1:])}" for path, _ in given]
     own = [name, f"{name}_real"]
@@ -204,7 +199,7 @@ def _shape(value: Any, dtype: np.dtype, path: Any) -> Any:
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{where} must be an array, a number or a jax.ShapeDtypeStruct, got "
-            f"{value!r}."
+            f"{shortened(value)}."
         ) from error
     if kind.kind == "f":
         kind = dtype

@@ -1,4 +1,4 @@
-"""The text of a function: statements that nothing needs left out, memory shared."""
+"""The text of a function: dead stores are removed, and arrays share memory."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,8 +10,8 @@ from ._expressions import c_type
 from ._values import Buffer
 
 
-def pruned(top: Scope, roots: Iterable[str]) -> frozenset[str]:
-    """Leave out what no root needs; the names that are read or written."""
+def eliminate_dead_stores(top: Scope, roots: Iterable[str]) -> frozenset[str]:
+    """Remove the statements that no root depends on; returns the names that stay."""
     writers: dict[str, list[Any]] = {}
 
     def index(scope, around):
@@ -68,8 +68,8 @@ def pruned(top: Scope, roots: Iterable[str]) -> frozenset[str]:
     return frozenset(needed)
 
 
-def spans(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]:
-    """From when to when each piece of memory is in use."""
+def live_ranges(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]:
+    """The live range of each buffer: the statements of its first and last use."""
     homes = {b.name: b.home for b in buffers}
     first: dict[str, int] = {}
     last: dict[str, int] = {}
@@ -92,7 +92,7 @@ def spans(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]:
             clock += 1
             touched |= inside
             for name in inside:
-                # What is there before a round of a loop and after it, is all along.
+                # What outlives a round of a loop is live during the whole loop.
                 if any(s.repeats and not homes[name].is_within(s) for s in item.scopes):
                     first[name], last[name] = min(first[name], begin), clock
         return touched
@@ -102,9 +102,9 @@ def spans(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]:
 
 
 def placed(buffers: list[Buffer], top: Scope) -> tuple[list[str], int]:
-    """The declarations of memory, and its bytes. What is not in use at the same time
-    shares a place."""
-    used = spans(top, buffers)
+    """The declarations of the buffers, and their bytes. Those whose live ranges do not
+    overlap share memory."""
+    used = live_ranges(top, buffers)
     lines, total = [], 0
     kinds: dict[Any, list[Buffer]] = {}
     for buffer in buffers:

@@ -7,7 +7,7 @@ import numpy as np
 from ._bounds import Bound
 from ._emit import Group, Scope
 from ._expressions import Expr, known, literal
-from ._trace import refuse
+from ._refusal import refuse
 from ._values import remapped, Scalars, Table, Value, View
 
 
@@ -76,7 +76,7 @@ def _hand_back(e, places):
 
 def while_(e, node, *starts):
     cond, body = node.blocks
-    bound = Bound(cond, body, node.ins, e.origins).rounds()
+    bound = Bound(cond, body, node.ins, e.definitions).rounds()
     is_sure = bound is not None
     if bound is None:
         bound = e.most

@@ -1,4 +1,4 @@
-"""A plain program written out: each node by the rule of its operation."""
+"""Writes a block: each node by the rule of its operation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,10 +7,10 @@ import numpy as np
 
 from . import _factors, _indexing, _loops, _reductions, _structural
 from ._blocks import Atom, Block, Const, Node, Var
-from ._bounds import Origins
+from ._bounds import Definitions
 from ._elementwise import operation
 from ._emit import same_memory, Writer
-from ._trace import refuse
+from ._refusal import refuse
 from ._values import broadcast, Table, Value, View
 
 
@@ -28,7 +28,7 @@ class Program(Writer):
 
     def __init__(self, block: Block, unroll: int, shared: Any, most: int | None):
         super().__init__(unroll, shared)
-        self.origins = Origins(block)
+        self.definitions = Definitions(block)
         self.values: dict[Var, Value] = {}
         self.most = most
         self.bounds: list[tuple[str, int]] = []
@@ -38,13 +38,13 @@ class Program(Writer):
         return int(np.prod(array.shape, dtype=int)) <= self.unroll
 
     def read(self, atom: Atom) -> Value:
-        """The array of an atom."""
+        """The value of an atom."""
         if isinstance(atom, Const):
             return Table(atom.value, self.shared.table)
         return self.values[atom]
 
     def bind(self, var: Var, value: Value) -> None:
-        """Name an array."""
+        """Set the value of a variable."""
         value = self.settled(value, var.weight)
         if not var.remaining:
             return
@@ -53,7 +53,7 @@ class Program(Writer):
             buffer.holders += 1
 
     def release(self, atom: Atom) -> None:
-        """One reader less."""
+        """Count one use less."""
         if not isinstance(atom, Var):
             return
         atom.remaining -= 1

@@ -1,21 +1,13 @@
-"""Programs of JAX made plain: calls looked through, constants folded."""
+"""From a jaxpr to blocks of nodes: calls are inlined, constants folded, and what does
+not change in a loop is moved out of it."""
 
-import contextlib
 import functools
-import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-import diffrax
-import equinox
 import jax
 import jax.numpy as jnp
-import jaxtyping
-import lineax
 import numpy as np
-import optax
-import optimistix
 from jax.extend.core import (
     ClosedJaxpr,  # pyright: ignore[reportPrivateImportUsage]
     jaxpr_as_fun,
@@ -23,14 +15,15 @@ from jax.extend.core import (
 )
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from ._blocks import Atom, Block, Const, count_readers, drop_dead, Node, Var
+from ._blocks import Atom, Block, Const, count_readers, eliminate_dead_code, Node, Var
 from ._expressions import is_supported
 from ._fold import folded, is_all
 from ._keys import as_keys, form, is_key, is_ours, on_words
+from ._refusal import line_of, refuse
 
 
 def trace(function: Callable[..., Any], *shapes: Any, draws: bool = False) -> Block:
-    """The plain program of a function of arrays, which returns a list of arrays.
+    """The block of a function of arrays, which returns a list of arrays.
 
     `draws`: whether it may draw random numbers.
     """
@@ -40,54 +33,9 @@ def trace(function: Callable[..., Any], *shapes: Any, draws: bool = False) -> Bl
     avals: Any = [v.aval for v in jaxpr.invars]
     params = [block.param(a.shape, a.dtype) for a in avals]
     block.outs = _inlined(ClosedJaxpr(jaxpr, closed.consts), params, block, "")
-    drop_dead(block)
+    eliminate_dead_code(block)
     count_readers(block)
     return block
-
-
-_WHY = {
-    "eig": "there is no routine for eigenvalues",
-    "eigh": "there is no routine for eigenvalues",
-    "svd": "there is no routine for singular values",
-    "schur": "there is no routine for it",
-    "conv_general_dilated": "there is no routine for convolutions",
-}
-
-
-class Unsupported(ValueError):
-    """What C cannot take."""
-
-
-def refuse(name: str, why: str, where: str) -> Unsupported:
-    """The error for an operation that has no form in C."""
-    why = _WHY.get(name, why)
-    line = f" at {where}" if where else ""
-    return Unsupported(f"export.c: {name}{line} cannot be exported: {why}.")
-
-
-_LIBRARIES = tuple(
-    str(Path(str(module.__file__)).parent) + os.sep
-    for module in (
-        jax,
-        equinox,
-        lineax,
-        diffrax,
-        optax,
-        optimistix,
-        contextlib,
-        jaxtyping,
-    )
-) + (str(Path(__file__).parents[1]) + os.sep,)
-
-
-def _line(eqn: Any) -> str:
-    """The line of the user's code that an equation comes from."""
-    traceback = eqn.source_info.traceback
-    for frame in traceback.frames if traceback else ():
-        file = frame.file_name
-        if not file.startswith(_LIBRARIES) and not file.startswith("<"):
-            return f"{Path(file).name}:{frame.line_num}"
-    return ""
 
 
 def _inlined(closed: Any, args: Sequence[Atom], block: Block, where: str) -> list[Atom]:
@@ -124,7 +72,7 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     op, params = eqn.primitive.name, eqn.params
     if op == "concatenate":
         ins = [a for a in ins if 0 not in a.shape] or ins
-    where = _line(eqn) or where
+    where = line_of(eqn, where)
     if op in _SAME:
         return ins
     is_known = all(isinstance(a, Const) for a in ins) and not eqn.effects
@@ -150,16 +98,16 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
         raise refuse(op, "C cannot call Python", where)
     kinds = {v.aval.dtype for v in (*eqn.invars, *eqn.outvars)}
     if keys := [kind for kind in kinds if is_key(kind)]:
-        return _drawn(eqn, ins, keys, is_known, block, where)
+        return _drawn(eqn, ins, keys, outs if is_known else None, block, where)
     if is_known:
         return _computed(eqn, ins, outs)
-    impl = eqn.primitive.impl
+    impl: Any = _IN_OTHERS.get(op, eqn.primitive.impl)
     if op == "call_hi_primitive":
         impl = eqn.primitive.to_lojax
         closed = jax.make_jaxpr(functools.partial(impl, **params))(*_shapes(ins))
         return _inlined(closed, ins, block, where)
     if not getattr(impl, "__module__", "functools").startswith(("jax", "functools")):
-        # One of another library, which it says in terms of others.
+        # It is said in terms of other operations, here or by another library.
         impl = functools.partial(impl, **params)
         flat = lambda *args: jax.tree.leaves(impl(*args))
         closed = jax.make_jaxpr(flat)(*_shapes(ins))
@@ -167,8 +115,8 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     return _node(op, ins, outs, dict(params), block, where)
 
 
-def _drawn(eqn: Any, ins: Any, keys: Any, is_known: bool, block: Block, where: str):
-    """The outputs of an equation on keys."""
+def _drawn(eqn: Any, ins: Any, keys: Any, known: Any, block: Block, where: str):
+    """The outputs of an equation on keys, which are like `known` if its inputs are."""
     op = eqn.primitive.name
     for kind in keys:
         if not is_ours(kind):
@@ -176,10 +124,24 @@ def _drawn(eqn: Any, ins: Any, keys: Any, is_known: bool, block: Block, where: s
             raise refuse(op, why, where)
     function = on_words(eqn)
     moves = op in ("random_wrap", "random_unwrap") or not op.startswith("random")
-    if function is None or not (moves or is_known or block.draws):
+    if function is None and known:
+        return _computed(eqn, ins, known)
+    if not (moves or known or block.draws):
         raise refuse(op, "it draws random numbers", where)
+    if function is None:
+        raise refuse(op, "there is no form of it in C", where)
     flat = lambda *args: jax.tree.leaves(function(*args))
     return _inlined(jax.make_jaxpr(flat)(*_shapes(ins)), ins, block, where)
+
+
+def _polynomial(x: Any, *coefficients: Any, **_: Any) -> Any:
+    total = coefficients[-1]
+    for number in coefficients[-2::-1]:
+        total = total * x + number
+    return jnp.broadcast_to(total, jnp.broadcast_shapes(x.shape, jnp.shape(total)))
+
+
+_IN_OTHERS = {"polynomial": _polynomial}
 
 
 def _shapes(ins: list[Atom]) -> list[Any]:
