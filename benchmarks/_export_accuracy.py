@@ -19,6 +19,7 @@ import numpy as np
 
 import delucax as dlx
 from benchmarks._exports import ALL, Exported, KEY, table, write
+from delucax.export._keys import as_words
 
 
 LIMITS = {"float64": 1e-12, "float32": 1e-5}
@@ -71,17 +72,11 @@ def recorded(controller: Any, case: Exported, sequences: int, steps: int) -> Any
         t, y, u, cost = row
         control, after = controller(t, y, eqx.combine(arrays, static))
         after = controller.applied(u, cost, after)
-        return eqx.filter(after, eqx.is_array), (words(arrays), control)
+        return eqx.filter(after, eqx.is_array), (
+            jax.tree.map(as_words, arrays),
+            control,
+        )
 
-    # Keys are two words in C.
-    words = lambda tree: jax.tree.map(
-        lambda x: (
-            jax.random.key_data(x)
-            if jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-            else x
-        ),
-        tree,
-    )
     run = jax.jit(jax.vmap(lambda rows: jax.lax.scan(step, start, rows)[1]))
     return inputs, *jax.device_get(run(inputs))
 

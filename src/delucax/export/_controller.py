@@ -17,10 +17,11 @@ from ._blocks import Block
 from ._cast import cast, precision
 from ._description import Array, Description
 from ._emit import Shared
-from ._expressions import c_type, Expr, is_supported, literal
+from ._expressions import Expr, is_supported, literal
 from ._function import (
     argument,
     finite_test,
+    kind_in_c,
     memory,
     new_program,
     ready,
@@ -201,7 +202,7 @@ def export_controller(
     applied = _applied(traced, name, state, shared, most)
     init = _init(traced, name, state, last, m, shared)
     members = [
-        f"{_kind(a, real)} {a.name}{_extent(a)}; /* {_words(a)} */" for a in state
+        f"{kind_in_c(a, real)} {a.name}{_extent(a)}; /* {_words(a)} */" for a in state
     ]
     if last is not None:
         members.append(f"{real} {last}[{m}]; /* the last good control */")
@@ -222,12 +223,6 @@ def export_controller(
     text, constants = _file.source(name, [init, step, applied], shared)
     functions = [init[0], step[0], applied[0]]
     return _file.header(description, comment, body), text, functions, constants, size
-
-
-def _kind(array: Array, real: str) -> str:
-    if array.dtype.startswith("float"):
-        return real
-    return c_type(array.dtype, stored=True)
 
 
 def _extent(array: Array) -> str:
@@ -307,14 +302,9 @@ def _step(traced, name, state, last, fallback, shared, most):
         program.bind(var, value)
     u, *after = program.run(traced.step)
     u = ready(program, u)
-    changed = [
-        (place, ready(program, value), first)
-        for place, value, first in zip(places, after, traced.start, strict=True)
-        if not _is_same(place, value)
-    ]
-    tested = [v for _, v, first in changed if np.all(np.isfinite(first))]
+    changed, values, tested = _changed(program, traced, places, after)
     leave_unless(finite_test(program, [u, *tested]), "BAD_RESULT")
-    program.put_all([p for p, *_ in changed], [v for _, v, _ in changed])
+    program.put_all(changed, values)
     program.fill(answer, u)
     if last is not None:
         program.fill(kept, u)
@@ -335,13 +325,8 @@ def _applied(traced, name, state, shared, most):
     for var, value in zip(traced.applied.params, [u, cost, *places], strict=True):
         program.bind(var, value)
     after = program.run(traced.applied)
-    changed = [
-        (place, ready(program, value), first)
-        for place, value, first in zip(places, after, traced.start, strict=True)
-        if not _is_same(place, value)
-    ]
+    changed, values, tested = _changed(program, traced, places, after)
     if changed:
-        tested = [v for _, v, first in changed if np.all(np.isfinite(first))]
         good = finite_test(program, tested)
 
         def leave(k):
@@ -349,13 +334,26 @@ def _applied(traced, name, state, shared, most):
                 program.line("return;", frozenset(), _LEAVE)
 
         program.choose(good, 2, leave)
-        program.put_all([p for p, *_ in changed], [v for _, v, _ in changed])
+        program.put_all(changed, values)
     real = f"{name}_real"
     signature = (
         f"void {name}_applied({name}_state *state, const {real} *u, {real} cost)"
     )
     roots = {_LEAVE, *(f"state->{a.name}" for a in state)}
     return _file.Function(signature, program, roots, ""), ["state", "u", "cost"]
+
+
+def _changed(program: Program, traced: _Traced, places: Any, after: Any) -> Any:
+    """The members of the state that change, their new values, and those of these that
+    must be finite, as they are at first."""
+    parts = [
+        (place, ready(program, value), bool(np.all(np.isfinite(first))))
+        for place, value, first in zip(places, after, traced.start, strict=True)
+        if not _is_same(place, value)
+    ]
+    values = [value for _, value, _ in parts]
+    tested = [value for _, value, is_finite in parts if is_finite]
+    return [place for place, *_ in parts], values, tested
 
 
 def _is_same(place: Value, value: Value) -> bool:

@@ -85,9 +85,14 @@ def ready(program: Program, value: Value) -> Value:
     return program.stored(value)
 
 
+def kind_in_c(array: Array, real: str) -> str:
+    """The type of the entries in the header."""
+    return real if array.dtype.startswith("float") else c_type(array.dtype, stored=True)
+
+
 def parameter(name: str, array: Array, real: str, is_output: bool = False) -> str:
     """An argument in a signature."""
-    kind = real if array.dtype.startswith("float") else c_type(array.dtype, stored=True)
+    kind = kind_in_c(array, real)
     if is_output:
         return f"{kind} *{name}"
     return f"const {kind} *{name}" if array.shape else f"{kind} {name}"
