@@ -3,18 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .._check import check_instance, finite_vector
-from .._controller import AbstractController, initial_state
 from .._module import parts_of
 from ..systems import AbstractPlant
 from . import _file
 from ._blocks import Block
-from ._cast import cast, precision
 from ._description import Array, Description
 from ._emit import Shared
 from ._expressions import Expr, is_supported, literal
@@ -26,138 +21,14 @@ from ._function import (
     new_program,
     ready,
 )
-from ._keys import as_keys, as_words, is_key, is_ours
 from ._program import Program
 from ._refusal import Unsupported
-from ._trace import trace
+from ._traced import TracedController
 from ._values import Scalars, Table, Value, View
 
 
-_MOST_TRIED = 16
 _LEAVE = "return"
 """As if it were a variable that is needed, for it stands alone in its branch."""
-
-
-class _Traced:
-    """A controller as programs of arrays."""
-
-    def __init__(self, controller: Any, dtype: np.dtype, example: Any, key: Any):
-        self.dtype = dtype
-        with precision(dtype):
-            controller = cast(controller, dtype)
-            start = _first_state(controller, dtype, key)
-            arrays, static = eqx.partition(start, eqx.is_array)
-            leaves, structure = jax.tree_util.tree_flatten_with_path(arrays)
-            # C has no arrays without entries.
-            kept = [bool(leaf.size) for _, leaf in leaves]
-            full = [pair for pair in leaves if pair[1].size]
-            self.start = [np.asarray(as_words(leaf)) for _, leaf in full]
-            self.paths = [jax.tree_util.keystr(path) for path, _ in full]
-            kinds = [(leaf.shape, leaf.dtype) for _, leaf in leaves]
-
-            def unflatten(flat):
-                rest = iter(flat)
-                pairs = zip(leaves, kept, strict=True)
-                every = [
-                    as_keys(next(rest), leaf.dtype) if used else leaf
-                    for (_, leaf), used in pairs
-                ]
-                return eqx.combine(jax.tree.unflatten(structure, every), static)
-
-            def flatten(state):
-                changing, rest = eqx.partition(state, eqx.is_array)
-                flat, after = jax.tree.flatten(changing)
-                # The precision may be that of the process, of which C knows none.
-                alike = after == structure and all(
-                    leaf.shape == shape
-                    and (is_key(kind) or leaf.dtype.kind == kind.kind)
-                    for leaf, (shape, kind) in zip(flat, kinds, strict=True)
-                )
-                if not alike or not eqx.tree_equal(rest, static):
-                    raise Unsupported(
-                        f"{_UNLIKE}, {eqx.tree_pformat(start)}, got "
-                        f"{eqx.tree_pformat(state)}. What changes must be a JAX array "
-                        "from the start."
-                    )
-                return [
-                    jnp.asarray(as_words(leaf), None if is_key(kind) else kind)
-                    for leaf, (_, kind), used in zip(flat, kinds, kept, strict=True)
-                    if used
-                ]
-
-            def step(t, y, *flat):
-                u, after = controller(t, y, unflatten(flat))
-                return [_control(u, dtype), *flatten(after)]
-
-            def applied(u, cost, *flat):
-                return flatten(controller.applied(u, cost, unflatten(flat)))
-
-            number = jax.ShapeDtypeStruct((), dtype)
-            state = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self.start]
-            y = _observation(step, number, state, dtype, example)
-            self.step = trace(step, number, y, *state, draws=True)
-            self.observations, self.controls = y.shape[0], self.step.outs[0].shape
-            u = jax.ShapeDtypeStruct(self.controls, dtype)
-            self.applied = trace(applied, u, number, *state, draws=True)
-
-
-_UNLIKE = "export.c: the controller must return a state like that of init"
-
-
-def _control(u: Any, dtype: np.dtype) -> Any:
-    if jnp.ndim(u) != 1 or not jnp.size(u):
-        raise Unsupported(
-            "export.c: the controller must return a control of shape (m,), got shape "
-            f"{jnp.shape(u)}."
-        )
-    return jnp.asarray(u, dtype)
-
-
-def _first_state(controller: AbstractController, dtype: np.dtype, key: Any) -> Any:
-    try:
-        state = initial_state(controller, key)
-    except ValueError as error:
-        if key is not None or "key" not in str(error):
-            raise
-        raise Unsupported(
-            f"export.c: {type(controller).__name__} cannot be exported without key=, "
-            f"such as jax.random.key(0), that its draws begin with ({error})"
-        ) from error
-    for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array)):
-        if is_key(leaf.dtype) and not is_ours(leaf.dtype):
-            raise Unsupported(
-                f"export.c: {type(controller).__name__} cannot be exported: it draws "
-                f"with a {leaf.dtype}, and C has threefry2x32 alone."
-            )
-    return cast(state, dtype)
-
-
-def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: Any):
-    """The shape of the observation: that of the example, or the one size that fits."""
-    if example is not None:
-        y = np.asarray(example) if not hasattr(example, "shape") else example
-        if len(y.shape) != 1:
-            raise ValueError(
-                "export.c: example must be an observation, a vector, for a "
-                f"controller, got shape {tuple(y.shape)}."
-            )
-        return jax.ShapeDtypeStruct(tuple(y.shape), dtype)
-    fitting = []
-    for size in range(1, _MOST_TRIED + 1):
-        y = jax.ShapeDtypeStruct((size,), dtype)
-        try:
-            jax.eval_shape(step, number, y, *state)
-        except Exception:  # noqa: BLE001 - whatever the controller raises for it
-            continue
-        fitting.append(y)
-        if len(fitting) > 1:
-            break
-    if len(fitting) == 1:
-        return fitting[0]
-    raise ValueError(
-        "export.c: example must be an observation (zeros of its shape are enough), "
-        "as the controller does not tell its size."
-    )
 
 
 def export_controller(
@@ -171,7 +42,7 @@ def export_controller(
     most: int | None,
 ) -> Any:
     """The header and the source of a controller, and what its report needs."""
-    traced = _Traced(controller, dtype, example, key)
+    traced = TracedController(controller, dtype, example, key)
     (m,) = traced.controls
     if plant is not None:
         check_instance(plant, AbstractPlant, "plant", "export.c")
@@ -236,7 +107,7 @@ def _words(array: Array) -> str:
     return f"{path}, {shape}" if shape else path
 
 
-def _members(traced: _Traced) -> list[Array]:
+def _members(traced: TracedController) -> list[Array]:
     for array, path in zip(traced.start, traced.paths, strict=True):
         if not is_supported(array.dtype):
             raise Unsupported(
@@ -343,7 +214,9 @@ def _applied(traced, name, state, shared, most):
     return _file.Function(signature, program, roots, ""), ["state", "u", "cost"]
 
 
-def _changed(program: Program, traced: _Traced, places: Any, after: Any) -> Any:
+def _changed(
+    program: Program, traced: TracedController, places: Any, after: Any
+) -> Any:
     """The members of the state that change, their new values, and those of these that
     must be finite, as they are at first."""
     parts = [
