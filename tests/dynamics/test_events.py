@@ -336,6 +336,20 @@ def test_wrappers_report_events():
 
 
 @once
+def test_events_of_an_interval_whose_control_switches():
+    """Two bounces, before and after the switch, are those of the whole interval."""
+    dynamics = dlx.Discretized(s.BouncingBall(), dt=0.6)
+    late = dlx.dynamics.TransportDelay(dynamics, controls=0.2)
+    x = jnp.array([0.05, -1.0])
+    x_next, _, expected = dynamics.advance_with_events(0.0, x, NONE, None)
+    after, _, events = late.advance_with_events(0.0, late.filled(x), NONE, None)
+    assert_close(after[:2], x_next, atol=1e-5)
+    assert_close(events.kinds, expected.kinds)
+    assert np.sum(events.kinds == 0) >= 2
+    assert_close(events.times, expected.times, atol=1e-5)
+
+
+@once
 def test_bad_input():
     with pytest.raises(ValueError, match="max_events needs a system with events"):
         dlx.Discretized(s.Pendulum(), dt=0.1, max_events=3)
