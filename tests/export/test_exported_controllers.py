@@ -236,3 +236,15 @@ def test_unusual_states(tmp_path):
         expected, state = controller(0.1 * k, jnp.asarray(y), state)
         u, mine = loaded(0.1 * k, y, mine)
         np.testing.assert_allclose(u, expected, rtol=tolerance(1e-5, 1e-12))
+
+
+@needs_compiler
+def test_a_plant_with_events(tmp_path):
+    dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=0.1)
+    export.c(dynamics, tmp_path, name="ball")
+    step, x = export.load(tmp_path), np.array([1.0, 0.0], jnp.zeros(()).dtype)
+    states = [x]
+    for _ in range(20):
+        states.append(step(0.0, states[-1], np.zeros(1)))
+    expected = dlx.open_loop(dynamics, x, jnp.zeros((20, 1)))
+    np.testing.assert_allclose(states, expected, atol=tolerance(1e-5, 1e-12))
