@@ -21,7 +21,7 @@ class Crossings(NamedTuple):
     - `guess`: where the cubic through its values and rates at both ends is zero.
     - `at_once`: whether it starts at zero, and crosses there.
     - `beyond`: whether it starts beyond zero.
-    - `seen`: whether the end of the step shows that it crosses; else only the cubic
+    - `past_end`: whether the end of the step shows that it crosses; else only the cubic
         does, which dips below zero and comes back.
     - `slope`: its change over the step, if the rate at the start were constant.
     - `size`: of its change along the step.
@@ -34,7 +34,7 @@ class Crossings(NamedTuple):
     guess: Array
     at_once: Array
     beyond: Array
-    seen: Array
+    past_end: Array
     slope: Array
     size: Array
 
@@ -145,14 +145,14 @@ def crossings(
         guess=jnp.where(at_once, near, guess),
         at_once=at_once & has_length,
         beyond=beyond & ~either & enabled[0],
-        seen=ends_beyond & ~dips,
+        past_end=ends_beyond & ~dips,
         slope=r0,
         size=jnp.abs(a) + jnp.abs(g1) + jnp.abs(r0) + jnp.abs(r1),
     )
 
 
 def locate(
-    guards: Callable[[Array], tuple[Array, Array]], found: Crossings, active: Array
+    guards: Callable[[Array], tuple[Array, Array]], crossing: Crossings, active: Array
 ) -> tuple[Array, Array, Array, Array]:
     """The first crossing of a step: Newton's method on the step itself, in a bracket.
 
@@ -160,33 +160,35 @@ def locate(
 
     - `guards`: from a share of the step to the guards there, and their changes over the
         step at the rates there.
-    - `found`: the crossings that are expected.
+    - `crossing`: the crossings that are expected.
     - `active`: whether there is one; else nothing is computed.
 
     **Returns:** `(share, event, crossed, grazes)`: where it is, which event's it is,
     whether there is one (a cubic may dip below zero where the step does not; the share
     is then 1), and whether it hardly crosses.
     """
-    eps = jnp.finfo(found.guess.dtype).eps
+    eps = jnp.finfo(crossing.guess.dtype).eps
     # The first in the order of their names, of those that cross at the same time.
-    start, event = least(jnp.where(found.expected, found.guess, 2.0))
+    start, event = least(jnp.where(crossing.expected, crossing.guess, 2.0))
     # What was expected elsewhere may, rounded otherwise, not be so here.
-    active = active & any_of(found.expected)
-    at_once = active & any_of(found.at_once)
-    seen = any_of(found.expected & found.seen)
-    high = jnp.where(seen, 1.0, 2.0).astype(start.dtype)
+    active = active & any_of(crossing.expected)
+    at_once = active & any_of(crossing.at_once)
+    past_end = any_of(crossing.expected & crossing.past_end)
+    high = jnp.where(past_end, 1.0, 2.0).astype(start.dtype)
 
     @by_components
     def look(state):
         _, left, right, share, _, _, crossed, count = state
-        g, rate = (found.sign * a for a in guards(share))
-        falling = found.expected & (share >= found.low)
+        g, rate = (crossing.sign * a for a in guards(share))
+        falling = crossing.expected & (share >= crossing.low)
         below = any_of(falling & (g < 0))
         left, right = jnp.where(below, left, share), jnp.where(below, share, right)
         newton = share - g / jnp.where(rate < 0, rate, -1)
         newton = jnp.where(falling & (rate < 0), newton, 2.0)
         # Those that do not yet fall here can cross only behind this point.
-        after, event = least(jnp.where(found.expected & ~falling, found.guess, newton))
+        after, event = least(
+            jnp.where(crossing.expected & ~falling, crossing.guess, newton)
+        )
         apart = jnp.abs(after - share)
         # Newton's next error is about the square of its step.
         near = apart < 0.3 * eps**0.5
@@ -198,11 +200,11 @@ def locate(
         more = ~done & (count < 60)
         return more, left, right, after, event, slope, crossed, count + 1
 
-    left, slope = jnp.zeros_like(start), pick(found.slope, event)
-    state = (active & ~at_once, left, high, start, event, slope, seen, 0)
+    left, slope = jnp.zeros_like(start), pick(crossing.slope, event)
+    state = (active & ~at_once, left, high, start, event, slope, past_end, 0)
     state = lax.while_loop(lambda state: state[0], look, state)
     _, _, _, share, event, slope, crossed, _ = state
     crossed = active & (crossed | at_once)
     # It grazes where its slope is nothing beside what it changes along the step.
-    grazes = crossed & (-slope < eps**0.5 * pick(found.size, event))
+    grazes = crossed & (-slope < eps**0.5 * pick(crossing.size, event))
     return jnp.where(crossed, jnp.minimum(share, 1), 1), event, crossed, grazes

@@ -21,7 +21,7 @@ def quickly_compiled(function: _F) -> _F:
     inside another `jax.jit`.
 
     A program of some hundred kernels then compiles in about three quarters of the time
-    and runs a tenth slower. A level in `XLA_FLAGS` is kept.
+    and runs up to a tenth slower. A level in `XLA_FLAGS` is kept.
     """
     whole = eqx.filter_jit(function)
     # The overloads of `filter_jit` leave out the options of `jax.jit`, which it takes.

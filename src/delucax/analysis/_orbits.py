@@ -33,8 +33,8 @@ class Return(eqx.Module):
         import delucax as dlx
 
         dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=0.1)
-        found = dlx.analysis.poincare_map(dynamics, "bounce", [0.0, 3.0])
-        found.state, found.time
+        after = dlx.analysis.poincare_map(dynamics, "bounce", [0.0, 3.0])
+        after.state, after.time
         ```
     """
 
@@ -121,8 +121,8 @@ def poincare_map(
     x, u, index = _arguments(dynamics, event, x, u, where)
     max_steps = check_count(max_steps, "max_steps", where)
     check_bool(throw, "throw", where)
-    found = _return(dynamics, index, x, u, as_float_array(t0), max_steps)
-    return raise_on_failure(found, where, throw, "the state that was reached")
+    after = _return(dynamics, index, x, u, as_float_array(t0), max_steps)
+    return raise_on_failure(after, where, throw, "the state that was reached")
 
 
 def _arguments(dynamics, event, x, u, where):

@@ -176,9 +176,9 @@ class HybridFlow(eqx.Module):
         """What one step to `end` meets."""
         h = end - s
         x_end, result = self.step(s, x, h)
-        found = frozen(self).crossings(*frozen((s, x, h, x_end)))
-        seen = found.expected, found.beyond
-        return Ahead(s, x, None, x_end, *seen, or_none(result))
+        crossing = frozen(self).crossings(*frozen((s, x, h, x_end)))
+        flags = crossing.expected, crossing.beyond
+        return Ahead(s, x, None, x_end, *flags, or_none(result))
 
 
 def ahead_of_steps(plant: HybridFlow, s: Array, x: Array, end: Array) -> Ahead:
@@ -194,9 +194,9 @@ def ahead_of_steps(plant: HybridFlow, s: Array, x: Array, end: Array) -> Ahead:
 
     def look(state):
         i, _, beyond = state
-        found = crossings(i + 1)
+        crossing = crossings(i + 1)
         # A start beyond a guard is that of the first step.
-        return i + 1, found.expected, jnp.where(i < 0, found.beyond, beyond)
+        return i + 1, crossing.expected, jnp.where(i < 0, crossing.beyond, beyond)
 
     none = jnp.zeros(len(plant.args[0].event_names), bool)
     more = lambda state: ~any_of(state[1]) & (state[0] + 1 < count)
@@ -293,13 +293,13 @@ class Intervals(eqx.Module):
         plant, (s, x, step, x_end, *_) = self.plant, run.ahead
         h, x_step = (end - s, x_end) if step is None else step
         still, (fs, fx, fh, fx_step) = frozen((plant, (s, x, h, x_step)))
-        found = still.crossings(fs, fx, fh, fx_step)
+        crossing = still.crossings(fs, fx, fh, fx_step)
 
         def guards_at(share):
             g, rate = still.look(fs + share * fh, still.step(fs, fx, share * fh)[0])
             return g, rate * fh
 
-        share, event, crossed, grazes = locate(guards_at, found, run.expected)
+        share, event, crossed, grazes = locate(guards_at, crossing, run.expected)
         x_there, _ = still.step(fs, fx, share * fh)
         fires = crossed & pick(still.enabled(fs + share * fh, x_there), event)
         grazes = fires & grazes

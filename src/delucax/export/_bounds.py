@@ -63,10 +63,10 @@ class Bound(NamedTuple):
         if node.op == "not":
             return self._while(block, node.ins[0], not value)
         if node.op in ("and", "or", "convert_element_type"):
-            found = [self._while(block, a, value) for a in node.ins]
-            known = [n for n in found if n is not None]
+            limits = [self._while(block, a, value) for a in node.ins]
+            known = [n for n in limits if n is not None]
             if node.op == ("or" if value else "and"):
-                return max(known) if len(known) == len(found) else None
+                return max(known) if len(known) == len(limits) else None
             return min(known, default=None)
         return self._counted(node, value, block is self.body)
 
@@ -109,23 +109,25 @@ class Bound(NamedTuple):
                 return group.index(atom)
         return None
 
-    def _limit(self, atom: Atom, sign: int, seen: tuple[Var, ...] = ()) -> float | None:
+    def _limit(
+        self, atom: Atom, sign: int, visited: tuple[Var, ...] = ()
+    ) -> float | None:
         """The largest that a number can be; the smallest if the sign is -1."""
         if isinstance(atom, Const):
             ends = atom.value.max, atom.value.min
             return float(ends[sign < 0]()) if atom.value.size else None
         node, is_any = self._made(atom), False
-        if atom in self.definitions.carried and atom not in seen:
-            seen = (*seen, atom)
+        if atom in self.definitions.carried and atom not in visited:
+            visited = (*visited, atom)
             parts = self.definitions.carried[atom]
         elif node is None or node.op not in _BETWEEN:
             return None
         else:
             parts = node.ins[1:] if node.op == "select_n" else node.ins
             is_any = node.op == ("min" if sign > 0 else "max")
-        found = [self._limit(a, sign, seen) for a in parts]
-        known = [sign * n for n in found if n is not None]
-        if not known or not is_any and len(known) < len(found):
+        limits = [self._limit(a, sign, visited) for a in parts]
+        known = [sign * n for n in limits if n is not None]
+        if not known or not is_any and len(known) < len(limits):
             return None
         return sign * (min(known) if is_any else max(known))
 

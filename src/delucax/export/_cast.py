@@ -17,8 +17,8 @@ def dtype_of(tree: Any, given: Any, where: str) -> np.dtype:
                 f"{where}: dtype must be 'float32' or 'float64', got {given!r}."
             )
         return np.dtype(name)
-    found = [leaf.dtype for leaf in _arrays(tree) if _is_real(leaf)]
-    kinds = [jax.dtypes.canonicalize_dtype(kind) for kind in found]
+    dtypes = [leaf.dtype for leaf in _arrays(tree) if _is_real(leaf)]
+    kinds = [jax.dtypes.canonicalize_dtype(kind) for kind in dtypes]
     dtype = jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if dtype not in (np.float32, np.float64):
         raise ValueError(

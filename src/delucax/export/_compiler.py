@@ -35,8 +35,8 @@ def find_compiler(compiler: str | None, where: str) -> list[str]:
     sought = [named] if named else list(_COMPILERS)
     for command in sought:
         words = shlex.split(command)
-        if words and (found := shutil.which(words[0])):
-            return [found, *words[1:]]
+        if words and (path := shutil.which(words[0])):
+            return [path, *words[1:]]
     raise ValueError(
         f"{where}: no C compiler was found: looked for {', '.join(map(repr, sought))} "
         "on the path. Install one (Debian's package gcc, Xcode's command line tools), "

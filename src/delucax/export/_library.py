@@ -49,20 +49,20 @@ def as_input(
         raise ValueError(
             f"{where}: {name} must be {kind} numbers of shape {shape}, got {got}."
         )
-    found = np.asarray(array, dtype, order="C")
-    if kinds == "iub" and not np.array_equal(found, array):
+    converted = np.asarray(array, dtype, order="C")
+    if kinds == "iub" and not np.array_equal(converted, array):
         raise ValueError(
             f"{where}: {name} must fit in {dtype}, got {shortened(value)}."
         )
-    return found
+    return converted
 
 
 class ControllerCalls:
     """The functions of an exported controller. What goes in is left as it is."""
 
     def __init__(self, path: str, about: Description):
-        (_, (_, seen, *_)), ((_, self.controls, *_),) = about.inputs, about.outputs
-        self.observations, self.dtype = seen, np.dtype(about.dtype)
+        (_, (_, y, *_)), ((_, self.controls, *_),) = about.inputs, about.outputs
+        self.observations, self.dtype = y, np.dtype(about.dtype)
         self._real = np.ctypeslib.as_ctypes_type(self.dtype)
         self._init = function_of(path, f"{about.name}_init")
         self._step = function_of(path, f"{about.name}_step")
@@ -78,10 +78,10 @@ class ControllerCalls:
     def in_place(self, memory: np.ndarray, y: np.ndarray, u: np.ndarray) -> Any:
         """`step(t) -> flag` and `applied(cost)`, which read and write these arrays."""
         real, at = self._real, [address(array) for array in (memory, y, u)]
-        state, seen, control = at
+        state, observation, control = at
         step, applied = self._step, self._applied
         return (
-            lambda t: step(state, real(t), seen, control),
+            lambda t: step(state, real(t), observation, control),
             lambda cost: applied(state, control, real(cost)),
         )
 

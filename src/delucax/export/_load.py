@@ -76,24 +76,24 @@ def _find(folder: Path, name: str | None, where: str) -> Description:
     if not folder.is_dir():
         raise ValueError(f"{where}: directory must be a folder, got {str(folder)!r}.")
     headers = [h for h in sorted(folder.glob("*.h")) if h.with_suffix(".c").exists()]
-    found: dict[str, Description] = {}
+    exports: dict[str, Description] = {}
     for header in headers:
         with contextlib.suppress(ValueError):  # it may be of another program
-            found[header.stem] = described(header)
-    if not found:
+            exports[header.stem] = described(header)
+    if not exports:
         raise ValueError(
             f"{where}: directory must hold what delucax.export.c wrote, and "
             f"{str(folder)!r} has none."
         )
-    if name is None and len(found) > 1:
+    if name is None and len(exports) > 1:
         raise ValueError(
             f"{where}: name must say which, for {str(folder)!r} holds "
-            f"{', '.join(found)}."
+            f"{', '.join(exports)}."
         )
-    which = next(iter(found)) if name is None else name
-    if which not in found:
+    which = next(iter(exports)) if name is None else name
+    if which not in exports:
         raise ValueError(
             f"{where}: no export is called {which!r} in {str(folder)!r}; "
-            f"{did_you_mean(str(which), found)}"
+            f"{did_you_mean(str(which), exports)}"
         )
-    return found[which]
+    return exports[which]

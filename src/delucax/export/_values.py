@@ -4,6 +4,7 @@ An array may be a table of constants, a view of memory, a few scalars, or a form
 is written out where it is read.
 """
 
+import abc
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -41,7 +42,7 @@ class Buffer:
         self.is_own, self.holders = is_own, 0
 
 
-class Value:
+class Value(abc.ABC):
     """An array. `buffers` are the memory that reading it reads."""
 
     shape: tuple[int, ...]
@@ -52,9 +53,9 @@ class Value:
     def size(self) -> int:
         return int(np.prod(self.shape, dtype=int))
 
+    @abc.abstractmethod
     def at(self, indices: Indices) -> Expr:
         """The entry."""
-        raise NotImplementedError
 
     def entries(self) -> list[Expr]:
         """All of them, in order."""
