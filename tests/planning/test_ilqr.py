@@ -419,3 +419,20 @@ def test_a_batch_over_what_a_cost_closes_over():
     weights = jnp.array([1.0, 2.0])
     alone = [jax.jit(total)(weight) for weight in weights]
     assert_close(jax.vmap(total)(weights), alone, rtol=1e-12)
+
+
+def test_a_cost_that_looks_up_a_table():
+    # JAX lowers `jnp.interp` late, and a plan is lowered as a whole.
+    table = jnp.linspace(0.0, 1.0, 5)
+    dynamics, _ = pendulum()
+
+    def cost(t, x, u):
+        return (x[0] - jnp.interp(t, table, table**2)) ** 2 + 0.1 * u[0] ** 2
+
+    def planned(x0):
+        cost_of = dlx.costs.Function(cost)
+        return ilqr(dynamics, cost_of, x0, jnp.zeros((10, 1))).cost
+
+    starts = jnp.array([[1.0, 0.0], [0.5, 0.0]])
+    each = jnp.stack([planned(x0) for x0 in starts])
+    assert_close(jax.jit(jax.vmap(planned))(starts), each)

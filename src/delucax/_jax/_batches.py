@@ -210,6 +210,9 @@ def _lanes_shapes(*_, program, batches):
     return outs, program.effects
 
 
+# Operations of JAX that are lowered late, such as `jnp.searchsorted`, may stay inside:
+# the program is lowered as a whole. Older versions of JAX have none.
+_lanes.is_high = lambda *_, **__: False
 _lanes.def_impl(_nested(_sequentially))
 _lanes.def_effectful_abstract_eval(_lanes_shapes)
 batching.primitive_batchers[_lanes] = _lanes_batch
