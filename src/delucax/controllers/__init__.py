@@ -21,6 +21,7 @@ from ._network import (
 )
 from ._output_feedback import LQG as LQG, OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
+from ._residual import local_lqr as local_lqr, Residual as Residual
 from ._safety_filter import SafetyFilter as SafetyFilter
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._stochastic import Categorical as Categorical, Gaussian as Gaussian

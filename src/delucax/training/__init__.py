@@ -7,13 +7,17 @@ from ._costs import (
     scored_cost as scored_cost,
     worst_case as worst_case,
 )
+from ._evolve import evolve as evolve
 from ._fit import fit as fit, Fitted as Fitted
 from ._gradient_estimators import (
     analytic as analytic,
     EvolutionStrategies as EvolutionStrategies,
     LikelihoodRatio as LikelihoodRatio,
 )
+from ._imitate import imitate as imitate
+from ._policy_search import Attempt as Attempt
 from ._ppo import PPO as PPO
 from ._record import History as History
 from ._shac import SHAC as SHAC
 from ._steps import AbstractSurrogate as AbstractSurrogate
+from ._synthesise import Synthesis as Synthesis, synthesise as synthesise

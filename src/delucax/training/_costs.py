@@ -28,7 +28,7 @@ from .._controller import (
 )
 from .._module import as_float_array
 from .._typing import Checkpoint, PRNGKey
-from ..environments import Environment
+from ..environments import Environment, randomise
 from ..math import safe_norm
 from ..simulation import rollout, Trajectory
 
@@ -38,6 +38,7 @@ class _ExpectedCost(eqx.Module):
 
     environment: Environment
     gradient_decay: float | Array
+    ranges: dict[str, Any] | None
     batch: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     checkpoint: Checkpoint = eqx.field(static=True)
@@ -50,7 +51,11 @@ class _ExpectedCost(eqx.Module):
         options |= dict(keep=(), throw=False)
 
         def total(key):
-            trajectory = rollout(self.environment, controller, key=key, **options)
+            environment = self.environment
+            if self.ranges is not None:
+                key, plant_key = jr.split(key)
+                environment = randomise(environment, plant_key, self.ranges)
+            trajectory = rollout(environment, controller, key=key, **options)
             return nan_if_failed(trajectory, trajectory.total_cost)
 
         if self.batch == 1:
@@ -66,6 +71,7 @@ def expected_cost(
     checkpoint: Checkpoint = "step",
     gradient_decay: Any = 1.0,
     truncate: int | None = None,
+    ranges: dict[str, Any] | None = None,
 ) -> Any:
     """The loss of a controller: its mean total cost over fresh starts.
 
@@ -85,6 +91,8 @@ def expected_cost(
         [`delucax.rollout`][]; 1, the true gradient, by default.
     - `truncate`: steps after which the gradient is cut, as in [`delucax.rollout`][];
         never by default.
+    - `ranges`: of parameters, as in [`delucax.randomise`][]: each rollout draws a plant
+        of its own. None by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar.
 
@@ -123,7 +131,10 @@ def expected_cost(
     horizon = check_count(horizon, "horizon", where)
     if truncate is not None:
         truncate = check_count(truncate, "truncate", where)
-    return _ExpectedCost(environment, decay, batch, horizon, checkpoint, truncate)
+    if ranges is not None:
+        randomise(environment, jr.key(0), ranges)  # for its checks
+    static = batch, horizon, checkpoint, truncate
+    return _ExpectedCost(environment, decay, ranges, *static)
 
 
 class _ScoredCost(eqx.Module):

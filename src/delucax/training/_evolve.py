@@ -1,0 +1,158 @@
+"""Search over weights without a derivative: natural evolution strategies."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from .._check import check_count, check_positive
+from .._module import weight
+from .._typing import PRNGKey
+from ._fit import fit, Fitted
+from ._gradient_estimators import cost_and_metrics
+from ._trainable import partition_trainable
+
+
+_WHERE = "evolve"
+_SPREAD = "log_std"
+
+
+class _Search(eqx.Module):
+    """A normal distribution of models: its mean, and a deviation for each weight."""
+
+    mean: PyTree
+    log_std: Array = weight()
+
+
+class _OfMean(eqx.Module):
+    """The loss of a model, as one of a distribution of models."""
+
+    loss: Callable[..., Any]
+
+    def __call__(self, search: _Search, key: PRNGKey) -> Any:
+        return self.loss(search.mean, key)
+
+
+class _NaturalGradient(eqx.Module):
+    """The natural gradient of the expected rank, an estimator for `fit`."""
+
+    population: int = eqx.field(static=True)
+
+    def __call__(self, loss: Any, values: dict[str, Array], key: PRNGKey) -> Any:
+        log_std = values[_SPREAD]
+        means = {path: value for path, value in values.items() if path != _SPREAD}
+        mean, as_tree = ravel_pytree(means)
+        size, half = mean.size, self.population // 2
+        draw_key, loss_key = jr.split(key)
+        noise = jr.normal(draw_key, (half, size), mean.dtype)
+        noise = jnp.concatenate([noise, -noise])
+        std = jnp.exp(log_std)
+
+        def cost_of(e):
+            # All members see the same starts, so that they differ by their weights.
+            value = loss(as_tree(mean + std * e) | {_SPREAD: log_std}, loss_key)
+            return cost_and_metrics(value, _WHERE)[0]
+
+        costs = jax.vmap(cost_of)(noise)
+        # A member that diverges comes last.
+        order = jnp.argsort(jnp.where(jnp.isnan(costs), jnp.inf, costs))
+        utility = jnp.zeros(2 * half, mean.dtype).at[order].set(_utilities(2 * half))
+        rate = (3 + np.log(size)) / (5 * np.sqrt(size))
+        slope = as_tree(-std * (utility @ noise))
+        slope[_SPREAD] = -rate / 2 * (utility @ (noise**2 - 1))
+        return jnp.nanmin(costs), slope
+
+
+def _utilities(count: int) -> Array:
+    """What the ranks count, from the best to the worst; their sum is zero."""
+    shares = np.maximum(0, np.log(count / 2 + 1) - np.log(np.arange(count) + 1))
+    return jnp.asarray(shares / shares.sum() - 1 / count)
+
+
+def evolve(
+    loss: Callable[..., Any],
+    model: PyTree,
+    steps: int,
+    *,
+    key: PRNGKey,
+    population: int = 64,
+    sigma: Any = 1.0,
+    trainable: Any = None,
+    block: int = 50,
+    progress: bool = True,
+    callbacks: Sequence[Callable[[int, dict[str, float]], Any]] = (),
+    throw: bool = True,
+) -> Fitted:
+    r"""Train a model by the ranks of a loss, without its derivative: separable natural
+    evolution strategies.
+
+    Weights are drawn from a normal distribution, `mean + std * e_i`, in pairs `+-e_i`.
+    With `v_i` the utility of a draw by its rank,
+
+    `mean <- mean + std sum_i v_i e_i`,
+    `log std <- log std + rate / 2 sum_i v_i (e_i^2 - 1)`,
+
+    `rate = (3 + log d) / (5 sqrt(d))` for d weights. As only the order of the losses
+    counts, it works where the loss is flat almost everywhere or jumps, such as the
+    reward at the end of an episode. It is best for up to some hundred weights.
+
+    **Arguments:**
+
+    - `loss`: `loss(model, key)` to a scalar, such as that of
+        [`delucax.training.expected_cost`][]. A generation shares its key.
+    - `model`: a controller or any pytree.
+    - `steps`: the number of generations, at least 1.
+    - `key`: a random key.
+    - `population`: models in a generation, an even number; 64 by default.
+    - `sigma`: the first standard deviation of each weight, 1 by default.
+    - `trainable`: the path of what moves, such as `"correction"`; the fields marked
+        [`delucax.weight`][] by default.
+    - `block`, `progress`, `callbacks`, `throw`: as in [`delucax.training.fit`][];
+        generations in a block are 50 by default.
+
+    **Returns:** a [`delucax.training.Fitted`][] whose model is the mean. Its history
+        has the least loss of each generation.
+
+    **Raises:** `ValueError` on an argument of the wrong kind, `RuntimeError` as `throw`
+    says if no model of a generation has a finite loss.
+
+    Source: Wierstra, Schaul, Glasmachers, Sun, Peters and Schmidhuber, 2014.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("mountain_car", horizon=200)
+        policy = dlx.controllers.mlp_policy(env, 4, 1, key=jax.random.key(0))
+        loss = dlx.training.expected_cost(env, batch=2)
+        key = jax.random.key(1)
+        fitted = dlx.training.evolve(loss, policy, 5, key=key, population=16)
+        ```
+    """
+    population = check_count(population, "population", _WHERE, least=4)
+    if population % 2:
+        raise ValueError(f"{_WHERE}: population must be even, got {population}.")
+    check_positive(sigma, "sigma", _WHERE)
+    if trainable is not None and not isinstance(trainable, str):
+        raise ValueError(f"{_WHERE}: trainable must be a path, got {trainable!r}.")
+    _, values = partition_trainable(model, trainable, _WHERE)
+    size = sum(value.size for value in values.values())
+    dtype = jnp.result_type(*values.values())
+    search = _Search(model, jnp.full(size, np.log(sigma), dtype))
+    options: Any = dict(key=key, block=block, progress=progress, throw=throw)
+    estimator = _NaturalGradient(population)
+    options |= dict(callbacks=callbacks, gradient=estimator)
+    if trainable is not None:
+        options["trainable"] = (f"mean.{trainable}", _SPREAD)
+    # The estimator gives whole steps.
+    fitted = fit(_OfMean(loss), search, optax.sgd(1.0), steps, **options)
+    return Fitted(fitted.model.mean, fitted.history, fitted.result)

@@ -1,0 +1,178 @@
+"""Imitation of an expert on the states that the policy itself visits."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jaxtyping import Array, PyTree
+
+from .._check import check_count, check_instance, check_key
+from .._controller import AbstractController, check_controller, initial_state, replay
+from .._typing import PRNGKey
+from ..environments import Environment
+from ..simulation import rollout
+from ._fit import fit, Fitted
+from ._record import COLUMNS, History
+
+
+_WHERE = "imitate"
+
+
+class _Likeness(eqx.Module):
+    """The loss of a policy: how far its controls are from those of the expert."""
+
+    scale: Array
+
+    def __call__(self, policy: AbstractController, batch: Any, key: PRNGKey) -> Array:
+        def distance(t, y, u):
+            own, _ = policy(t, y, policy.init(key=key))
+            return jnp.sum(((own - u) / self.scale) ** 2)
+
+        times, observations, controls, weights = batch
+        distances = jax.vmap(distance)(times, observations, controls)
+        # A step that does not count may hold NaN.
+        distances = jnp.where(weights > 0, distances, 0)
+        return jnp.sum(distances) / jnp.maximum(jnp.sum(weights), 1)
+
+
+def imitate(
+    environment: Environment,
+    expert: AbstractController,
+    policy: PyTree,
+    *,
+    key: PRNGKey,
+    rounds: int = 4,
+    episodes: int = 8,
+    steps: int = 300,
+    horizon: int | None = None,
+    optimiser: optax.GradientTransformation | None = None,
+    batch_size: int = 256,
+    trainable: Any = None,
+    progress: bool = True,
+    throw: bool = True,
+) -> Fitted:
+    """Train a policy to act as an expert does, such as MPC: dataset aggregation.
+
+    In the first round the expert runs the episodes. From the second on the policy runs
+    them, and the expert says what it would have done in each state, from which a policy
+    learns to return after its own mistakes. Each round trains on the states of all
+    rounds so far,
+
+    `loss = mean of |(policy(t, y) - expert(t, y)) / scale|^2`,
+
+    `scale` being the standard deviation of each control of the expert.
+
+    **Arguments:**
+
+    - `environment`: the environment.
+    - `expert`: any controller, with a memory or not.
+    - `policy`: the controller to train. It must have no memory.
+    - `key`: a random key.
+    - `rounds`: 4 by default; 1 for behavioural cloning.
+    - `episodes`: of each round, 8 by default.
+    - `steps`: of the optimiser in each round, 300 by default.
+    - `horizon`: steps per episode; the environment's own by default.
+    - `optimiser`: made anew for each round; Adam with cosine decay from 0.003 by
+        default.
+    - `batch_size`: states in a batch, 256 by default.
+    - `trainable`, `progress`, `throw`: as in [`delucax.training.fit`][].
+
+    **Returns:** a [`delucax.training.Fitted`][]; its history has the rounds one after
+        another.
+
+    **Raises:** `ValueError` on an argument of the wrong kind, a policy with a memory,
+    or an expert whose controls are never finite; `RuntimeError` as `throw` says.
+
+    Source: Ross, Gordon and Bagnell, 2011 (DAgger).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum", horizon=20)
+        expert = dlx.controllers.local_lqr(env)
+        policy = dlx.controllers.mlp_policy(env, 8, 1, key=jax.random.key(0))
+        fitted = dlx.training.imitate(
+            env, expert, policy, key=jax.random.key(1), rounds=2, steps=50
+        )
+        ```
+    """
+    check_instance(environment, Environment, "environment", _WHERE)
+    check_controller(expert, "expert", _WHERE)
+    check_controller(policy, "policy", _WHERE)
+    key = check_key(key, _WHERE)
+    counts = dict(rounds=rounds, episodes=episodes, steps=steps, batch_size=batch_size)
+    for name, count in counts.items():
+        check_count(count, name, _WHERE)
+    horizon = check_count(horizon or environment.horizon, "horizon", _WHERE)
+    if any(map(eqx.is_array, jax.tree.leaves(policy.init(key=key)))):
+        raise ValueError(
+            f"{_WHERE}: policy must have no memory, got a {type(policy).__name__} "
+            "whose state holds arrays. Train it by fit, on the cost."
+        )
+    if optimiser is None:
+        optimiser = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
+
+    rows: Any = None
+    histories, loss, result = [], None, None
+    options: Any = dict(progress=progress, throw=throw, trainable=trainable)
+    capacity = rounds * episodes * horizon
+    options["batch_size"] = min(batch_size, capacity)
+    for k in range(rounds):
+        run_key, fit_key = jr.split(jr.fold_in(key, k))
+        keys = jr.split(run_key, episodes)
+        driver = policy if k else expert
+        new = jax.device_get(_watched(environment, driver, expert, keys, horizon))
+        pairs = zip(rows or new, new, strict=True)
+        rows = new if rows is None else [np.concatenate(pair) for pair in pairs]
+        if loss is None:
+            controls = rows[2][rows[3] > 0]
+            if not len(controls):
+                raise ValueError(
+                    f"{_WHERE}: expert must have controls that are finite."
+                )
+            loss = _Likeness(jnp.asarray(np.maximum(controls.std(axis=0), 1e-6)))
+        # Repeated up to one size, so that no round compiles anew.
+        whole = tuple(np.resize(r, (capacity, *r.shape[1:])) for r in rows)
+        fitted = fit(loss, policy, optimiser, steps, key=fit_key, data=whole, **options)
+        policy, result = fitted.model, fitted.result
+        histories.append(fitted.history)
+    return Fitted(policy, _one_after_another(histories), result)
+
+
+@eqx.filter_jit
+def _watched(environment, driver, expert, keys, horizon):
+    """Times, observations, controls of the expert and whether they count, of all steps
+    of the episodes that `driver` runs."""
+
+    def episode(key):
+        keep = ("observations", "controls", "costs")
+        options: Any = dict(horizon=horizon, keep=keep, throw=False)
+        run: Any = rollout(environment, driver, key=key, **options)
+        *_, controller_key = environment.split_key(key)
+        act = lambda t, y, state, u: expert(t, y, state)
+        times, y = run.times[:-1], run.observations
+        record = times, y, run.controls, run.costs
+        controls = replay(expert, initial_state(expert, controller_key), record, act)
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([y, controls], axis=1)), axis=1)
+        counts = finite & (jnp.arange(horizon) < run.length)
+        return times, y, controls, counts.astype(y.dtype)
+
+    return [r.reshape(-1, *r.shape[2:]) for r in jax.vmap(episode)(keys)]
+
+
+def _one_after_another(histories: list[History]) -> History:
+    columns = {n: np.concatenate([h[n] for h in histories]) for n in COLUMNS}
+    lengths = np.cumsum([0, *map(len, histories[:-1])])
+    last = np.cumsum([0, *(h.seconds[-1] for h in histories[:-1])])
+    for name, before in (("step", lengths), ("seconds", last)):
+        columns[name] = np.concatenate(
+            [h[name] + b for h, b in zip(histories, before, strict=True)]
+        )
+    return History(**columns, metrics={})

@@ -1,0 +1,102 @@
+"""Networks that fit an environment, around an LQR where there is one."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
+
+from .._controller import AbstractController
+from .._typing import PRNGKey
+from ..controllers import Constant, GRU, LQR, MLP, Residual, Standardise, Zero
+from ..environments import Environment
+from ..simulation import rollout
+
+
+# Episodes of each controller that the scales are taken from.
+_EPISODES = 32
+LQR_AND_NETWORK = "LQR + network"
+
+
+def structures(
+    environment: Environment, lqr: LQR | None, width: int, depth: int, key: PRNGKey
+) -> dict[str, AbstractController]:
+    """Policies to train, by name: a network; one that corrects the LQR; and where the
+    state is not observed one with a memory."""
+    visits_key, plain_key, residual_key = jr.split(key, 3)
+    m, bounds = environment.control_size, environment.control_bounds
+    low, high = (jnp.full(m, -jnp.inf), jnp.full(m, jnp.inf))
+    if bounds is not None:
+        low, high = (jnp.broadcast_to(jnp.asarray(e, float), m) for e in bounds)
+    bounded = jnp.isfinite(high - low)
+
+    drivers: list[AbstractController] = [Zero(m)]
+    if lqr is not None:
+        drivers.append(lqr)
+    for end in (low, high):
+        drivers.append(Constant(jnp.where(jnp.isfinite(end), end, 0)))
+    visits = _visits(environment, drivers, jr.split(visits_key, _EPISODES))
+    features = _standardised(environment, np.concatenate([y for y, _ in visits]))
+    # Where a control has no bounds, its range is that of the LQR, or of order one.
+    reach = np.ones(m) if lqr is None else _spread(np.asarray(visits[1][1]), 1e-3)
+    half = jnp.where(bounded, (high - low) / 2, 2 * reach)
+    ends = jnp.where(bounded, low, -half), jnp.where(bounded, high, half)
+
+    size = environment.feature_size
+    if environment.observation_size != environment.state_size:
+        options: Any = dict(features=features, bounds=ends, key=plain_key)
+        return {"memory": GRU(size, m, width, **options)}
+    network = lambda bounds, key: MLP(
+        size, m, width, depth, features=features, bounds=bounds, key=key
+    )
+    made: dict[str, AbstractController] = {"network": network(ends, plain_key)}
+    if lqr is not None:
+        # Its correction is zero at first.
+        correction = network((-half, half), residual_key)
+        last = lambda c: (c.network.layers[-1].weight, c.network.layers[-1].bias)
+        zeros = jax.tree.map(jnp.zeros_like, last(correction))
+        correction = eqx.tree_at(last, correction, zeros)
+        made[LQR_AND_NETWORK] = Residual(lqr, correction, bounds)
+    return made
+
+
+@eqx.filter_jit
+def _visits(
+    environment: Environment, drivers: list[AbstractController], keys: Array
+) -> list[tuple[Array, Array]]:
+    """Observations and controls of episodes, a row for each step, by driver."""
+    keep = ("observations", "controls")
+
+    def of(driver):
+        run = lambda k: rollout(environment, driver, key=k, keep=keep, throw=False)
+        runs: Any = jax.vmap(run)(keys)
+        return tuple(
+            array.reshape(-1, array.shape[-1])
+            for array in (runs.observations, runs.controls)
+        )
+
+    return [of(driver) for driver in drivers]
+
+
+@eqx.filter_jit
+def _encoded(environment: Environment, observations: Array) -> Array:
+    return jax.vmap(environment.encode)(observations)
+
+
+def _standardised(environment: Environment, observations: np.ndarray) -> Standardise:
+    """Features with the centre and the spread of those of `observations`."""
+    z = np.asarray(_encoded(environment, jnp.asarray(observations)))
+    centre = np.median(z[np.all(np.isfinite(z), axis=1)], axis=0)
+    std = _spread(z, 1e-3)
+    return Standardise(jnp.asarray(centre), jnp.asarray(std), environment.encode)
+
+
+def _spread(rows: np.ndarray, least: float) -> np.ndarray:
+    """The standard deviation of the middle of the rows: some episodes run away."""
+    rows = rows[np.all(np.isfinite(rows), axis=1)]
+    low, high = np.quantile(rows, [0.1, 0.9], axis=0)
+    # 80% of a normal distribution are within 1.28 deviations.
+    return np.maximum((high - low) / 2.56, least * (1 + np.abs(low)))

@@ -1,0 +1,148 @@
+"""A policy for any environment with a model, from one call."""
+
+from typing import Any, NamedTuple, TYPE_CHECKING
+
+import numpy as np
+
+from .._check import check_count, check_instance, check_key, check_number
+from .._controller import AbstractController
+from .._extras import extra
+from .._typing import PRNGKey
+from ..environments import Environment
+from ._policy_search import Attempt, PolicySearch
+
+
+if TYPE_CHECKING:
+    import pandas
+
+
+_WHERE = "synthesise"
+# Seconds below which not even the first programs compile.
+_LEAST_BUDGET = 5.0
+
+
+class Synthesis(NamedTuple):
+    """The result of `synthesise`.
+
+    **Attributes:**
+
+    - `policy`: the controller that was chosen.
+    - `structure`: what it is: `"zero"`, `"LQR"`, `"network"`, `"LQR + network"` or
+        `"memory"`.
+    - `costs`: from `"policy"`, `"zero"`, `"LQR"`, `"MPC"` and `"plan"` to the costs of
+        episodes from starts that were used for nothing else, the same for each; those
+        that do not apply are left out.
+    - `tried`: a list of `Attempt`s, in the order in which they were made.
+    - `seconds`: what it took.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("double_integrator", horizon=20)
+        found = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
+        found.structure, found.costs["policy"].mean()
+        ```
+    """
+
+    policy: AbstractController
+    structure: str
+    costs: dict[str, np.ndarray]
+    tried: list[Attempt]
+    seconds: float
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """A table with a row for each controller that was compared: mean, median and
+        worst cost.
+
+        **Returns:** a `pandas.DataFrame`.
+
+        **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
+        """
+        rows = {
+            name: dict(mean=np.mean(c), median=np.median(c), worst=np.max(c))
+            for name, c in self.costs.items()
+        }
+        return extra("pandas", "tables").DataFrame(rows).T
+
+
+def synthesise(
+    environment: Environment,
+    *,
+    key: PRNGKey,
+    budget: Any = 60.0,
+    ranges: dict[str, Any] | None = None,
+    width: int = 32,
+    depth: int = 1,
+    progress: bool = True,
+) -> Synthesis:
+    """A policy for an environment with a model, without settings of the task.
+
+    It tries, compares and refines:
+
+    1. The floor: no control, and the LQR of [`delucax.controllers.local_lqr`][] where
+        there is one.
+    2. Trials: a network, and a network that corrects the LQR
+        ([`delucax.controllers.Residual`][]), or a recurrent network where the state is
+        not observed; each by the gradient of the rollout, by that gradient damped over
+        half a second, and by [`delucax.training.evolve`][], which needs no gradient.
+    3. Refinement of the best, by the method that still gains; imitation of MPC
+        ([`delucax.training.imitate`][]) once none does.
+    4. Choice of the best on starts that it was not trained on. Where the LQR, or no
+        control, is as good to half a percent, that is returned.
+
+    **Arguments:**
+
+    - `environment`: the environment. Its dynamics and cost must be differentiable.
+    - `key`: a random key.
+    - `budget`: seconds for all of it with compilation, 60 by default, at least 5. A
+        training or comparison that has begun is finished. What is tried depends on the
+        speed of the machine, and so does the result.
+    - `ranges`: of parameters, as in [`delucax.randomise`][]: the policy is for a family
+        of plants, one of which each episode draws. The LQR is that of the nominal
+        plant; MPC and the plan know each plant. None by default.
+    - `width`, `depth`: of the networks, 32 and 1 by default.
+    - `progress`: whether to show a bar with the seconds and the cost so far; true by
+        default.
+
+    An interrupt (`KeyboardInterrupt`) ends the training, and returns the best so far.
+
+    **Returns:** a [`delucax.training.Synthesis`][].
+
+    **Raises:** `ValueError` on an argument of the wrong kind; if the cost of a first
+    state is not finite, no control keeps one finite over the first step, or the
+    dynamics or the cost have no derivative; all before anything is trained.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("double_integrator", horizon=20)
+        found = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
+        found.structure, found.costs["policy"].mean()
+        ```
+    """
+    check_instance(environment, Environment, "environment", _WHERE)
+    key = check_key(key, _WHERE)
+    check_number(budget, "budget", _WHERE)
+    if budget < _LEAST_BUDGET:
+        raise ValueError(
+            f"{_WHERE}: budget must be at least {_LEAST_BUDGET:g} s, which the first "
+            f"programs take to compile, got {budget}."
+        )
+    width = check_count(width, "width", _WHERE)
+    depth = check_count(depth, "depth", _WHERE)
+    search = PolicySearch(environment, ranges, key, float(budget), progress)
+    search.check()
+    with search.bar:
+        try:
+            search.run(width, depth)
+        except KeyboardInterrupt:
+            pass
+        structure, policy = search.chosen()
+        costs = search.compared(policy)
+    return Synthesis(policy, structure, costs, search.tried, search.seconds)

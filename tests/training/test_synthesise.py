@@ -1,0 +1,135 @@
+"""A policy from one call."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import once
+
+import delucax as dlx
+from delucax.training import synthesise
+from delucax.training._policy_search import PolicySearch
+
+
+KEY = jax.random.key(0)
+pytestmark = once
+
+
+@functools.cache
+def env():
+    return dlx.make("double_integrator", horizon=80, max_force=100.0)
+
+
+@functools.cache
+def found():
+    return synthesise(env(), key=KEY, budget=6.0, width=8, progress=False)
+
+
+def test_a_linear_plant_gets_its_regulator():
+    assert found().structure == "LQR"
+    assert isinstance(found().policy, dlx.controllers.LQR)
+
+
+def test_what_was_tried_is_reported():
+    structures = {attempt.structure for attempt in found().tried}
+    assert "network" in structures
+    assert all(np.isfinite(attempt.cost) for attempt in found().tried)
+    assert sum(attempt.seconds for attempt in found().tried) < found().seconds
+
+
+def test_costs_are_from_the_same_starts():
+    costs = found().costs
+    assert {"policy", "zero", "LQR"} <= set(costs)
+    np.testing.assert_array_equal(costs["policy"], costs["LQR"])
+    if "plan" in costs:
+        assert np.all(costs["plan"] <= costs["policy"] * (1 + 1e-5))
+    table = found().to_pandas()
+    assert table.loc["zero", "mean"] == pytest.approx(costs["zero"].mean())
+
+
+def test_a_network_where_the_regulator_is_worse():
+    # Nothing is trained: what is better by more than half a percent is chosen.
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    zero, lqr, net = (dlx.controllers.Constant([float(i)]) for i in range(3))
+    search.best = {"zero": (zero, 9.0), "LQR": (lqr, 1.01), "network": (net, 1.0)}
+    assert search.chosen() == ("network", net)
+    search.best["LQR"] = lqr, 1.004
+    assert search.chosen() == ("LQR", lqr)
+    search.best["zero"] = zero, 1.0
+    assert search.chosen() == ("zero", zero)
+
+
+def test_it_stops_where_the_user_does(monkeypatch):
+    def interrupted(self, *_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PolicySearch, "attempt", interrupted)
+    stopped = synthesise(env(), key=KEY, budget=5.0, width=8, progress=False)
+    assert stopped.structure == "LQR" and not stopped.tried
+
+
+class NoDerivative(dlx.AbstractSystem):
+    state_names, control_names = ("x",), ("u",)
+
+    def vector_field(self, t, x, u, w):
+        shape = jax.ShapeDtypeStruct(x.shape, x.dtype)
+        return jax.pure_callback(lambda x: -x, shape, x, vmap_method="sequential") + u
+
+
+def plain(system):
+    dynamics = dlx.Discretized(system, dt=0.1)
+    return dlx.Environment(dynamics, dlx.costs.Quadratic([1.0], [1.0]), horizon=5)
+
+
+def test_a_model_without_derivative():
+    with pytest.raises(ValueError, match="synthesise: .* that JAX can differentiate"):
+        synthesise(plain(NoDerivative()), key=KEY)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (dict(initial_state=lambda key: jnp.full(2, jnp.nan)), "first state must be"),
+        (
+            dict(cost=dlx.costs.Function(lambda t, x, u: jnp.log(-(x[0] ** 2)))),
+            "cost of a first state must be finite",
+        ),
+        (
+            dict(initial_state=lambda key: jnp.full(2, 3e38)),
+            "cost of a first state must be finite",
+        ),
+    ],
+)
+def test_bad_tasks(change, match):
+    task = dataclasses.replace(env(), **change)
+    with pytest.raises(ValueError, match=f"synthesise: the {match}"):
+        synthesise(task, key=KEY)
+
+
+def test_a_start_that_no_control_keeps():
+    class Explodes(dlx.AbstractSystem):
+        state_names, control_names = ("x",), ("u",)
+
+        def vector_field(self, t, x, u, w):
+            return jnp.exp(x) + u
+
+    task = dataclasses.replace(plain(Explodes()), initial_state=[200.0])
+    with pytest.raises(ValueError, match="no control keeps the first step finite"):
+        synthesise(task, key=KEY)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (dict(budget=1.0), "budget must be at least 5 s"),
+        (dict(budget=jnp.nan), "budget must be"),
+        (dict(width=0), "width must be"),
+        (dict(ranges={"dynamics.system.weight": (1, 2)}), "weight"),
+    ],
+)
+def test_bad_arguments(options, match):
+    with pytest.raises(ValueError, match=match):
+        synthesise(env(), key=KEY, **options)
