@@ -130,6 +130,11 @@ SYSTEMS = {
     "RimlessWheel": Case(s.RimlessWheel, [-0.3, -2.0], [0.45, 2.0], *box(1.0), 0.02),
     "SimplestWalker": Case(s.SimplestWalker, *box(0.3, 0.3, 0.6, 0.6), *box(0.1), 0.05),
     "CompassGait": Case(s.CompassGait, *box(0.4, 0.4, 2.0, 2.0), *box(5.0), 0.01),
+    "Thermostat": Case(s.Thermostat, [19.0, 0.0], [21.0, 1.0], *box(1.0), 0.1),
+    "StickSlip": Case(s.StickSlip, [-0.2, -0.5, 0.0], [0.2, 0.5, 2.0], *box(1.0), 0.05),
+    "ValveWithStops": Case(
+        s.ValveWithStops, [0.0, -4.0, 0.0], [1.0, 4.0, 0.0], *box(25.0), 0.02
+    ),
     "TwoTank": Case(s.TwoTank, [0.0, 0.0], [20.0, 20.0], [0.0], [30.0], 1.0),
     "CSTR": Case(s.CSTR, [0.3, 340.0], [0.7, 360.0], [280.0], [320.0], 0.05),
     "PermanentMagnetMotor": Case(

@@ -19,8 +19,9 @@ class Crossings(NamedTuple):
     - `expected`: whether it crosses zero.
     - `low`, `high`: it falls between these, from positive to negative.
     - `guess`: where the cubic through its values and rates at both ends is zero.
-    - `at_once`: whether it starts at zero, and crosses there.
-    - `beyond`: whether it starts beyond zero.
+    - `at_once`: whether it starts at zero and crosses there, or is late.
+    - `late`: whether it is urgent and starts beyond zero.
+    - `beyond`: whether it starts beyond zero and is not urgent.
     - `past_end`: whether the end of the step shows that it crosses; else only the cubic
         does, which dips below zero and comes back.
     - `slope`: its change over the step, if the rate at the start were constant.
@@ -33,6 +34,7 @@ class Crossings(NamedTuple):
     high: Array
     guess: Array
     at_once: Array
+    late: Array
     beyond: Array
     past_end: Array
     slope: Array
@@ -68,6 +70,7 @@ def crossings(
     slack: Array,
     margin: Array,
     directions: Array,
+    urgent: Array,
     enabled: tuple[Array, Array],
     has_length: Array,
 ) -> Crossings:
@@ -79,6 +82,7 @@ def crossings(
         constant, at both ends.
     - `slack`, `margin`: what counts as zero at the start, and at the end.
     - `directions`: -1 falling, 1 rising, 0 both.
+    - `urgent`: which fire at the start of a step, too, where they start beyond zero.
     - `enabled`: at both ends.
     - `has_length`: whether the step is more than a rounding of its interval; if it is
         not, nothing is expected in it, but at the start of the next.
@@ -90,13 +94,15 @@ def crossings(
     own = jnp.where(jnp.where(on_guard, r0, g0) < 0, -1, 1)
     sign = jnp.where(either, own, -directions).astype(g0.dtype)
     g0, r0, g1, r1 = (sign * a for a in (g0, r0, g1, r1))
-    at_once = on_guard & (r0 < 0) & enabled[0]
     beyond = g0 < -slack
+    late = beyond & urgent & enabled[0] & has_length
+    at_once = on_guard & (r0 < 0) & enabled[0] & has_length | late
     # One that is not enabled and is already falling has to come back first.
     gone = beyond | on_guard & (r0 < 0)
     # Where it grazes there is nothing to correct.
     near = -g0 / jnp.where(r0 < 0, r0, -1)
-    near = jnp.where(jnp.abs(near) < jnp.finfo(g0.dtype).eps ** 0.25, near, 0)
+    small = jnp.abs(near) < jnp.finfo(g0.dtype).eps ** 0.25
+    near = jnp.where(small & on_guard, near, 0)
     a = jnp.where(on_guard, 0, g0)
     # Hermite's cubic a + r0 z + c z^2 + d z^3, and where it is least and largest. Of
     # each pair of formulas one has no cancellation.
@@ -139,12 +145,13 @@ def crossings(
         guess = jnp.where(good, newton, (left + right) / 2)
     return Crossings(
         sign=sign,
-        expected=(expected | at_once) & has_length,
+        expected=expected & has_length | at_once,
         low=low,
         high=high,
         guess=jnp.where(at_once, near, guess),
-        at_once=at_once & has_length,
-        beyond=beyond & ~either & enabled[0],
+        at_once=at_once,
+        late=late,
+        beyond=beyond & ~either & ~urgent & enabled[0],
         past_end=ends_beyond & ~dips,
         slope=r0,
         size=jnp.abs(a) + jnp.abs(g1) + jnp.abs(r0) + jnp.abs(r1),

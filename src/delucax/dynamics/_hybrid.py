@@ -170,7 +170,9 @@ class HybridFlow(eqx.Module):
         values = (g0, r0 * h), (g1, r1 * h)
         zero = slack, margin
         long = h > 64 * eps * span
-        return crossings(*values, *zero, jnp.array(directions), enabled, long)
+        urgent = [name in system.urgent_events for name in system.event_names]
+        kinds = jnp.array(directions), jnp.array(urgent)
+        return crossings(*values, *zero, *kinds, enabled, long)
 
     def ahead(self, s: Array, x: Array, end: Array) -> Ahead:
         """What one step to `end` meets."""
@@ -302,11 +304,13 @@ class Intervals(eqx.Module):
         share, event, crossed, grazes = locate(guards_at, crossing, run.expected)
         x_there, _ = still.step(fs, fx, share * fh)
         fires = crossed & pick(still.enabled(fs + share * fh, x_there), event)
-        grazes = fires & grazes
+        # Where a late one fires does not depend on its guard.
+        crosses = fires & ~pick(crossing.late, event)
+        grazes = crosses & grazes
 
-        length = _length(plant, s, x, share * fh, (event, fires, grazes))
+        length = _length(plant, s, x, share * fh, (event, crosses, grazes))
         # Where nothing fires the step is only cut there, or taken whole.
-        length = jnp.where(fires, length, jnp.where(crossed, share * fh, h))
+        length = jnp.where(crosses, length, jnp.where(crossed, share * fh, h))
         x_event, solved = plant.step(s, x, length)
         s_event = s + length
         x_after = jnp.where(fires, plant.reset(event, s_event, x_event), x_event)
@@ -369,14 +373,14 @@ def _length(plant, s, x, length, known):
 
     @root.defjvp
     def change(primals, tangents):
-        given, _, (event, fires, grazes) = primals
+        given, _, (event, crosses, grazes) = primals
         length = root(*primals)
         along = lambda length: guard(given, length, event)
         _, slope = jax.jvp(along, (length,), (jnp.ones_like(length),))
         of = lambda given: guard(given, length, event)
         _, moved = jax.jvp(of, (given,), (tangents[0],))
         slope = jnp.where(grazes, jnp.nan, slope)
-        return length, -moved / jnp.where(fires, slope, 1)
+        return length, -moved / jnp.where(crosses, slope, 1)
 
     return root(given, length, known)
 

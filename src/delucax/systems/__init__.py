@@ -45,6 +45,11 @@ if TYPE_CHECKING:
         KinematicBicycle as KinematicBicycle,
         Reacher as Reacher,
     )
+    from ._switching import (
+        StickSlip as StickSlip,
+        Thermostat as Thermostat,
+        ValveWithStops as ValveWithStops,
+    )
     from ._walkers import CompassGait as CompassGait, SimplestWalker as SimplestWalker
 else:
     # The catalogue is imported as it is used.
@@ -58,6 +63,7 @@ else:
             "_quadrotors": "ConstantWind DissipativeWind PlanarQuadrotor Quadrotor "
             "VortexWind",
             "_robots": "DynamicBicycle KinematicBicycle Reacher",
+            "_switching": "StickSlip Thermostat ValveWithStops",
             "_walkers": "CompassGait SimplestWalker",
         },
     )

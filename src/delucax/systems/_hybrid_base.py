@@ -25,13 +25,17 @@ class AbstractHybridSystem(AbstractSystem):
     A guard that falls, as most do, is a distance: the plant lives where it is positive,
     and the event is what happens when it is used up. A state that is beyond an enabled
     guard at the start of an interval or after a reset is a fault of the model,
-    `RESULTS.beyond_guard`; one that is on the guard and moves beyond it fires at once.
+    `RESULTS.beyond_guard`, unless the event is urgent; one that is on the guard and
+    moves beyond it fires at once.
 
     **Class attributes** (or properties), besides those of [`delucax.AbstractSystem`][]:
 
     - `event_names`: a tuple of strings.
     - `event_directions`: for each event -1 if its guard falls (the default), +1 if it
         rises, or 0 for both, which allows either side.
+    - `urgent_events`: those that also fire at once where the state is beyond their
+        guard at the start of an interval or after a reset, none by default. A guard
+        that depends on the control needs it, as a control may jump between intervals.
     - `mode_names`: the names of discrete modes, none by default. With them one of the
         states is named `"mode"`; it holds 0.0, 1.0, ..., resets change it, and its
         derivative is zero. `mode` reads it.
@@ -68,6 +72,7 @@ class AbstractHybridSystem(AbstractSystem):
     else:
         event_names: eqx.AbstractVar[tuple[str, ...]]
     event_directions: ClassVar[Any] = ()
+    urgent_events: ClassVar[Any] = ()
     mode_names: ClassVar[Any] = ()
 
     def __check_init__(self):
@@ -82,6 +87,12 @@ class AbstractHybridSystem(AbstractSystem):
             raise ValueError(
                 f"{where}: event_directions must be -1, 0 or 1 for each of "
                 f"{tuple(names)}, got {self.event_directions!r}."
+            )
+        one_way = [n for n, way in zip(names, directions, strict=True) if way != 0]
+        if not set(self.urgent_events) <= set(one_way):
+            raise ValueError(
+                f"{where}: urgent_events must be among the events that have a "
+                f"direction, {tuple(one_way)}, got {self.urgent_events!r}."
             )
         if self.mode_names and "mode" not in self.state_names:
             raise ValueError(
