@@ -35,14 +35,16 @@ ARGUMENTS = {
 
 
 def names() -> list[str]:
-    """Each task once, but the lungs and the pendulum.
+    """Each task once, but the lungs, the pendulum and the plants with events.
 
-    The paper's names are others for the same; the pendulum has `benchmarks.pendulum`.
+    The paper's names are others for the same; the pendulum has `benchmarks.pendulum`,
+    and a raw scan that finds events would be what delucax does.
     """
     every = dlx.environments.registered()
     lungs = {name.removeprefix("lung/") for name in every if name.startswith("lung/")}
     apart = {"pendulum", *lungs}
-    return [name for name in every if "/" not in name and name not in apart]
+    found = [name for name in every if "/" not in name and name not in apart]
+    return [n for n in found if not getattr(task(n).dynamics, "event_names", ())]
 
 
 def task(name: str) -> dlx.Environment:

@@ -78,7 +78,9 @@ def step_with(u):
 
 NUMBERS = {
     "acrobot": ["goal_height", "max_torque"],
+    "bouncing_ball": ["height", "max_force", "rest_cost"],
     "cartpole": ["max_force"],
+    "compass_gait": ["speed", "max_torque", "fall_cost"],
     "cstr": ["concentration", "min_coolant", "max_coolant"],
     "double_integrator": ["max_force"],
     "dynamic_bicycle": ["speed", "max_acceleration", "max_steering"],
@@ -89,7 +91,11 @@ NUMBERS = {
     "mountain_car_discrete": ["goal_position", "goal_velocity"],
     "permanent_magnet_motor": ["speed", "max_voltage"],
     "quadrotor": ["max_thrust"],
+    "rimless_wheel": ["speed", "max_torque", "stall_cost"],
+    "stick_slip": ["max_force"],
+    "thermostat": ["target", "max_heat"],
     "two_tank": ["max_flow"],
+    "valve_with_stops": ["max_force"],
     "van_der_pol": ["max_control"],
 }
 

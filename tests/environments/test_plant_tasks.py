@@ -192,6 +192,8 @@ def test_constants_reach_the_physics():
     "name, constants",
     [
         ("acrobot", dict(mass_2=1.2, form="nips")),
+        ("bouncing_ball", dict(drag=0.1, restitution=0.9)),
+        ("compass_gait", dict(slope=0.0)),
         ("kinematic_bicycle", dict(front=1.2)),
         ("mass_spring_damper", dict(mass=2.0, masses=2)),
         ("mountain_car_discrete", dict(power=0.001, gravity=0.003)),
@@ -214,6 +216,9 @@ def test_a_task_takes_a_system_or_its_arguments(name, constants):
 
 @once
 def test_defaults_of_tasks_that_are_not_those_of_their_systems():
+    for name, constant in (("bouncing_ball", "drag"), ("stick_slip", "damping")):
+        system = dlx.make(name).dynamics.system
+        assert getattr(system, constant) > 0 == getattr(type(system)(), constant)
     weak = dlx.make("mountain_car_discrete").dynamics.system
     assert_close(weak.power, 0.001, rtol=1e-6)
     given = dlx.make("mountain_car_discrete", system=dlx.systems.MountainCar())
@@ -315,6 +320,9 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
             dict(concentration=2.0),
             "concentration must be above 0 and below feed_concentration, 1.0, got 2.0",
         ),
+        ("bouncing_ball", dict(height=0.0), "bouncing_ball: height must be positive"),
+        ("compass_gait", dict(max_torque=-1.0), "max_torque must be at least 0"),
+        ("thermostat", dict(low=21.0), "low must be below high, got 21.0 and 21.0"),
         ("lorenz", dict(max_control=-1.0), "max_control must be at least 0"),
         ("quadrotor", dict(inputs="motors"), "inputs must be 'rotors' or 'wrench'"),
         ("neural", {}, "give a system, or a key .* got neither"),

@@ -78,7 +78,7 @@ class Events(eqx.Module):
         return jax.tree.map(blank, self)
 
 
-def _none(dtype) -> float:
+def _none(dtype) -> float | int:
     """What stands where there is no event: no time, or no kind."""
     return jnp.nan if jnp.issubdtype(dtype, jnp.inexact) else -1
 

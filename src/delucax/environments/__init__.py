@@ -22,6 +22,14 @@ if TYPE_CHECKING:
         mountain_car_discrete as mountain_car_discrete,
         pendulum as pendulum,
     )
+    from ._hybrid import (
+        bouncing_ball as bouncing_ball,
+        compass_gait as compass_gait,
+        rimless_wheel as rimless_wheel,
+        stick_slip as stick_slip,
+        thermostat as thermostat,
+        valve_with_stops as valve_with_stops,
+    )
     from ._linear import cartpole_linear as cartpole_linear, lds as lds
     from ._regulation import (
         cstr as cstr,

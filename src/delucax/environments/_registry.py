@@ -10,6 +10,8 @@ from ._environment import Environment
 
 TASKS = {
     "_classic_control": "acrobot cartpole mountain_car mountain_car_discrete pendulum",
+    "_hybrid": "bouncing_ball compass_gait rimless_wheel stick_slip thermostat "
+    "valve_with_stops",
     "_linear": "cartpole_linear lds",
     "_regulation": "cstr double_integrator lorenz mass_spring_damper neural "
     "permanent_magnet_motor two_tank van_der_pol",

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from .._jax import host_unless_traced, xp
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, Real, Scalar, State, Time
 from ..math import cos, sin
@@ -65,11 +64,6 @@ class BouncingBall(AbstractHybridSystem):
 
     def resets(self, t: Time, x: State, u: Control) -> Sequence[State]:
         return (jnp.stack([x[0], -self.restitution * x[1]]),)
-
-    @host_unless_traced
-    def equilibrium(self) -> tuple[State, Control]:
-        """Hanging at a height of zero, held by the force."""
-        return xp.zeros(2), xp.stack([self.mass * self.gravity])
 
 
 class RimlessWheel(AbstractHybridSystem):
@@ -133,7 +127,3 @@ class RimlessWheel(AbstractHybridSystem):
         lean, kept = x[0] - self.slope, cos(2 * self.half) * x[1]
         step, back = lean - 2 * self.half, lean + 2 * self.half
         return tuple(jnp.stack([self.slope + new, kept]) for new in (step, back))
-
-    @host_unless_traced
-    def equilibrium(self) -> tuple[State, Control]:
-        return xp.zeros(2), xp.zeros(1)

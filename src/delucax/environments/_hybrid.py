@@ -1,0 +1,333 @@
+"""Tasks of plants with events: bounce, roll, walk, switch, slip and land."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._module import parameter
+from .._typing import BoolScalar, Control, Real, Scalar, State, Time
+from ..costs import AbstractCost, Arrival, Quadratic
+from ..math import cos
+from ..systems import (
+    BouncingBall,
+    CompassGait,
+    RimlessWheel,
+    StickSlip,
+    Thermostat,
+    ValveWithStops,
+)
+from ._task import box, Fields, Limit, Number, Positive, task, UniformState
+
+
+def peak(system: BouncingBall, x: State) -> Scalar:
+    """How high the ball would fly without drag and force."""
+    return x[0] + x[1] * x[1] / (2 * system.gravity)
+
+
+class PeakCost(AbstractCost):
+    """`(peak - height)^2 + force_weight force^2`."""
+
+    system: BouncingBall
+    height: Real = parameter()
+    force_weight: Real = parameter(0.01)
+
+    def __call__(self, t: Time, x: State, u: Control) -> Scalar:
+        lack = peak(self.system, x) - self.height
+        return lack * lack + self.force_weight * (u[0] * u[0])
+
+
+class _Rests(eqx.Module):
+    """Whether what is left of the bouncing is low."""
+
+    system: BouncingBall
+    low: Real = parameter(0.05)
+
+    def __call__(self, t: Time, x: State) -> BoolScalar:
+        return peak(self.system, x) < self.low
+
+
+@task(
+    BouncingBall,
+    dt=0.05,
+    horizon=200,
+    arguments=lambda *, drag=0.02: dict(drag=drag),
+)
+def bouncing_ball(
+    system: BouncingBall,
+    *,
+    height: Positive = 2.0,
+    max_force: Limit = 3.0,
+    rest_cost: Number = 1000.0,
+) -> Fields:
+    """Keep a ball bouncing to a height by a force smaller than its weight.
+
+    State (height, velocity); control (force). Starts at rest at a height uniform in
+    [0.5, 1.5]. Cost `(peak - height)^2 + 0.01 force^2` per step, in which
+    `peak = height + velocity^2 / (2 gravity)` is what the energy of the ball would lift
+    it to. The episode ends, at `rest_cost`, when the peak is below 0.05: before the
+    bounces accumulate, unless the restitution is below 0.2.
+
+    The cost and the end hold the ball too: for others call this again, under `jax.vmap`
+    for many.
+
+    **Arguments:**
+
+    - `drag`: of the ball, 0.02 by default.
+    - `height`: of the bounces, 2 by default.
+    - `max_force`: 3 by default.
+    - `rest_cost`: 1000 by default.
+
+    Source: Goebel, Sanfelice and Teel, 2012.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("bouncing_ball", restitution=0.9)
+        ```
+    """
+    rests = _Rests(system)
+    return dict(
+        cost=PeakCost(system, height) + _once(rests, rest_cost),
+        initial_state=UniformState([0.5, 0.0], [1.5, 0.0]),
+        control_bounds=(-max_force, max_force),
+        terminated=rests,
+    )
+
+
+def _once(ended: Callable[[Time, State], BoolScalar], cost: Number) -> Arrival:
+    """What the end of an episode costs."""
+    return Arrival(ended, step_cost=0.0, arrival_cost=cost)
+
+
+class _RollsBack(eqx.Module):
+    """Whether the wheel turns backwards, as it did not come over a spoke."""
+
+    def __call__(self, t: Time, x: State) -> BoolScalar:
+        return x[1] < 0
+
+
+@task(RimlessWheel, dt=0.05, horizon=200)
+def rimless_wheel(
+    system: RimlessWheel,
+    *,
+    speed: Number = 2.0,
+    max_torque: Limit = 2.0,
+    stall_cost: Number = 500.0,
+) -> Fields:
+    """Roll a wheel of spokes down a gentle slope, faster than it rolls by itself.
+
+    State (angle, velocity); control (torque). Starts with the angle uniform in +-0.2
+    about the vertical and the velocity in [0.8, 1.6]. Cost
+    `(velocity - speed)^2 + 0.1 torque^2` per step. The episode ends, at `stall_cost`,
+    when the wheel turns back.
+
+    **Arguments:**
+
+    - `speed`: 2 by default.
+    - `max_torque`: 2 by default, about half of what holds the wheel on its spokes.
+    - `stall_cost`: 500 by default.
+
+    Source: McGeer, 1990; Coleman, Chatterjee and Ruina, 1997.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("rimless_wheel", slope=0.0)
+        ```
+    """
+    back = _RollsBack()
+    cost = Quadratic([0.0, 1.0], [0.1], state_target=[0.0, speed])
+    return dict(
+        cost=cost + _once(back, stall_cost),
+        initial_state=UniformState([-0.2, 0.8], [0.2, 1.6]),
+        control_bounds=(-max_torque, max_torque),
+        terminated=back,
+    )
+
+
+class WalkingCost(AbstractCost):
+    """`(v - speed)^2 + torque_weight torque^2`, v being the speed of the hip along the
+    slope."""
+
+    system: CompassGait
+    speed: Real = parameter()
+    torque_weight: Real = parameter(0.001)
+
+    def __call__(self, t: Time, x: State, u: Control) -> Scalar:
+        leg = self.system.lower + self.system.upper
+        # Walking turns the stance leg forwards, to smaller angles.
+        lack = -leg * cos(x[1] + self.system.slope) * x[3] - self.speed
+        return lack * lack + self.torque_weight * (u[0] * u[0])
+
+
+class _Falls(eqx.Module):
+    """Whether the stance leg leans too far from the normal of the slope, or the swing
+    foot, below the ground as the legs pass, has not come up."""
+
+    system: CompassGait
+    max_lean: Real = parameter(0.8)
+
+    def __call__(self, t: Time, x: State) -> BoolScalar:
+        u = jnp.zeros(1, x.dtype)
+        (height,), (ahead,) = self.system.guards(t, x, u), self.system.enabled(t, x, u)
+        leans = abs(x[1] + self.system.slope) > self.max_lean
+        # A foot that strikes at the end of an interval may be below by rounding.
+        return leans | ahead & (height < -8 * jnp.finfo(x.dtype).eps)
+
+
+@task(CompassGait, dt=0.02, horizon=500)
+def compass_gait(
+    system: CompassGait,
+    *,
+    speed: Number = 0.73,
+    max_torque: Limit = 10.0,
+    fall_cost: Number = 200.0,
+) -> Fields:
+    """Walk on two straight legs with a motor at the hip.
+
+    State (swing, stance, swing rate, stance rate); control (torque). Starts as a step
+    of the passive gait on 3 degrees does, with angles within 0.01 and rates within
+    0.03 of it: there the walker goes on without control; on level ground (`slope=0.0`)
+    it slows down and falls. Cost `(v - speed)^2 + 0.001 torque^2` per step, v being the
+    speed of the hip along the slope. The episode ends, at `fall_cost`, when the walker
+    trips or leans by more than 0.8 from the normal of the slope.
+
+    The cost and the end hold the walker too: for others call this again, under
+    `jax.vmap` for many.
+
+    **Arguments:**
+
+    - `speed`: 0.73 by default, that of the passive gait on 3 degrees.
+    - `max_torque`: 10 by default; 0 for a passive walker.
+    - `fall_cost`: 200 by default.
+
+    Source: Goswami, Thuilot and Espiau, 1998.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("compass_gait", slope=0.0, max_torque=20.0)
+        passive = dlx.make("compass_gait", max_torque=0.0)
+        ```
+    """
+    falls = _Falls(system)
+    # Both feet on the ground.
+    angles = [-0.27105 - system.slope, 0.27105 - system.slope]
+    centre = jnp.stack([*angles, *map(jnp.asarray, (-0.3772, -1.0918))])
+    return dict(
+        cost=WalkingCost(system, speed) + _once(falls, fall_cost),
+        initial_state=UniformState(*box([0.01, 0.01, 0.03, 0.03], centre)),
+        control_bounds=(-max_torque, max_torque),
+        terminated=falls,
+    )
+
+
+@task(Thermostat, dt=0.1, horizon=240)
+def thermostat(
+    system: Thermostat, *, target: Number = 20.0, max_heat: Limit = 2.0
+) -> Fields:
+    """Calm the swings of a room whose heater a thermostat switches, by a heat pump that
+    is too weak to heat alone.
+
+    State (temperature, mode); control (heat). Starts off, with the temperature uniform
+    in [19.2, 20.8]. Cost `(temperature - target)^2 + 0.01 heat^2` per step. Never
+    terminates.
+
+    **Arguments:**
+
+    - `target`: 20 by default.
+    - `max_heat`: to heat or to cool, 2 by default, of which 3 would hold the target.
+
+    Source: Ihara and Schweppe, 1981.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("thermostat", outside=-5.0, power=10.0)
+        ```
+    """
+    return dict(
+        cost=Quadratic([1.0, 0.0], [0.01], state_target=[target, 0.0]),
+        initial_state=UniformState([19.2, 0.0], [20.8, 0.0]),
+        control_bounds=(-max_heat, max_heat),
+    )
+
+
+@task(
+    StickSlip,
+    dt=0.05,
+    horizon=200,
+    arguments=lambda *, damping=0.1: dict(damping=damping),
+)
+def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
+    """Bring a mass that sticks to a moving belt and slips to rest, with the belt
+    slipping under it.
+
+    State (position, velocity, mode); control (force). Starts sticking, with the
+    position uniform in +-0.1. Cost
+    `100 (position - position*)^2 + 10 velocity^2 + force^2` per step, position* being
+    that at rest. Never terminates. Without control it sticks and slips for ever.
+
+    **Arguments:**
+
+    - `damping`: of the mass, 0.1 by default.
+    - `max_force`: 0.5 by default, which is less than either friction.
+
+    Source: Popp and Stelter, 1990.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("stick_slip", static=2.0)
+        ```
+    """
+    rest, _ = system.equilibrium()
+    sticking = jnp.stack([0 * system.belt, system.belt, 0 * system.belt])
+    return dict(
+        cost=Quadratic([100.0, 10.0, 0.0], [1.0], state_target=rest),
+        initial_state=UniformState(*box([0.1, 0.0, 0.0], sticking)),
+        control_bounds=(-max_force, max_force),
+    )
+
+
+@task(ValveWithStops, dt=0.02, horizon=200)
+def valve_with_stops(system: ValveWithStops, *, max_force: Limit = 25.0) -> Fields:
+    """Bring the valve of an engine to its open stop, land softly, and hold it there.
+
+    State (position, velocity, mode); control (force). Starts free, with the position
+    uniform in [0.2, 0.8] and the velocity in +-1. Cost
+    `10 (position - 1)^2 + 0.1 velocity^2 + 0.0002 force^2` per step. Never terminates.
+    Without control the valve comes to rest between its stops; a force of 19.5 holds it
+    open.
+
+    **Arguments:**
+
+    - `max_force`: 25 by default.
+
+    Source: Hoffmann, Peterson and Stefanopoulou, 2003.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("valve_with_stops", restitution=0.5)
+        ```
+    """
+    target = [1.0, 0.0, 0.0]
+    return dict(
+        cost=Quadratic([10.0, 0.1, 0.0], [2e-4], state_target=target),
+        initial_state=UniformState([0.2, -1.0, 0.0], [0.8, 1.0, 0.0]),
+        control_bounds=(-max_force, max_force),
+    )
