@@ -131,6 +131,17 @@ def test_times_of_events_and_their_gradients():
     rows, columns = np.nonzero(np.asarray(trajectory.events.kinds) == 0)
     J = jax.jacrev(lambda p: recorded(p).events.times[rows, columns])(P)
     assert_close(J, jax.jacfwd(lambda p: bounces(p, 10))(P), rtol=1e-8, atol=1e-10)
+    falls = P[1] ** jnp.arange(10) * jnp.sqrt(2 * P[0] * P[2])
+    before, after = (
+        states[rows, columns]
+        for states in (trajectory.events.before, trajectory.events.after)
+    )
+    expected = (
+        jnp.stack([0 * falls, -falls], 1),
+        jnp.stack([0 * falls, P[1] * falls], 1),
+    )
+    assert_close((before, after), expected, atol=1e-12)
+    assert np.sum(np.isfinite(trajectory.events.before)) == 20
     with pytest.raises(ValueError, match="events must be kept"):
         _ = dataclasses.replace(trajectory, recorded_events=None).events
 
@@ -335,6 +346,37 @@ def test_wrappers_report_events():
     assert events.kinds[0] == 0
 
 
+class Gate(s.AbstractHybridSystem):
+    """A point that passes a gate before it is closed, and then meets a wall."""
+
+    state_names, control_names = ("x",), ("u",)
+    event_names = ("gate", "wall")
+
+    def vector_field(self, t, x, u, w):
+        return jnp.ones(1)
+
+    def guards(self, t, x, u):
+        return 0.3 - x[0], 0.8 - x[0]
+
+    def enabled(self, t, x, u):
+        return x[0] > 0.6, True
+
+    def resets(self, t, x, u):
+        return x, x - 5
+
+
+@once
+def test_a_guard_that_is_not_enabled_leaves_no_row_empty():
+    x, _, events = step_of(Gate(), [0.0], dt=1.0)
+    assert list(events.kinds[:2]) == [1, -1]
+    assert_close(jnp.concatenate([events.times[:1], x]), [0.8, -4.0], atol=1e-6)
+    assert_close(
+        jnp.stack([events.before[0], events.after[0]]), [[0.8], [-4.2]], atol=1e-6
+    )
+    over = events.unless(jnp.asarray(True))
+    assert np.all(over.kinds == -1) and np.all(np.isnan(over.after))
+
+
 @once
 def test_events_of_an_interval_whose_control_switches():
     """Two bounces, before and after the switch, are those of the whole interval."""
@@ -347,6 +389,7 @@ def test_events_of_an_interval_whose_control_switches():
     assert_close(events.kinds, expected.kinds)
     assert np.sum(events.kinds == 0) >= 2
     assert_close(events.times, expected.times, atol=1e-5)
+    assert_close(events.after, expected.after, atol=1e-5)
 
 
 @once

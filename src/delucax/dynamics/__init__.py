@@ -11,7 +11,7 @@ from ._base import (
 from ._conversion import c2d as c2d, d2c as d2c
 from ._delays import Delayed as Delayed, TransportDelay as TransportDelay
 from ._discretized import Discretized as Discretized
-from ._hybrid import Events as Events
+from ._event_record import Events as Events
 from ._linear import LinearDynamics as LinearDynamics
 from ._linearize import linearize as linearize, OperatingPoint as OperatingPoint
 from ._method_of_steps import MethodOfSteps as MethodOfSteps

@@ -29,7 +29,8 @@ from .._results import first_of, or_none, Result, RESULTS
 from .._typing import Real, RealScalar
 from ..systems import AbstractHybridSystem, AbstractSystem
 from ._base import AbstractDiscretization
-from ._hybrid import ahead_of_steps, Events, HybridFlow, Intervals, Outcome
+from ._event_record import Events
+from ._hybrid import ahead_of_steps, HybridFlow, Intervals, Outcome
 from ._solver_steps import apply, BrownianTerm, field, solver_step
 
 

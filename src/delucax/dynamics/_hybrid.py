@@ -23,64 +23,7 @@ from .._integration import (
 )
 from .._jax import bounded_while, by_components
 from .._results import choose, first_failure, or_none, Result, RESULTS
-
-
-class Events(eqx.Module):
-    """The events of an interval, in the order in which they fired.
-
-    **Attributes:**
-
-    - `times`: shape `(max_events,)`, NaN behind the last.
-    - `kinds`: indices in `event_names`, shape `(max_events,)`, -1 behind the last.
-    - `fault_time`, `fault_kind`: when and by which guard the interval first failed;
-        NaN and -1 where it did not.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=1.0)
-        falling = 0.0, jnp.array([1.0, 0.0]), jnp.zeros(1), None
-        _, _, events = dynamics.advance_with_events(*falling)
-        events.times[:2], events.kinds[:2]
-        ```
-    """
-
-    times: Array
-    kinds: Array
-    fault_time: Array
-    fault_kind: Array
-
-    def then(self, later: "Events") -> "Events":
-        """The events of two intervals, one after the other, of which as many are kept
-        as one of them has room for.
-
-        **Arguments:** `later`: those of the second.
-
-        **Returns:** all of them.
-        """
-        count = jnp.sum(self.kinds >= 0)
-        behind = jnp.arange(self.kinds.size) - count
-        join = lambda a, b: jnp.where(behind < 0, a, b[jnp.maximum(behind, 0)])
-        first = lambda a, b: jnp.where(self.fault_kind < 0, b, a)
-        return Events(
-            join(self.times, later.times),
-            join(self.kinds, later.kinds),
-            first(self.fault_time, later.fault_time),
-            first(self.fault_kind, later.fault_kind),
-        )
-
-    def unless(self, over: Array) -> "Events":
-        """These, or none where `over` holds."""
-        blank = lambda a: jnp.where(over, jnp.asarray(_none(a.dtype), a.dtype), a)
-        return jax.tree.map(blank, self)
-
-
-def _none(dtype) -> float | int:
-    """What stands where there is no event: no time, or no kind."""
-    return jnp.nan if jnp.issubdtype(dtype, jnp.inexact) else -1
+from ._event_record import Events
 
 
 class Ahead(NamedTuple):
@@ -256,9 +199,7 @@ class Intervals(eqx.Module):
 
     def __call__(self, x: Array, dt: Array, substeps: int, record: bool) -> Outcome:
         """`dt` from `x`, or less where it stops before; the state is held then."""
-        nan, none = jnp.full((), jnp.nan, x.dtype), jnp.asarray(-1)
-        rows = jnp.full(self.max_events, nan), jnp.full(self.max_events, none)
-        events = Events(*rows, nan, none) if record else None
+        events = Events.none(self.max_events, x) if record else None
         known = _knows(self.plant.args[0], x)
         result = choose(known, RESULTS.successful, RESULTS.unknown_mode)
         h = jnp.asarray(dt / substeps, x.dtype)
@@ -318,11 +259,8 @@ class Intervals(eqx.Module):
         result = first_failure(run.result, solved)
         failed = (result == RESULTS.successful) & grazes
         if events is not None:
-            # A cut leaves its row empty.
-            times = events.times.at[run.count].set(jnp.where(fires, time, jnp.nan))
-            kinds = events.kinds.at[run.count].set(jnp.where(fires, event, -1))
-            events = Events(times, kinds, events.fault_time, events.fault_kind)
-            events = _fault(events, failed, event, time)
+            events = events.noted(fires, time, event, x_event, x_after)
+            events = events.with_fault(failed, event, time)
         result = choose(failed, RESULTS.grazing, result)
         ahead = self.look_ahead(s_event, x_after, end)
         stopped = run.stopped
@@ -345,7 +283,7 @@ class Intervals(eqx.Module):
         if events is not None:
             kind = jnp.argmax(jnp.where(beyond, ahead.beyond, ahead.expected))
             time = self.plant.args[1].t + ahead.s
-            events = _fault(events, good & (over | beyond), kind, time)
+            events = events.with_fault(good & (over | beyond), kind, time)
         result = choose(good & over, RESULTS.too_many_events, result)
         result = choose(good & beyond, RESULTS.beyond_guard, result)
         expected = going & ~over & any_of(ahead.expected)
@@ -398,11 +336,3 @@ def _knows(system, x) -> Array:
         return jnp.asarray(True)
     mode = x[system.state_names.index("mode")]
     return jnp.any(mode == jnp.arange(len(system.mode_names)))
-
-
-def _fault(events, failed, event, time) -> Events:
-    """The events, with the first fault noted."""
-    new = lax.stop_gradient(time), jnp.asarray(event, events.kinds.dtype)
-    old = events.fault_time, events.fault_kind
-    noted = (jnp.where(failed, a, b) for a, b in zip(new, old, strict=True))
-    return Events(events.times, events.kinds, *noted)

@@ -92,7 +92,7 @@ def rollout(
     - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
         `"disturbances"`, `"costs"`, `"terminated"`, `"incidents"` and
         `"controller_state"`, all by default, and `"events"` of a hybrid plant, which
-        take room for `max_events` a step.
+        take room for `max_events` times two states a step.
     - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
         step, and the step is computed again; `"sqrt"`: the state at each of about the
         square root of T steps, for long horizons; `None`: all intermediate values,

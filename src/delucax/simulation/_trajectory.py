@@ -107,7 +107,8 @@ class Trajectory(eqx.Module):
     @property
     def events(self) -> Events:
         """The events of each step, [`delucax.dynamics.Events`][] with a leading axis of
-        T: `times` and `kinds` have the shape `(T, max_events)`.
+        T: `times` and `kinds` have the shape `(T, max_events)`, and the states `before`
+        and `after` them `(T, max_events, n)`.
 
         **Raises:** `ValueError` if they were not kept.
         """
