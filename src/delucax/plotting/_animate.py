@@ -14,10 +14,13 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from .._check import check_bool, check_count, check_instance, check_step
+from .._figures import NEUTRAL
 from ..environments import Environment
 from ..simulation import Trajectory
 from ._drawings._canvas import Episode
 from ._export import check_path, compressed, html_player, write
+from ._marks import event_color, mark_events
+from ._path import with_events
 from ._plot import control_bounds, draw_panel
 from ._renderer import PlantArtist
 from ._runs import as_runs, HELD, Panel, panels_of, Run
@@ -26,10 +29,15 @@ from ._runs import as_runs, HELD, Panel, panels_of, Run
 SIZE = 11.0
 # Inches: without the traces and with them, the least height, and what the texts take.
 ALONE, BESIDE, LOWEST, HEADER = (5.0, 4.4), (10.0, 4.6), 1.5, 0.35
+FLASH = 4  # frames that show an event in its colour
 
 
 class Scene:
-    """Draws the frames of an animation, one step of a trajectory each."""
+    """Draws the frames of an animation, one step of a trajectory each.
+
+    The frame that is nearest to an event shows the moment of the event in place of its
+    step, so that what bounces is seen to touch the floor.
+    """
 
     def __init__(
         self,
@@ -39,8 +47,8 @@ class Scene:
         dpi: float | int,
         traces: bool = True,
     ):
-        self.run = run
-        self.states = np.asarray(run.trajectory.states, float)
+        self.run, self.path = run, run.paths[0]
+        self.rows = self._rows_of(np.asarray(indices))
         self.controls = np.asarray(run.trajectory.controls, float)
         panels = panels_of(run, None, grouped=True, where="animate") if traces else []
         step = np.diff(run.times[0]).max(initial=0.0) or 1.0
@@ -56,8 +64,9 @@ class Scene:
             self.lines = self._panels(panels, grid[0, 1].subgridspec(len(panels), 1))
         ax = self.figure.add_subplot(grid[0, 0])
         episode = Episode(environment, run.trajectory)
-        visited = self.states[: int(run.last[0]) + 1]
-        self.plant = PlantArtist(ax, episode, map(self._moment, indices), visited)
+        visited = self.path.states[: self.path.samples[run.last[0]] + 1]
+        moments = map(self._moment, self.rows.values())
+        self.plant = PlantArtist(ax, episode, moments, visited)
 
         if not traces and self.plant.ax.get_aspect() == 1:  # no higher than it must be
             left, right, low, high = self.plant.ax.axis()
@@ -67,9 +76,10 @@ class Scene:
         rect = (0, 0, 1, 1 - HEADER / height)
         self.figure.set_layout_engine(ConstrainedLayoutEngine(rect=rect, wspace=0.06))
         at = 1 - 0.1 / height
+        # The time, the cost and the last event.
         self.texts = [
-            self.figure.text(x / width, at, "", va="top", fontsize=SIZE + 1)
-            for x in (0.2, 2.0)
+            self.figure.text(x / width, at, "", va="top", ha=side, fontsize=SIZE + 1)
+            for x, side in ((0.2, "left"), (1.65, "left"), (width - 0.2, "right"))
         ]
         self.moving = [self.plant.ax, *self.texts, *(line for line, _ in self.lines)]
         for artist in self.moving:
@@ -78,8 +88,20 @@ class Scene:
         self.figure.set_layout_engine("none")
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
-    def _moment(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        return self.states[k], self.controls[min(k, len(self.controls) - 1)]
+    def _rows_of(self, indices: np.ndarray) -> dict[int, int]:
+        """The row of the path that the frame of each step shows."""
+        path = self.path
+        rows = path.samples[indices]
+        times = path.times[rows]
+        for jump in path.jumps:
+            i = int(np.argmin(np.abs(times - path.times[jump])))
+            if 0 < i < len(rows) - 1:  # the first and the last stay what they are
+                rows[i] = jump
+        return dict(zip(indices.tolist(), rows.tolist(), strict=True))
+
+    def _moment(self, row: int) -> tuple[np.ndarray, np.ndarray]:
+        step = min(int(self.path.steps[row]), len(self.controls) - 1)
+        return self.path.states[row], self.controls[step]
 
     def _panels(self, panels: Sequence[Panel], grid: Any) -> list[tuple[Line2D, Any]]:
         """Faint traces of the whole run; the lines over them that grow, and their dots,
@@ -90,39 +112,60 @@ class Scene:
             axes.append(ax)
             handles = draw_panel(ax, panel, [self.run], size=SIZE, faint=0.3)
             for handle, column in zip(handles, panel.columns, strict=True):
-                values = self.run.series[panel.kind][0, :, column]
+                ((times, values),) = self.run.lines(panel.kind, column)
                 drawstyle = "steps-post" if panel.kind in HELD else "default"
                 color = handle.get_color()
                 grown = Line2D([], [], color=color, lw=1.8, drawstyle=drawstyle)
                 dot = Line2D([], [], color=color, marker="o", markersize=6, ls="none")
                 for line in (grown, dot):
                     ax.add_line(line)
-                    lines.append((line, values))
+                    lines.append((line, (times, values)))
             ax.tick_params(labelbottom=panel is panels[-1])
+        of_states = [a for a, p in zip(axes, panels, strict=True) if p.kind == "states"]
+        mark_events(of_states, [self.run])
         axes[-1].set_xlabel(self.run.time_label, fontsize=SIZE)
         self.figure.align_ylabels(axes)
         return lines
 
     def frame(self, k: int) -> np.ndarray:
         """The picture of step `k`, shape `(height, width, 3)`."""
-        times = self.run.times[0]
+        row = self.rows[k]
+        time = self.path.times[row]
         unit = self.run.time_label.removeprefix("time").strip(" []")
         unit = f" {unit}" if unit not in ("", "steps") else ""
-        self.texts[0].set_text(f"t = {times[k]:.{self.decimals}f}{unit}")
+        self.texts[0].set_text(f"t = {time:.{self.decimals}f}{unit}")
         if "costs" in self.run.series:
             costs = self.run.series["costs"][0, :, 0]
             self.texts[1].set_text(f"cost so far {np.nansum(costs[:k]):.4g}")
-        for line, values in self.lines:
+        self._tell_event(row)
+        for line, (times, values) in self.lines:
             # Costs have no value at the end; their dot stays at the last one.
-            last = max(k - 1, 0) if np.isnan(values[k]) else k
-            start = last if line.get_marker() == "o" else 0
-            line.set_data(times[start : k + 1], values[start : k + 1])
-        self.plant.draw(*self._moment(k), self.states[: k + 1])
+            shown = np.flatnonzero((times <= time) & np.isfinite(values))
+            start = shown[-1:] if line.get_marker() == "o" else slice(max(shown) + 1)
+            line.set_data(times[start], values[start])
+        self.plant.draw(*self._moment(row), self.path.states[: row + 1])
         self.canvas.restore_region(self.background)
         renderer = self.canvas.get_renderer()
         for artist in self.moving:
             artist.draw(renderer)
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+    def _tell_event(self, row: int) -> None:
+        """The name of the last event and how often it has fired; in colour and bold
+        when it does."""
+        path, text = self.path, self.texts[2]
+        count = int(np.searchsorted(path.jumps, row, side="right"))
+        if not count:
+            text.set_text("")
+            return
+        kind = int(path.kinds[count - 1])
+        name = self.run.trajectory.event_names[kind].replace("_", " ")
+        text.set_text(f"{name} {np.sum(path.kinds[:count] == kind)}")
+        since = sum(
+            path.jumps[count - 1] <= other <= row for other in self.rows.values()
+        )
+        text.set_color(event_color(kind) if since <= FLASH else NEUTRAL)
+        text.set_fontweight("bold" if since <= FLASH else "normal")
 
 
 FASTEST, SLOWEST = 30.0, 5.0
@@ -178,6 +221,10 @@ def animate(
     without one is shown as a dot in the plane of its two states, or, if it has more or
     fewer, as bars. The animation ends where the episode ends.
 
+    Of a system with events the frame that is nearest to an event shows the moment just
+    after it, and its name is told in colour. Events that the rollout did not keep are
+    found by taking its steps again, which needs the disturbances, if there were any.
+
     **Arguments:**
 
     - `environment`: the environment that was run.
@@ -232,6 +279,7 @@ def animate(
             'keep=("states", "controls", "costs").'
         )
     control_bounds(environment, run, where)
+    trajectory = with_events(environment, trajectory)
     max_frames = check_count(max_frames, "max_frames", where)
     check_step(dpi, where, "dpi")
     if fps is not None:

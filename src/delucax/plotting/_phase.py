@@ -7,19 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from .. import _figures as figures
 from .._check import as_vector, check_instance
-from ..systems import AbstractSystem
+from ..systems import AbstractHybridSystem, AbstractSystem
+from ._marks import event_color
 from ._runs import as_runs, Trajectories
 
 
 Limits: TypeAlias = Float[np.ndarray, "2 2"]
 
 GRID = 60
+DASHES = (0, (5, 2))
 SIZE = 10.0
 
 
@@ -34,7 +37,9 @@ def phase_portrait(
 
     Streamlines follow dx/dt at time 0, thicker where it is faster. A dot marks where a
     trajectory starts. A state that is an angle (the system's `difference` wraps it)
-    shows its trajectories in every turn that is within the limits.
+    shows its trajectories in every turn that is within the limits. Of a system with
+    events the flow is left out beyond the guards, and their zero lines are dashed; a
+    dotted line leads from before to after each event that a trajectory kept.
 
     **Arguments:**
 
@@ -78,7 +83,7 @@ def phase_portrait(
             )
     x, v = (np.linspace(low, high, GRID) for low, high in limits)
     states = np.stack(np.meshgrid(x, v), axis=-1).reshape(-1, 2)
-    field = np.asarray(_field(system, control, jnp.asarray(states), where))
+    field, guards = _field(system, control, jnp.asarray(states), where)
     field = field.reshape(GRID, GRID, 2)
 
     figure = figures.NotebookFigure(figsize=(6.0, 4.8), layout="constrained")
@@ -94,23 +99,35 @@ def phase_portrait(
         style |= {"linewidth": width, "color": to_rgba(figures.NEUTRAL, 0.6)}
         ax.streamplot(x, v, field[..., 0], field[..., 1], **style)
     entries = []
+    for kind, (name, values) in enumerate(guards.items()):
+        color = event_color(kind)
+        style = {"colors": [color], "linestyles": [DASHES], "zorder": 1}
+        values = values.reshape(GRID, GRID)
+        ax.contour(x, v, values, levels=[0.0], linewidths=1.4, **style)
+        entries.append((Line2D([], [], color=color, ls=DASHES, lw=1.4), name))
     for i, run in enumerate(runs):
         style = figures.line_style(i)
-        members = run.series["states"]
+        members = run.paths
         alpha = 1.0 if len(members) == 1 else max(0.2, 0.9 - 0.02 * len(members))
         for path in members:
-            for turn in _turns(system, path, limits):
-                xs, vs = (path + turn).T
+            _, line = path.broken()
+            jumps = np.stack([path.states[path.jumps - 1], path.states[path.jumps]], 1)
+            for turn in _turns(system, path.states, limits):
+                xs, vs = (line + turn).T
                 ax.plot(xs, vs, linewidth=1.8, alpha=alpha, zorder=2, **style)
                 ax.plot(xs[:1], vs[:1], "o", color=style["color"], ms=5, zorder=3)
+                dotted = {"linestyles": ":", "linewidth": 1.2, "alpha": alpha}
+                dotted["color"] = style["color"]
+                ax.add_collection(LineCollection(list(jumps + turn), **dotted))
         handle = Line2D([], [], linewidth=1.8, **style)
-        entries.append((handle, figures.wrapped(run.label, 40)))
+        if isinstance(trajectories, dict):
+            entries.append((handle, figures.wrapped(run.label, 40)))
     ax.set(xlim=limits[0], ylim=limits[1])
     units = system.state_units or ("", "")
     x_label, y_label = map(figures.with_unit, system.state_names, units)
     ax.set_xlabel(figures.wrapped(x_label, 60), size=SIZE)
     ax.set_ylabel(figures.wrapped(y_label, 45), size=SIZE)
-    if isinstance(trajectories, dict) and entries:
+    if entries:
         columns = max(1, 60 // (6 + max(len(label) for _, label in entries)))
         figures.top_legend(figure, entries, ncols=columns, fontsize=SIZE)
     return figure
@@ -132,18 +149,29 @@ def _checked_limits(limits: Any, where: str) -> Limits:
 
 def _field(
     system: AbstractSystem, control: Any, states: Float[Array, "n 2"], where: str
-) -> Float[Array, "n 2"]:
-    """dx/dt at each row of `states`."""
+) -> tuple[Float[np.ndarray, "n 2"], dict[str, np.ndarray]]:
+    """dx/dt at each row of `states`, NaN beyond a guard; and, by their names, the
+    guards that are zero somewhere, NaN where they are not enabled."""
     if not callable(control):
         given = np.zeros(system.control_size) if control is None else control
         control = as_vector(given, system.control_size, "control", where)
-    return _compiled_field(system, control, states, where)
+    field, guards = _compiled_field(system, control, states, where)
+    if not isinstance(system, AbstractHybridSystem):
+        return np.asarray(field), {}
+    values, enabled = map(np.asarray, guards)
+    names = system.event_names
+    directions = np.asarray(system.event_directions or (-1,) * len(names))
+    beyond = np.any(enabled & (values * directions > 0), axis=1)
+    values = np.where(enabled, values, np.nan).T
+    crossed = np.any(values < 0, axis=1) & np.any(values > 0, axis=1)
+    zero = {names[i]: values[i] for i in np.flatnonzero(crossed)}
+    return np.where(beyond[:, None], np.nan, field), zero
 
 
 @eqx.filter_jit
 def _compiled_field(
     system: AbstractSystem, control: Any, states: Float[Array, "n 2"], where: str
-) -> Float[Array, "n 2"]:
+) -> tuple[Float[Array, "n 2"], Any]:
     size = system.control_size
     w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
 
@@ -151,7 +179,10 @@ def _compiled_field(
         u = control
         if callable(control):
             u = as_vector(control(x), size, "what control returns", where)
-        return system.vector_field(0.0, x, u, w)
+        dx, rows = system.vector_field(0.0, x, u, w), ()
+        if isinstance(system, AbstractHybridSystem):
+            rows = system.guards(0.0, x, u), system.enabled(0.0, x, u)
+        return dx, [jnp.stack([jnp.asarray(a) for a in row]) for row in rows]
 
     return jax.vmap(at)(states)
 

@@ -14,6 +14,7 @@ from .. import _figures as figures
 from .._check import check_instance
 from .._results import RESULTS
 from ..environments import Environment
+from ._marks import event_entries, mark_events
 from ._runs import as_runs, FEW, HELD, Panel, panels_of, Run, Trajectories
 
 
@@ -48,7 +49,9 @@ def plot(
     trajectories are laid over each other, with a panel for each state. A ring marks
     where an episode terminated, a cross where it failed. Above the controls a tick
     marks each step at which something went wrong in the controller, such as a failed
-    plan, or, of one trajectory, at which the bounds clipped the control.
+    plan, or, of one trajectory, at which the bounds clipped the control. Events, if
+    they were kept, break the lines of the states; each is a dotted line across their
+    panels, or, where they are many or several trajectories are drawn, a tick above.
 
     The figure is not registered with pyplot: a notebook shows it, and
     `figure.savefig("run.pdf")` writes it.
@@ -113,6 +116,9 @@ def plot(
         ax.tick_params(labelbottom=i + columns >= len(panels))
         if panel.kind == "costs" and not compared:
             ax.set_title(_total(runs[0]), loc="right", fontsize=SIZE - 1, pad=3)
+    of_states = [ax for ax, p in zip(axes, panels, strict=True) if p.kind == "states"]
+    if of_states:
+        mark_events(of_states, runs)
     set_label = axes[-1].set_xlabel if columns == 1 else figure.supxlabel
     set_label(runs[0].time_label, fontsize=SIZE)
     figure.align_ylabels(axes)
@@ -165,10 +171,10 @@ def draw_panel(
             style = figures.line_style(i if compared else j + (panel.kind in HELD))
             if panel.kind == "costs" and not compared:
                 style["color"] = figures.NEUTRAL
-            values = run.series[panel.kind][..., column]
-            _draw_series(ax, run, panel.kind, values, style, faint)
+            _draw_series(ax, run, panel.kind, column, style, faint)
             handles.append(Line2D([], [], linewidth=1.6, **style))
             if panel.kind == "states":
+                values = run.series["states"][..., column]
                 _mark_ends(ax, run, values, style["color"])
     if panel.kind == "controls":
         if bounds is not None:
@@ -202,12 +208,13 @@ def _total(run: Run) -> str:
 
 
 def _draw_series(
-    ax: Axes, run: Run, kind: str, values: Values, style: dict[str, Any], faint: float
+    ax: Axes, run: Run, kind: str, column: int, style: dict[str, Any], faint: float
 ) -> None:
     """One series of a run: a line a member, or the median and a band."""
     held = kind in HELD
     style = style | {"drawstyle": "steps-post" if held else "default"}
     if run.as_band:
+        values = run.series[kind][..., column]
         # Quartiles over the members that have not ended.
         low, middle, high = np.full((3, values.shape[1]), np.nan)
         some = np.any(np.isfinite(values), axis=0)
@@ -218,10 +225,10 @@ def _draw_series(
         ax.fill_between(run.times[0], low, high, step=step, **band)
         ax.plot(run.times[0], middle, linewidth=1.6, **style)
         return
-    members = len(values)
+    members = len(run.times)
     width = 1.6 if members == 1 else 0.9
     alpha = faint * (1.0 if members == 1 else max(0.15, 0.75 - 0.05 * members))
-    for t, v in zip(run.times, values, strict=True):
+    for t, v in run.lines(kind, column):
         ax.plot(t, v, linewidth=width, alpha=alpha, **style)
 
 
@@ -315,6 +322,7 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
         color = figures.NEUTRAL if compared else color
         handle = Line2D([], [], linestyle="none", marker="|", color=color)
         entries.append((handle, _incident_label(name, runs)))
+    entries += event_entries(runs) if "states" in kinds else []
     title = "" if compared else figures.wrapped(runs[0].label, 80)
     if not entries:
         figure.suptitle(title, fontsize=SIZE + 1)

@@ -52,13 +52,14 @@ class PlantArtist:
 
     def draw(self, x: Vector, u: Vector, past: States | None = None) -> None:
         """Draw one moment in the place of the one before, and the path of the `past`
-        states."""
+        states, the last of which is `x`."""
         for artist in self.ax.get_children():
             if id(artist) not in self._fixed:
                 artist.remove()
         self.ax.set_prop_cycle(color=PALETTE)
         self._draw_path(past, 0.8)
-        self.drawing.draw(x, u)
+        known = x[None] if past is None else past
+        self.drawing.draw(x, u, *([known] if self.drawing.walks else []))
 
 
 _INCHES, _DPI = (5.0, 5.0), 100

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from .._check import check_instance, is_concrete
 from .._module import indexed_names
 from ..simulation import Trajectory
+from ._path import Path, path_of
 
 
 Trajectories: TypeAlias = Trajectory | Mapping[Any, Trajectory] | Sequence[Trajectory]
@@ -54,6 +56,25 @@ class Run:
         finite = np.all(np.isfinite(self.series["states"]), axis=-1)
         last = finite.shape[1] - 1 - np.argmax(finite[:, ::-1], axis=1)
         return np.where(finite.any(axis=1), last, 0)
+
+    @functools.cached_property
+    def paths(self) -> list[Path]:
+        """Where each member has been, through its events if they were kept."""
+        events, batch = self.trajectory.recorded_events, self.trajectory.batch_shape
+        flat = lambda a: np.asarray(a).reshape(len(self.times), *a.shape[len(batch) :])
+        events = jax.tree.map(flat, events)
+        members = zip(self.times, self.series["states"], strict=True)
+        return [
+            path_of(times, states, jax.tree.map(operator.itemgetter(i), events))
+            for i, (times, states) in enumerate(members)
+        ]
+
+    def lines(self, kind: str, column: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The times and values of one series, a line for each member."""
+        if kind == "states":
+            broken = [path.broken() for path in self.paths]
+            return [(times, states[:, column]) for times, states in broken]
+        return list(zip(self.times, self.series[kind][..., column], strict=True))
 
     @property
     def time_label(self) -> str:

@@ -196,11 +196,14 @@ class Drawing(NamedTuple):
     - `draw(x, u)` draws one moment.
     - `path(states)` is where the plant has been, shape `(times, 2)`, if it leaves one.
     - `autoscale`: whether the limits of the axes are to fit all that is drawn.
+    - `walks`: whether `draw(x, u, past)` is given the states up to now, too, because
+        they tell how far the plant has come.
     """
 
-    draw: Callable[[Vector, Vector], Any]
+    draw: Callable[..., Any]
     path: Callable[[States], Points] | None = None
     autoscale: bool = False
+    walks: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
