@@ -169,6 +169,38 @@ def original_ilqr(dynamics, cost, x0, controls, *, iterations):
     return learn(dynamics, dynamics, cost, start, iterations=iterations, throw=False)
 
 
+def trajectory_of(env, states, controls=None):
+    """A trajectory with these states; no simulation."""
+    steps = len(states) - 1
+    if controls is None:
+        controls = np.zeros((steps, env.control_size))
+    zero = jnp.zeros(())
+    return dlx.Trajectory(
+        states=jnp.asarray(states),
+        controls=jnp.asarray(controls),
+        costs=jnp.zeros(steps),
+        final_state=jnp.asarray(states[-1]),
+        final_cost=zero,
+        total_cost=zero,
+        length=jnp.asarray(steps),
+        ended=jnp.zeros((), bool),
+        result=dlx.RESULTS.successful,
+        dt=env.dt,
+        recorded_times=None,
+        recorded_observations=None,
+        recorded_disturbances=None,
+        recorded_terminated=None,
+        steps=steps,
+        keep=("states", "controls", "costs"),
+        disturbance_size=env.disturbance_size,
+        state_names=tuple(env.dynamics.state_names),
+        control_names=tuple(env.dynamics.control_names),
+        state_units=tuple(env.dynamics.state_units),
+        control_units=tuple(env.dynamics.control_units),
+        time_unit=env.dynamics.time_unit,
+    )
+
+
 @contextlib.contextmanager
 def counted_programs():
     """The events of compilation within."""

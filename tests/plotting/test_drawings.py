@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import once
+from helpers import once, trajectory_of
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from systems_catalogue import SYSTEMS
@@ -38,38 +38,6 @@ VARIANTS = {
 PLANAR = [name for name, case in SYSTEMS.items() if len(case.low) == 2]
 
 
-def run_of(env, states, controls=None):
-    """A trajectory with these states; no simulation."""
-    steps = len(states) - 1
-    if controls is None:
-        controls = np.zeros((steps, env.control_size))
-    zero = jnp.zeros(())
-    return dlx.Trajectory(
-        states=jnp.asarray(states),
-        controls=jnp.asarray(controls),
-        costs=jnp.zeros(steps),
-        final_state=jnp.asarray(states[-1]),
-        final_cost=zero,
-        total_cost=zero,
-        length=jnp.asarray(steps),
-        ended=jnp.zeros((), bool),
-        result=dlx.RESULTS.successful,
-        dt=env.dt,
-        recorded_times=None,
-        recorded_observations=None,
-        recorded_disturbances=None,
-        recorded_terminated=None,
-        steps=steps,
-        keep=("states", "controls", "costs"),
-        disturbance_size=env.disturbance_size,
-        state_names=tuple(env.dynamics.state_names),
-        control_names=tuple(env.dynamics.control_names),
-        state_units=tuple(env.dynamics.state_units),
-        control_units=tuple(env.dynamics.control_units),
-        time_unit=env.dynamics.time_unit,
-    )
-
-
 def scene_of(env, run, traces=False):
     return Scene(as_runs(run, None, "", "")[0], env, range(run.steps + 1), 40, traces)
 
@@ -77,7 +45,7 @@ def scene_of(env, run, traces=False):
 def drawn(env, x, u=None):
     """The axes with a moment drawn on them, in a run that goes there from rest."""
     u = np.zeros(env.control_size) if u is None else u
-    run = run_of(env, np.stack([np.zeros(env.state_size), x]), np.stack([u]))
+    run = trajectory_of(env, np.stack([np.zeros(env.state_size), x]), np.stack([u]))
     scene = scene_of(env, run)
     fixed = set(map(id, scene.plant.ax.get_children()))
     scene.plant.draw(x, u)
@@ -97,7 +65,9 @@ def test_every_task_has_a_drawing_that_moves(name, arguments):
     assert (drawing_for(env) is generic) == (name in phase_planes)
     rng = np.random.default_rng(0)
     states = 0.5 * rng.normal(size=(4, env.state_size))
-    scene = scene_of(env, run_of(env, states, rng.normal(size=(3, env.control_size))))
+    scene = scene_of(
+        env, trajectory_of(env, states, rng.normal(size=(3, env.control_size)))
+    )
     first, last = scene.frame(0), scene.frame(3)
     assert first.shape[1:] == (200, 3) and 60 <= first.shape[0] <= 176
     header = 14  # where the time is told
@@ -105,7 +75,7 @@ def test_every_task_has_a_drawing_that_moves(name, arguments):
     np.testing.assert_array_equal(scene.frame(0), first)
     # A run that fails, or that goes far away, is drawn too.
     far = np.concatenate([states, 1e4 * states, np.full_like(states, np.nan)])
-    scene_of(env, run_of(env, far)).frame(5)
+    scene_of(env, trajectory_of(env, far)).frame(5)
 
 
 def test_arms_reach_where_the_systems_say():
@@ -167,7 +137,7 @@ def test_time_is_told_in_the_unit_of_the_plant():
     }
     for name, text in texts.items():
         env = dlx.make(name)
-        scene = scene_of(env, run_of(env, np.zeros((4, env.state_size))))
+        scene = scene_of(env, trajectory_of(env, np.zeros((4, env.state_size))))
         scene.frame(2)
         assert scene.texts[0].get_text() == text
 
@@ -181,7 +151,7 @@ def test_spring_joins_its_ends():
 def test_past_is_a_line_and_the_rest_is_faint():
     env = dlx.make("lorenz")
     states = np.cumsum(np.ones((6, 3)), axis=0)
-    scene = scene_of(env, run_of(env, states))
+    scene = scene_of(env, trajectory_of(env, states))
     scene.frame(3)
     paths = [line for line in scene.plant.ax.get_lines() if len(line.get_xdata()) > 1]
     whole, past = paths

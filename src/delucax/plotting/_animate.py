@@ -143,7 +143,8 @@ class Scene:
             shown = np.flatnonzero((times <= time) & np.isfinite(values))
             start = shown[-1:] if line.get_marker() == "o" else slice(max(shown) + 1)
             line.set_data(times[start], values[start])
-        self.plant.draw(*self._moment(row), self.path.states[: row + 1])
+        past = self.path.times[: row + 1], self.path.states[: row + 1]
+        self.plant.draw(*self._moment(row), past)
         self.canvas.restore_region(self.background)
         renderer = self.canvas.get_renderer()
         for artist in self.moving:

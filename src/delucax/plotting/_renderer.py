@@ -14,7 +14,7 @@ from .._figures import PALETTE
 from ..controllers import Zero
 from ..environments import Environment
 from ..simulation import rollout
-from ._drawings._canvas import Canvas, Episode, States, Vector
+from ._drawings._canvas import Canvas, Episode, Past, States, Vector
 from ._drawings._registry import drawing_for
 
 
@@ -50,15 +50,16 @@ class PlantArtist:
             path = np.asarray(self.drawing.path(states))
             self.ax.plot(*path.T, color=PALETTE[0], lw=1.8, alpha=alpha, zorder=1)
 
-    def draw(self, x: Vector, u: Vector, past: States | None = None) -> None:
-        """Draw one moment in the place of the one before, and the path of the `past`
-        states, the last of which is `x`."""
+    def draw(self, x: Vector, u: Vector, past: Past | None = None) -> None:
+        """Draw one moment in the place of the one before, and the path up to it of the
+        `past` times and states, the last of which is `x`."""
         for artist in self.ax.get_children():
             if id(artist) not in self._fixed:
                 artist.remove()
         self.ax.set_prop_cycle(color=PALETTE)
-        self._draw_path(past, 0.8)
-        known = x[None] if past is None else past
+        if past is not None:
+            self._draw_path(past[1], 0.8)
+        known = past or (np.zeros(1), x[None])
         self.drawing.draw(x, u, *([known] if self.drawing.walks else []))
 
 

@@ -188,6 +188,7 @@ class View(NamedTuple):
 
 Vector: TypeAlias = Float[np.ndarray, "_"]  # noqa: F821
 States: TypeAlias = Float[np.ndarray, "times states"]
+Past: TypeAlias = tuple[Float[np.ndarray, " times"], States]
 
 
 class Drawing(NamedTuple):
@@ -196,8 +197,8 @@ class Drawing(NamedTuple):
     - `draw(x, u)` draws one moment.
     - `path(states)` is where the plant has been, shape `(times, 2)`, if it leaves one.
     - `autoscale`: whether the limits of the axes are to fit all that is drawn.
-    - `walks`: whether `draw(x, u, past)` is given the states up to now, too, because
-        they tell how far the plant has come.
+    - `walks`: whether it is `draw(x, u, past)`, which is given the times and the states
+        up to now, too, as they tell how far the plant has come.
     """
 
     draw: Callable[..., Any]

@@ -14,7 +14,7 @@ from ..._figures import style_axes, with_unit, wrapped
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
 from ...systems import AbstractSystem
-from . import _machines, _mechanics, _vehicles
+from . import _machines, _mechanics, _switches, _vehicles, _walkers
 from ._canvas import Canvas, Drawing, Episode, layers, Setup, Vector, View
 
 
@@ -119,7 +119,9 @@ def bars(canvas: Canvas, episode: Episode) -> Drawing:
 
 _BY_TYPE: dict[type, Setup] = {
     systems.Acrobot: _mechanics.acrobot,
+    systems.BouncingBall: _switches.ball,
     systems.CartPole: _mechanics.cart_pole,
+    systems.CompassGait: _walkers.compass_gait,
     systems.DoubleIntegrator: _mechanics.double_integrator,
     systems.DynamicBicycle: _vehicles.car,
     systems.KinematicBicycle: _vehicles.car,
@@ -132,7 +134,12 @@ _BY_TYPE: dict[type, Setup] = {
     systems.PlanarQuadrotor: _vehicles.planar_quadrotor,
     systems.Quadrotor: _vehicles.quadrotor,
     systems.Reacher: _mechanics.reacher,
+    systems.RimlessWheel: _walkers.rimless_wheel,
+    systems.SimplestWalker: _walkers.simplest_walker,
+    systems.StickSlip: _switches.stick_slip,
+    systems.Thermostat: _switches.thermostat,
     systems.TwoTank: _machines.two_tank,
+    systems.ValveWithStops: _switches.valve,
     AbstractDynamics: state_space,  # what has no drawing of its own
 }
 # Lungs, and linear models, which keep the names of the plant that they approximate.
