@@ -1,10 +1,12 @@
 """`python -m benchmarks.policies`: training by the gradient, by PPO and by SHAC.
 
-Three parts, each written to `benchmarks/results/policies.json` when it is done:
+Four parts, each written to `benchmarks/results/policies.json` when it is done:
 
 - `swing-up`: the analytic gradient and PPO, ten seeds each, with the steps and the
   seconds that they take;
 - `tuning`: eight settings of each method, on seeds that are not among those reported;
+- `tasks`: every named task by `training.synthesise`, five seeds each, stored one by one
+  in `results/synthesis.jsonl`; `--task pendulum` runs one;
 - `learning`: PPO, SHAC and the analytic gradient at equal steps of the environment, 30
   seeds, with the best of these; draws `docs/assets/learning.svg`. `--steps 40000` runs
   one of the budgets.
@@ -32,6 +34,7 @@ import delucax as dlx
 from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._paired import middle, spread
 from benchmarks._results import updated
+from benchmarks._synthesis import tasks
 from delucax.studies import holds_upright, train_swing_up
 from delucax.training import (
     actor_critic,
@@ -44,7 +47,7 @@ from delucax.training import (
 
 RESULTS = Path(__file__).parent / "results" / "policies.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "assets" / "learning.svg"
-PARTS = ("swing-up", "tuning", "learning")
+PARTS = ("swing-up", "tuning", "learning", "tasks")
 BUDGETS = (40_000, 80_000, 160_000, 320_000)
 """Steps of the environment that a seed is trained for."""
 STARTS = 100
@@ -288,6 +291,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.policies")
     parser.add_argument("--part", choices=PARTS, action="append")
     parser.add_argument("--steps", type=int, choices=BUDGETS, help="one budget, again")
+    parser.add_argument("--task", action="append", default=[], help="one task alone")
+    parser.add_argument("--seeds", type=int, default=5, help="of each task")
     parser.add_argument("--small", action="store_true", help="to try it; not written")
     options = parser.parse_args()
     compile_anew()
@@ -295,6 +300,9 @@ def main() -> None:
     runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}
     for part in options.part or PARTS:
         print(f"\n== {part}", flush=True)
+        if part == "tasks":
+            tasks(options.task, options.seeds)
+            continue
         found = runs[part](options)
         if options.small:
             continue
