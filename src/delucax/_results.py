@@ -63,6 +63,12 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No step lowered the cost, although the gradient is not zero: the problem may "
         "not be smooth there, or the tolerance may be below rounding."
     )
+    events_changed = (
+        "The events along the trajectory change from one iterate to the next, so that "
+        "the model of one does not tell of the other, and the iteration ended without "
+        "convergence: the best plan may be where an event is about to appear, or moves "
+        "to another interval. The plan is the best so far."
+    )
     too_many_events = (
         "More events than max_events fell in one interval, and the state is held after "
         "the last: they may accumulate, or a reset may leave its guard at zero. Raise "

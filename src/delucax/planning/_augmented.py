@@ -57,7 +57,11 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         raised = jnp.where(enough, rho, _RHO_GROWTH * rho)
         hopeless = (raised > most_rho) & ~settled & ~spent
         lost = after.result == RESULTS.diverged
-        result = choose(settled, RESULTS.successful, RESULTS.not_converged)
+        result = RESULTS.not_converged
+        if problem.dynamics.event_names:
+            changed = after.result == RESULTS.events_changed
+            result = choose(changed, RESULTS.events_changed, result)
+        result = choose(settled, RESULTS.successful, result)
         result = choose(hopeless, RESULTS.no_feasible_point, result)
         after = after._replace(
             violation=violation,

@@ -79,9 +79,28 @@ class _Progress(NamedTuple):
     """By how much rounding may change the cost."""
     negligible: Array
     """Whether the decrease that `policy` predicts is less than that."""
+    events: "Events"
     started: Array
     """Whether the starts have been compared."""
     done: Array
+
+
+class Events(NamedTuple):
+    """What the searches saw of a hybrid plant's events; `None` of another plant.
+
+    - `counts`: how many each step of `now` has, shape `(T,)`; -1 where it is not known.
+    - `changed`: whether a candidate had others, since the last full step that was taken
+        without regularisation and without such a candidate.
+    """
+
+    counts: Array | None
+    changed: Array | None
+
+    def differ(self, counts: Array | None) -> Array | None:
+        """Whether a candidate has other events."""
+        if self.counts is None or counts is None:
+            return None
+        return jnp.any((counts != self.counts) & (self.counts >= 0))
 
 
 def optimise(
@@ -127,7 +146,12 @@ def optimise(
         )
     no, nothing = jnp.asarray(False), jnp.zeros_like(controls)
     policy = Policy(now.gains, nothing, nothing, zero, zero, zero, no)
-    first = _Progress(now, policy, defects, zero + 1, ~no, zero, zero, no, no, no)
+    events = Events(None, None)
+    if problem.dynamics.event_names:
+        events = Events(jnp.full(T, -1), no)
+    first = _Progress(
+        now, policy, defects, zero + 1, ~no, zero, zero, no, events, no, no
+    )
     body = functools.partial(_iterate, problem, options, starts, count)
     now = lax.while_loop(lambda progress: ~progress.done, body, first).now
     counts = jnp.arange(options.max_iterations + 1)
@@ -148,8 +172,8 @@ def _iterate(
     """A line search, and the model about where it led. The first one compares starts:
     the loop has one body, so that one roll-out is compiled."""
     now, started, tolerance = before.now, before.started, options.tolerance
-    trajectory, accepted, tried = _searched(problem, options, starts, count, before)
-    states, controls, cost, defects = trajectory
+    searched = _searched(problem, options, starts, count, before)
+    (states, controls, cost, defects), accepted, tried, events = searched
     lost = ~started & ~jnp.isfinite(cost)
     # Fall back to Gauss-Newton if the exact Hessian is indefinite or the search failed.
     flatten = ~accepted & before.exact & options.second_order
@@ -184,6 +208,8 @@ def _iterate(
     converged = policy.ok & closed & (settled | spent) & ~failed
     result = choose(converged, RESULTS.successful, RESULTS.not_converged)
     result = choose(stuck, RESULTS.no_descent, result)
+    if events.changed is not None:
+        result = choose(events.changed & ~converged, RESULTS.events_changed, result)
     after = now._replace(
         states=states,
         controls=controls,
@@ -198,19 +224,21 @@ def _iterate(
     )
     penalty = _penalty(before.penalty, defects, policy)
     done = failed | converged | (iteration >= options.max_iterations)
-    changing = delta, exact, penalty, rounding, negligible, jnp.ones_like(started)
-    return _Progress(after, policy, defects, *changing, done)
+    changing = delta, exact, penalty, rounding, negligible, events
+    return _Progress(after, policy, defects, *changing, jnp.ones_like(started), done)
 
 
 def _searched(problem, options, starts, count, before: _Progress):
     """Backtracking line search: the states, controls, cost and defects after the
-    longest step of sufficient decrease, or as before; whether one was accepted; and how
-    many were tried. Before the first iteration, those of the cheapest of the starts.
+    longest step of sufficient decrease, or as before; whether one was accepted; how
+    many were tried; and the events. Before the first iteration, those of the cheapest
+    of the starts.
 
     The merit function is the cost plus `penalty` times the sum of the defects. The cost
     is known to within `rounding`.
     """
     now, policy, defects = before.now, before.policy, before.defects
+    events = before.events
     missed = 0.0 if defects is None else jnp.sum(jnp.abs(defects))
     # A step that only rounding makes worse is taken, or the search would end short of
     # the minimum.
@@ -221,15 +249,16 @@ def _searched(problem, options, starts, count, before: _Progress):
     length_of = lambda i: 0.5 ** i.astype(now.cost.dtype)
 
     def trial(i):
-        """The trajectory, and its rank: the lowest one is taken."""
+        """The rank of a trajectory, of which the lowest one is taken; itself; and
+        whether it has other events."""
         # The feedback of a start is followed as it is: the change `k` is zero then.
         own = now.states, now.controls, policy.K
         given = starts.states, starts.controls, starts.gains
         pick = lambda own, given: jnp.where(before.started, own, given[i])
         length = length_of(i)
         xs, us, K = jax.tree.map(pick, own, given)
-        path = roll_out(problem, xs, us, K, policy.k, length, defects)
-        *_, cost = path
+        path = roll_out(problem, xs, us, K, policy.k, length, defects, True)
+        *_, cost, counts = path
         # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
         # times the defects, of which a step of length a closes that share.
         curvature = length * policy.curvature / 2
@@ -238,45 +267,52 @@ def _searched(problem, options, starts, count, before: _Progress):
         enough = decrease >= LEAST_SHARE * predicted - slack
         enough = enough & jnp.isfinite(cost)
         rank = jnp.where(enough, i.astype(cost.dtype), jnp.inf)
-        return jnp.where(before.started, rank, cost), path
+        return jnp.where(before.started, rank, cost), path, events.differ(counts)
 
     if options.line_search == "parallel":
         most = jnp.arange(max(HALVINGS, starts.count))
-        ranks, candidates = jax.vmap(trial)(most)
+        ranks, candidates, others = jax.vmap(trial)(most)
         best = jnp.argmin(jnp.where(most < number, ranks, jnp.inf))
         rank, candidate = jax.tree.map(lambda a: a[best], (ranks, candidates))
         rank, tried = jnp.where(best < number, rank, jnp.inf), number
+        other = others if others is None else jnp.any(others & (most < number))
     else:
 
         def body(carry):
-            i, best, rank, candidate = carry
-            new, path = trial(i)
+            i, best, rank, candidate, other = carry
+            new, path, differs = trial(i)
             lower = (new < rank) | (i == 0)
             keep = lambda new, old: jnp.where(lower, new, old)
-            return i + 1, *jax.tree.map(keep, (i, new, path), (best, rank, candidate))
+            other = None if differs is None else other | differs
+            kept = (i, new, path), (best, rank, candidate)
+            return i + 1, *jax.tree.map(keep, *kept), other
 
         # Steps are tried until one is accepted, all starts are compared.
         going = lambda carry: (
             (carry[0] < number) & ~(before.started & jnp.isfinite(carry[2]))
         )
         index = jnp.zeros((), int)
-        last = now.states, now.controls, now.cost
-        nothing = index, index, jnp.full_like(now.cost, jnp.inf), last
-        tried, best, rank, candidate = lax.while_loop(going, body, nothing)
+        last = now.states, now.controls, now.cost, events.counts
+        none = None if events.changed is None else jnp.zeros_like(events.changed)
+        nothing = index, index, jnp.full_like(now.cost, jnp.inf), last, none
+        tried, best, rank, candidate, other = lax.while_loop(going, body, nothing)
     accepted = jnp.isfinite(rank)
     # Of starts that all diverge the first one is left, for what it shows.
     keep = lambda new, old: jnp.where(
         accepted | (~before.started & (number > 0)), new, old
     )
-    last = now.states, now.controls, now.cost
-    states, controls, cost = jax.tree.map(keep, candidate, last)
+    last = now.states, now.controls, now.cost, events.counts
+    states, controls, cost, counts = jax.tree.map(keep, candidate, last)
     # Its controls are finite at least as given.
     controls = jnp.where(accepted, controls, now.controls)
     if defects is not None:
         # A step of length a removes that share of the defects.
         left = (1 - length_of(best)) * defects
         defects = jnp.where(accepted, left, defects)
-    return (states, controls, cost, defects), accepted, tried
+    if events.changed is not None and other is not None:
+        full = accepted & (now.regularisation == 0)
+        other = before.started & (other | events.changed & ~full)
+    return (states, controls, cost, defects), accepted, tried, Events(counts, other)
 
 
 def first_accepted(

@@ -62,6 +62,11 @@ class ILQR(AbstractPlanner):
     far from the region of interest. If `controls` is a number of steps, it starts from
     the LQR's trajectory if that is cheaper than that of the equilibrium's control.
 
+    Where the number of events in a step of a hybrid plant is another, the model of an
+    iterate does not hold, and the cost may have a kink or a jump. If the iteration ends
+    there without convergence, the result is `events_changed`, and the plan is the best
+    so far. A start with the wanted events leads to a plan that has them.
+
     Under `jax.vmap` on CPU the plans of a batch are made one after the other, which is
     up to six times as fast as together, where each iteration would wait for the longest
     line search and the last plan; accelerators make them together.
@@ -238,8 +243,9 @@ def ilqr(
     - `tolerance`: the square root of the precision by default (1.5e-8 in float64). At 0
         all iterations are taken.
     - `throw`: raise unless converged (default); if false, look at `plan.result`, which
-        is `not_converged`, `no_descent`, `no_feasible_point` if no weight makes
-        the constraints hold, or `diverged` if every start diverges: the plan is
+        is `not_converged`, `no_descent`, `events_changed` where the events of a hybrid
+        plant are others from one iterate to the next, `no_feasible_point` if no weight
+        makes the constraints hold, or `diverged` if every start diverges: the plan is
         then the best iterate.
 
     **Returns:** a [`delucax.planning.Plan`][]. It is stationary if it has converged.

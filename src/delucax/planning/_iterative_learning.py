@@ -265,7 +265,7 @@ def _iterate(
     model = dataclasses.replace(plant, dynamics=model, w=None)
     # The first run follows the plan's own feedback, without a change.
     unchanged = jnp.zeros_like(plan.controls)
-    first = roll_out(plant, *about, unchanged, zero)
+    first = roll_out(plant, *about, unchanged, zero)[:3]
     lost = ~jnp.isfinite(first[2])
 
     def policy_of(states, controls, before) -> tuple[Array, Policy]:
@@ -294,7 +294,8 @@ def _iterate(
             power = 1.0 - tried.astype(dtype) ** 2
             length = now.step * jnp.asarray(1.1, dtype) ** power
             if online is None:
-                after = roll_out(plant, states, controls, policy.K, policy.k, length)
+                along = states, controls, policy.K, policy.k, length
+                after = roll_out(plant, *along)[:3]
             else:
                 rest = states, controls, policy, length, now.rate, online
                 after = _perturbed(plant, model, *rest)

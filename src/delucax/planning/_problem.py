@@ -235,7 +235,7 @@ class Problem(eqx.Module):
         if states is None:
             points = controls.shape[0] + 1
             states = jnp.broadcast_to(self.x0, (points, *self.x0.shape))
-        return roll_out(self, states, controls, gains)
+        return roll_out(self, states, controls, gains)[:3]
 
     # Compiled: the numbers of a plan that diverged are not refused while it is traced.
     @eqx.filter_jit
@@ -280,12 +280,15 @@ def roll_out(
     k: Array | None = None,
     length: Array | float = 0.0,
     defects: Array | None = None,
-) -> tuple[Array, Array, Array]:
-    """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
+    count_events: bool = False,
+) -> tuple[Array, Array, Array, Array | None]:
+    """The trajectory under `u - length k - K (x - x_planned)`, its cost, and how many
+    events each step has if they are counted and the dynamics have any.
 
     Each of `K` and `k` may be left out. `1 - length` of each defect is left.
     The cost is infinite if a step fails or a number is not finite.
     """
+    count_events = count_events and bool(problem.dynamics.event_names)
     size = problem.x0.shape[0]
     split = functools.partial(split_state, most=_SPLIT_UP_TO)
 
@@ -298,13 +301,18 @@ def roll_out(
         if K is not None:
             u = u - matvec(K, problem.deviation(x, planned))
         u = problem.clip(u)
-        x_next, result = problem.dynamics.advance(t, x, u, w)
+        if count_events:
+            advance = problem.dynamics.advance_with_events
+            x_next, result, events = advance(t, x, u, w)
+            count = jnp.sum(events.kinds >= 0)
+        else:
+            (x_next, result), count = problem.dynamics.advance(t, x, u, w), None
         x_next = x_next.astype(x.dtype)
         # Multiple shooting: a step of this length closes that share of the defects, so
         # the trajectory stays near the guess of the states.
         if defect is not None:
             x_next = x_next - (1 - length) * defect
-        return split(x_next), (parts, u, or_none(result))
+        return split(x_next), (parts, u, or_none(result), count)
 
     times = problem.times(controls.shape[0])[:-1]
     inputs = (times, states[:-1], controls, K, k, defects, problem.w)
@@ -312,11 +320,12 @@ def roll_out(
     # of a planner is spent here. A larger one is carried whole, with its products.
     whole = size > _SPLIT_UP_TO
     body = products_whole()(body) if whole else by_components(body)
-    last, (parts, controls, results) = lax.scan(body, split(problem.x0), inputs)
+    last, kept = lax.scan(body, split(problem.x0), inputs)
+    parts, controls, results, counts = kept
     states = stack_steps(parts, size, last)
     # All states are checked, because a cost may ignore some of them, or clip them.
     cost = problem.total(states, controls)
     good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(states))
     # A step whose solver failed may still give finite numbers.
     good = good & (first_of(results) == RESULTS.successful)
-    return states, controls, jnp.where(good, cost, jnp.inf)
+    return states, controls, jnp.where(good, cost, jnp.inf), counts

@@ -76,6 +76,9 @@ class SQP(AbstractPlanner):
     constraints have positive multipliers and are independent. They are zero with
     respect to `controls` and `states`, from which the iteration only starts.
 
+    Events of a hybrid plant are not followed from one iterate to the next: a plan at a
+    kink, where they change, does not converge, and is `not_converged` or `no_descent`.
+
     Under `jax.vmap` on CPU the plans of a batch are made one after the other, as by
     [`delucax.planning.ILQR`][].
 
