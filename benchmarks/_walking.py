@@ -78,7 +78,8 @@ class Network(dlx.AbstractController):
 
 class Tracking(dlx.AbstractController):
     """The torque that brings the energy to a target, as Goswami, Espiau and Keramane,
-    1997, have it, without their division by zero."""
+    1997, have it, without their division by zero. Target and gain are the best of 35
+    pairs, on four starts of their own."""
 
     system: Any = dlx.parameter()
     target: Array = dlx.parameter(4.0)

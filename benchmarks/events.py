@@ -4,8 +4,9 @@ Ten bounces against their closed form, derivatives that other libraries were rep
 miss, periodic gaits against published ones, delays against exact sampled systems; a
 throw with one bounce that iLQR plans; a walker that is trained through its impacts; and
 what events cost: the gradient, a batch, and the first answer in a fresh process. Double
-precision on one core. Prints tables and writes `benchmarks/results/events.json`;
-`--part` runs one again, such as `--part speed` on a quiet machine.
+precision on one core. Prints tables, writes `benchmarks/results/events.json` and the
+tables of `docs/events.md`; `--part speed`, or another, runs one again, and `--draw`
+writes the tables from the file alone.
 """
 
 from pathlib import Path
@@ -25,6 +26,8 @@ from benchmarks._walking import walker
 
 
 RESULTS = Path(__file__).parent / "results" / "events.json"
+PAGE = Path(__file__).parents[1] / "docs" / "events.md"
+WHOLE = "starts", "starts, finer steps", "fewest steps"
 TARGET = np.array([3.0, 1.0])
 
 
@@ -121,8 +124,8 @@ def speed(quick: bool) -> list[dict[str, Any]]:
         ("1,024 balls at once", batches, 10.0),
     ):
         ball, fall = race(contenders, rounds=rounds)
-        found.append(row(f"{what}: ns a step", ball.best))
-        found.append(row(f"{what}: times that without events", ball.ratio(fall), limit))
+        found.append(row(f"{what}, ns a step", ball.best))
+        found.append(row(f"{what}, times that without events", ball.ratio(fall), limit))
     return found
 
 
@@ -162,11 +165,50 @@ PARTS: dict[str, Any] = {
 
 
 def draw(content: dict[str, Any]) -> None:
-    """Print all figures."""
+    """Print all figures, and put those of accuracy, of the walker and of speed into the
+    tables of the page."""
     for name in PARTS:
         rows = content[name]
         table = pd.DataFrame(rows["rows"] if isinstance(rows, dict) else rows)
         print(f"\n{name}\n{table.to_string(index=False)}")
+    known = [found for name in ACCURACY for found in content[name]]
+    tables = {
+        "errors": [
+            [found["what"], f"{found['measured']:.0e}", f"{found['limit']:.0e}"]
+            for found in known
+            if found["limit"] is not None
+        ],
+        "published": [
+            [found["what"], _as(found["published"], found["measured"])]
+            + [found["published"]]
+            for found in known
+            if found["published"] is not None
+        ],
+        "walker": [
+            [found["walker"], *(str(found[key]) for key in WHOLE)]
+            + [f"{found['seconds a step']:.2f}", f"{found['torque']:.1f}"]
+            for found in content["walker"]["rows"]
+        ],
+        "cost": [
+            [found["what"], f"{found['measured']:.2g}", f"{found['limit'] or '-'}"]
+            for found in content["speed"]
+            if "times" in found["what"]
+        ],
+    }
+    text = PAGE.read_text()
+    for name, rows in tables.items():
+        begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->"
+        before, _, rest = text.partition(begin)
+        table, _, after = rest.partition(end)
+        head = table.strip().split("\n")[:2]
+        lines = [*head, *(f"| {' | '.join(cells)} |" for cells in rows)]
+        text = "\n".join([before + begin, *lines, "", end + after])
+    PAGE.write_text(text)
+
+
+def _as(published: str, measured: float) -> str:
+    """A number with the digits of a published one, two decimals at least."""
+    return f"{measured:.{max(len(published.partition('.')[2]), 2)}f}"
 
 
 def main() -> None:
