@@ -257,7 +257,8 @@ def _searched(problem, options, starts, count, before: _Progress):
         pick = lambda own, given: jnp.where(before.started, own, given[i])
         length = length_of(i)
         xs, us, K = jax.tree.map(pick, own, given)
-        path = roll_out(problem, xs, us, K, policy.k, length, defects, True)
+        along = xs, us, K, policy.k, length, defects
+        path = roll_out(problem, *along, count_events=True)
         *_, cost, counts = path
         # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
         # times the defects, of which a step of length a closes that share.
