@@ -15,6 +15,7 @@ from ._field import (
 from ._runge_kutta import (
     RK4 as RK4,
     runge_kutta_step as runge_kutta_step,
+    runge_kutta_step_in_loop as runge_kutta_step_in_loop,
     tableau_of as tableau_of,
 )
 from ._solvers import (

@@ -37,6 +37,7 @@ from ._derivatives import (
     is_constant as is_constant,
     jacobian as jacobian,
     nan_tangent as nan_tangent,
+    operations as operations,
     value_and_jacobians as value_and_jacobians,
 )
 from ._loops import bounded_while as bounded_while, in_parts as in_parts

@@ -90,6 +90,11 @@ def _primitives(jaxpr: Any) -> Iterator[str]:
                 yield from _primitives(leaf)
 
 
+def operations(f: Callable[..., Any], *args: Any) -> int:
+    """How many operations the program of `f` has, those of nested ones included."""
+    return sum(1 for _ in _primitives(jax.make_jaxpr(f)(*args)))
+
+
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
     """Whether the array that `f` returns depends on none of its arguments."""
     # Dead code elimination that keeps the output says which inputs it needs.

@@ -1,5 +1,6 @@
 """A continuous system integrated over one control interval."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -18,12 +19,13 @@ from .._integration import (
     evaluate_field,
     RK4,
     runge_kutta_step,
+    runge_kutta_step_in_loop,
     solve_result,
     tableau_of,
     throwing_adjoint,
     TimeOffset,
 )
-from .._jax import by_components, join_state, split_state
+from .._jax import by_components, join_state, operations, split_state
 from .._module import parameter
 from .._results import first_of, or_none, Result, RESULTS
 from .._typing import Real, RealScalar
@@ -34,6 +36,9 @@ from ._hybrid import ahead_of_steps, HybridFlow, Intervals, Outcome
 from ._solver_steps import apply, BrownianTerm, field, solver_step
 
 
+_LARGE = 64
+"""Operations of a field above which a step to an event has its stages in a loop: there
+are five such steps in a program, and each would repeat them four times."""
 # Euler and ItoMilstein converge to the solution in Itô's sense, the others to that in
 # Stratonovich's: where g depends on x these are different processes.
 _SDE_SOLVERS = (
@@ -293,14 +298,17 @@ class Discretized(AbstractDiscretization):
         system, start, u, _ = args
         guards = lambda t: jnp.stack(list(system.guards(t, x, u)))
         plant = HybridFlow(self, args, TimeOffset(start.t, guards))
+        # The first step is the one that is taken where nothing happens.
         look_ahead = plant.ahead
+        if operations(lambda x: field(jnp.zeros_like(x[0]), x, args), x) > _LARGE:
+            plant = dataclasses.replace(plant, in_loop=True)
         if self.stepsize_controller is not None:
             look_ahead = functools.partial(ahead_of_steps, plant)
         assert self.max_events is not None
         through = Intervals(plant, look_ahead, self.max_events, until)
         return through(x, self.dt, self.substeps, record)
 
-    def flow(self, args: Any) -> Any:
+    def flow(self, args: Any, in_loop: bool = False) -> Any:
         """One step of the solver, `(s, x, h) -> (x_next, result)`: of `h` from `x` at
         `s` after the start of the interval."""
         system, start, u, held = args
@@ -318,7 +326,8 @@ class Discretized(AbstractDiscretization):
         # The field itself is in the loop where nothing is to be corrected: fewer frames
         # lie between it and an error that it raises.
         rhs = (lambda s, x: field(s, x, args)) if start.is_corrected else checked
-        step = functools.partial(runge_kutta_step, tableau, rhs)
+        method = runge_kutta_step_in_loop if in_loop else runge_kutta_step
+        step = functools.partial(method, tableau, rhs)
         return lambda s, x, h: (step(s, x, h), RESULTS.successful)
 
     def _noisy_step(self, x, args):

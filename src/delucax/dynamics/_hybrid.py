@@ -57,6 +57,7 @@ class HybridFlow(eqx.Module):
     dynamics: Any
     args: Any
     guard_start: TimeOffset
+    in_loop: bool = eqx.field(static=True, default=False)
 
     @property
     def _system(self):
@@ -64,7 +65,7 @@ class HybridFlow(eqx.Module):
 
     def step(self, s: Array, x: Array, h: Array) -> tuple[Array, Result]:
         """One step of the solver."""
-        return self.dynamics.flow(self.args)(s, x, h)
+        return self.dynamics.flow(self.args, self.in_loop)(s, x, h)
 
     def guards(self, s: Array, x: Array) -> Array:
         """The guards, shape `(events,)`."""
@@ -262,7 +263,8 @@ class Intervals(eqx.Module):
             events = events.noted(fires, time, event, x_event, x_after)
             events = events.with_fault(failed, event, time)
         result = choose(failed, RESULTS.grazing, result)
-        ahead = self.look_ahead(s_event, x_after, end)
+        further = self.look_ahead if run.ahead.step is not None else plant.ahead
+        ahead = further(s_event, x_after, end)
         stopped = run.stopped
         if self.until is not None:
             stopped = stopped | fires & (event == self.until)
