@@ -33,16 +33,18 @@ with warnings.catch_warnings():
 
 
 _WHERE = "synthesise"
-METHODS = "gradient", "damped gradient", "evolution"
+# Seconds over which a damped gradient is forgotten.
+_MEMORIES = {"gradient": jnp.inf, "gradient, 0.5 s": 0.5, "gradient, 0.1 s": 0.1}
+METHODS = (*_MEMORIES, "evolution")
 # Starts on which policies are chosen, and others on which the best is compared.
 _CHOICE, _COMPARISON = 64, 16
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
-# Steps and learning rate of a trial and of a refinement; generations of a search.
-_TRIAL, _REFINEMENT, _GENERATIONS = (150, 1e-2), (400, 3e-3), 150
+# Steps and first learning rate of a round, and generations of one of evolution.
+_STEPS, _RATE, _GENERATIONS = 300, 5e-3, 150
 _BATCH, _LONGEST = 32, 200
-# Seconds over which the damped gradient is forgotten.
-_MEMORY = 0.5
+# The share of the budget that one attempt may take, after its first round.
+_ATTEMPT = 0.03
 # A gain below which a method is given up, and one that is worth a network or an
 # expert.
 _GAIN, _WORTH = 1e-3, 5e-3
@@ -74,6 +76,15 @@ class Attempt(NamedTuple):
     method: str
     cost: float
     seconds: float
+
+
+class _Line(NamedTuple):
+    """A policy that one method trains, and its cost."""
+
+    structure: str
+    method: str
+    policy: AbstractController
+    cost: float
 
 
 class PolicySearch:
@@ -150,52 +161,65 @@ class PolicySearch:
         if self.lqr is not None:
             self.best["LQR"] = self.lqr, self.cost(self.lqr)
         made = structures(env, self.lqr, width, depth, self.fresh_key())
-        for name, policy in made.items():
-            for method in METHODS:
-                if self.may_train:
-                    self.attempt(name, method, policy)
-        self.refine([name for name in made if name in self.best])
+        lines = [
+            _Line(name, method, policy, np.inf)
+            for name, policy in made.items()
+            for method in METHODS
+        ]
+        # Successive halving: the better half goes on, for twice as long.
+        share = _ATTEMPT
+        while (self.may_train or not self.tried) and len(lines) > 1:
+            lines = [
+                self.attempt(line, share)
+                for line in lines
+                if self.may_train or not self.tried
+            ]
+            lines = sorted(lines, key=lambda line: line.cost)[: (len(lines) + 1) // 2]
+            share *= 2
+        if lines:
+            self.finish(lines[0], made[lines[0].structure])
 
-    def trained(
-        self, name: str, method: str, policy: AbstractController, refines: bool
-    ) -> AbstractController:
-        """The policy after a training; one that `refines` starts near the best."""
-        env = self.environment
+    def trained(self, line: _Line) -> AbstractController:
+        """The policy of a line after a round of its method."""
+        env, policy, method = self.environment, line.policy, line.method
         options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
         # The LQR inside a policy stays as it is.
-        options["trainable"] = "correction" if name == LQR_AND_NETWORK else None
+        options["trainable"] = (
+            "correction" if line.structure == LQR_AND_NETWORK else None
+        )
         if method == "imitation":
-            policy = imitate(env, _mpc(env, self.lqr), policy, **options).model
+            return imitate(env, _mpc(env, self.lqr), policy, **options).model
         if method == "evolution":
-            options["sigma"] = _NEAR if refines else _WIDTHS[name]
+            options["sigma"] = (
+                _NEAR if np.isfinite(line.cost) else _WIDTHS[line.structure]
+            )
             loss = expected_cost(env, batch=8, ranges=self.ranges)
             return evolve(loss, policy, _GENERATIONS, **options).model
-        steps, rate = _REFINEMENT if refines else _TRIAL
-        adam = optax.adam(optax.cosine_decay_schedule(rate, steps))
+        adam = optax.adam(optax.cosine_decay_schedule(_RATE, _STEPS))
         optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
-        # An array, so that both compile once.
-        decay = jnp.exp(-env.dt / (_MEMORY if "damped" in method else jnp.inf))
+        # An array, so that all compile once.
+        decay = jnp.exp(-env.dt / _MEMORIES[method])
         shape: Any = dict(batch=_BATCH, horizon=min(env.horizon, _LONGEST))
         loss = expected_cost(env, gradient_decay=decay, ranges=self.ranges, **shape)
-        return fit(loss, policy, optimiser, steps, **options).model
+        return fit(loss, policy, optimiser, _STEPS, **options).model
 
-    def refine(self, names: list[str]) -> None:
-        """Train the best policy on, by each method that still gains; and by imitation
-        once none does."""
-        losses, has_imitated = dict.fromkeys(METHODS, 0), False
-        while self.may_train and names:
-            name = min(names, key=lambda name: self.best[name][1])
-            policy, before = self.best[name]
-            method = min(losses, key=lambda method: losses[method])
-            if losses[method] >= 2:
-                if has_imitated or not self.expert_is_better(policy):
-                    return
-                method, has_imitated = "imitation", True
-                losses = dict.fromkeys(METHODS, 0)
-            after = self.attempt(name, method, policy, refines=True)
-            if method in losses:
-                gains = before - after > _GAIN * abs(before)
-                losses[method] = 0 if gains else losses[method] + 1
+    def finish(self, line: _Line, untrained: AbstractController) -> None:
+        """Train the last line on, by each method in turn until none gains, and from
+        what imitates MPC if that is better."""
+        others = [method for method in METHODS if method != line.method]
+        methods, left = [line.method, *others], len(METHODS)
+        has_imitated = False
+        while self.may_train and left:
+            after = self.attempt(line._replace(method=methods[0]), 2 * _ATTEMPT)
+            gains = line.cost - after.cost > _GAIN * abs(line.cost)
+            line = min(line, after, key=lambda line: line.cost)
+            left = len(METHODS) if gains else left - 1
+            if not gains:
+                methods = [*methods[1:], methods[0]]
+            if not left and not has_imitated and self.expert_is_better(line.policy):
+                has_imitated, left = True, len(METHODS)
+                clone = line._replace(method="imitation", policy=untrained, cost=np.inf)
+                line = min(line, self.attempt(clone, 0.0), key=lambda line: line.cost)
 
     def expert_is_better(self, policy: AbstractController) -> bool:
         """Whether MPC costs less, on some of the starts of the choice."""
@@ -206,20 +230,28 @@ class PolicySearch:
         own = np.mean(_costs(self.environment, None, policy, keys))
         return bool(own - expert > _WORTH * abs(own))
 
-    def attempt(
-        self, name: str, method: str, policy: AbstractController, refines: bool = False
-    ) -> float:
-        """The cost of the policy after a training, which is kept if it is the best."""
-        began = self.seconds
-        policy = self.trained(name, method, policy, refines)
-        cost = self.cost(policy)
-        self.tried.append(Attempt(name, method, cost, self.seconds - began))
-        if name not in self.best or cost < self.best[name][1]:
-            self.best[name] = policy, cost
+    def attempt(self, line: _Line, share: float) -> _Line:
+        """The line after rounds of its method, for a share of the budget after the
+        first, which compiles."""
+        began, compiled, now = self.seconds, None, line
+        best = now
+        while compiled is None or self.seconds - compiled < share * self.budget:
+            before, policy = now.cost, self.trained(now)
+            now = now._replace(policy=policy, cost=self.cost(policy))
+            best = min(best, now, key=lambda line: line.cost)
+            compiled = self.seconds if compiled is None else compiled
+            # What changes nothing diverges at once.
+            if now.cost == before or not self.may_train:
+                break
+        name = line.structure
+        if best.cost < self.best.get(name, (None, np.inf))[1]:
+            self.best[name] = best.policy, best.cost
+        seconds = self.seconds - began
+        self.tried.append(Attempt(name, line.method, best.cost, seconds))
         least = min(cost for _, cost in self.best.values())
-        self.bar.set_postfix_str(f"cost {least:.5g}, {name} by {method}", refresh=False)
+        self.bar.set_postfix_str(f"cost {least:.5g}, {name}", refresh=False)
         self.bar.update(min(self.seconds, self.bar.total) - self.bar.n)
-        return cost
+        return best
 
     def cost(self, policy: AbstractController) -> float:
         """The mean cost over the starts on which policies are chosen."""
