@@ -180,7 +180,7 @@ class _Falls(eqx.Module):
         return leans | ahead & (height < -8 * jnp.finfo(x.dtype).eps)
 
 
-@task(CompassGait, dt=0.02, horizon=500)
+@task(CompassGait, dt=0.05, horizon=200)
 def compass_gait(
     system: CompassGait,
     *,
