@@ -67,13 +67,14 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The events along the trajectory change from one iterate to the next, so that "
         "the model of one does not tell of the other, and the iteration ended without "
         "convergence: the best plan may be where an event is about to appear, or moves "
-        "to another interval. The plan is the best so far."
+        "to another interval. The plan is the best so far; other starts may lead to a "
+        "better one."
     )
     too_many_events = (
         "More events than max_events fell in one interval, and the state is held after "
         "the last: they may accumulate, or a reset may leave its guard at zero. Raise "
-        "max_events, take a smaller dt, or add a mode in which the guard is not "
-        "enabled."
+        "max_events, take a smaller dt, add a mode in which the guard is not enabled, "
+        "or name an event that only tells of a crossing in crossing_events."
     )
     beyond_guard = (
         "A state is beyond an enabled guard at the start of an interval or after a "

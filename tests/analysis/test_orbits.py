@@ -1,5 +1,6 @@
 """Maps from event to event, their fixed points and multipliers."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,3 +74,14 @@ def test_an_event_that_does_not_come():
     assert missed.result == dlx.RESULTS.not_converged
     with pytest.raises(ValueError, match="event must be"):
         dlx.analysis.poincare_map(wheel(), "bounce", GUESS)
+
+
+def test_dynamics_that_have_no_orbit():
+    pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    with pytest.raises(ValueError, match="must be of an AbstractHybridSystem"):
+        dlx.analysis.poincare_map(pendulum, "step", [0.0, 0.0])
+    steps = diffrax.PIDController(rtol=1e-5, atol=1e-5)
+    wheel = dlx.systems.RimlessWheel()
+    adaptive = dlx.Discretized(wheel, 0.1, diffrax.Tsit5(), stepsize_controller=steps)
+    with pytest.raises(ValueError, match="adjoint with a forward mode"):
+        dlx.analysis.periodic_orbit(adaptive, "step", [-0.29, 1.2])

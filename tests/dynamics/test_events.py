@@ -306,6 +306,76 @@ def test_a_grazing_has_a_status_and_no_derivative():
     assert not np.any(np.isfinite(jax.jacfwd(lambda x: run(x)[0])(x)[0]))
 
 
+def test_a_touch_in_single_precision_has_no_derivative():
+    # A point that is thrown just up to a wall, which rounding puts it through or not.
+    class Touch(Ends):
+        def guards(self, t, x, u):
+            return 1.25 - x[0], 10 + x[0], 10 + x[0]
+
+        def resets(self, t, x, u):
+            return (jnp.stack([x[0], -x[1]]),) * 3
+
+    dynamics, push = dlx.Discretized(Touch(), dt=0.1), jnp.array([-10.0])
+
+    def thrown(speed):
+        def step(x, k):
+            x, result, _ = dynamics.advance_with_events(0.1 * k, x, push, None)
+            return x, result == Q.grazing
+
+        x0 = jnp.stack([0 * speed, speed])
+        x, grazes = jax.lax.scan(step, x0, jnp.arange(10))
+        return x[0], jnp.any(grazes)
+
+    speeds = jnp.sqrt(25 + 1e-6 * jnp.arange(-20.0, 21.0))
+    slopes, grazes = jax.jit(jax.vmap(jax.grad(thrown, has_aux=True)))(speeds)
+    assert np.all(np.isnan(slopes) == grazes)
+    assert np.all(np.abs(slopes[~grazes]) < 1e4)
+    assert np.any(grazes) or jax.config.jax_enable_x64
+
+
+class Clock(s.AbstractHybridSystem):
+    """It counts the upward crossings of a sine."""
+
+    period: Array = dlx.parameter(0.3)
+
+    state_names, control_names = ("count",), ("u",)
+    event_names, event_directions = ("tick",), (1,)
+    crossing_events = event_names
+
+    def vector_field(self, t, x, u, w):
+        return 0 * x
+
+    def guards(self, t, x, u):
+        return (jnp.sin(2 * jnp.pi * (t - 0.05) / self.period),)
+
+    def resets(self, t, x, u):
+        return (x + 1,)
+
+
+@pytest.mark.parametrize(("period", "dt"), [(0.3, 0.1), (0.1, 0.05), (0.7, 0.02)])
+def test_a_clock_ticks_once_a_period(period, dt):
+    dynamics = dlx.Discretized(Clock(period=period), dt=dt)
+    env = dlx.Environment(dynamics, dlx.costs.Quadratic([1.0], [1.0]))
+    options = dict(key=jax.random.key(0), horizon=round(3 / dt), keep=("events",))
+    run = dlx.rollout(env, dlx.controllers.Zero(1), x0=[0.0], **options)
+    times = [time for time, _ in run.event_list()]
+    assert_close(times, np.arange(0.05, 3.0, period), atol=tolerance(3e-6, 1e-12))
+
+
+@once
+def test_crossings_need_a_direction():
+    class Both(Clock):
+        event_directions = (0,)
+
+    class Urgent(Clock):
+        urgent_events = ("tick",)
+
+    with pytest.raises(ValueError, match="crossing_events must be among .* direction"):
+        Both()
+    with pytest.raises(ValueError, match="'tick' must not be both in urgent_events"):
+        Urgent()
+
+
 def test_what_is_not_a_number_stays_one():
     x, result, _ = step_of(s.BouncingBall(), [np.nan, -1.0])
     assert np.isnan(x[0]) and result == Q.successful

@@ -89,3 +89,15 @@ def test_where_events_change(line_search):
     assert_close(plan.result == Q.successful, [True, False, False])
     assert_close(plan.result == Q.events_changed, [False, True, True])
     assert_close(plan.states[:, -1, 0], [0.4, 0.6, 0.0], atol=0.01)
+
+
+@once
+def test_a_plan_names_the_event_that_fails():
+    dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 1.0], [1.0])
+    with pytest.raises(RuntimeError, match=r"the event bounce at t = 0\."):
+        dlx.planning.ilqr(dynamics, cost, [-0.1, 0.0], jnp.zeros((3, 1)))
+    env = dlx.Environment(dynamics, cost, horizon=3)
+    with pytest.raises(RuntimeError, match=r"beyond.*the event bounce at t = 0\."):
+        options = dict(key=jax.random.key(0), x0=[-0.1, 0.0])
+        dlx.rollout(env, dlx.controllers.Zero(1), **options)

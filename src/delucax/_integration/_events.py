@@ -25,7 +25,7 @@ class Crossings(NamedTuple):
     - `past_end`: whether the end of the step shows that it crosses; else only the cubic
         does, which dips below zero and comes back.
     - `slope`: its change over the step, if the rate at the start were constant.
-    - `size`: of its change along the step.
+    - `least_slope`: the slope below which it grazes.
     """
 
     sign: Array
@@ -38,7 +38,7 @@ class Crossings(NamedTuple):
     beyond: Array
     past_end: Array
     slope: Array
-    size: Array
+    least_slope: Array
 
 
 def pick(rows: Iterable[Array], index: Array) -> Array:
@@ -71,8 +71,10 @@ def crossings(
     margin: Array,
     directions: Array,
     urgent: Array,
+    passing: Array,
     enabled: tuple[Array, Array],
     has_length: Array,
+    noise: Array,
 ) -> Crossings:
     """The crossings of guards along a step.
 
@@ -83,9 +85,11 @@ def crossings(
     - `slack`, `margin`: what counts as zero at the start, and at the end.
     - `directions`: -1 falling, 1 rising, 0 both.
     - `urgent`: which fire at the start of a step, too, where they start beyond zero.
+    - `passing`: which may start beyond zero and then do not fire.
     - `enabled`: at both ends.
     - `has_length`: whether the step is more than a rounding of its interval; if it is
         not, nothing is expected in it, but at the start of the next.
+    - `noise`: the rounding of the guards.
     """
     (g0, r0), (g1, r1) = starts, ends
     on_guard = jnp.abs(g0) <= slack
@@ -96,7 +100,7 @@ def crossings(
     g0, r0, g1, r1 = (sign * a for a in (g0, r0, g1, r1))
     beyond = g0 < -slack
     late = beyond & urgent & enabled[0] & has_length
-    at_once = on_guard & (r0 < 0) & enabled[0] & has_length | late
+    at_once = on_guard & (r0 < 0) & ~passing & enabled[0] & has_length | late
     # One that is not enabled and is already falling has to come back first.
     gone = beyond | on_guard & (r0 < 0)
     # Where it grazes there is nothing to correct.
@@ -123,10 +127,11 @@ def crossings(
     dips = inside(lowest, 1.0) & (cubic(lowest)[0] < 0)
     # A guard that is zero at the end, as near as can be told, is left to the start of
     # the next step: whether it is just below is rounding, which is another in another
-    # program. One that may be crossed either way fires, as that start could not tell.
+    # program. One that may be on either side fires, as that start could not tell.
     # From the guard to the guard, as in a step of no length, nothing is crossed.
     margin = jnp.where(on_guard, jnp.maximum(slack, margin), margin)
-    ends_on = either & ~on_guard & (g1 <= margin) & (r1 < 0)
+    ends_on = (g1 <= margin) & (r1 < 0)
+    ends_on &= either & ~on_guard | passing & (~on_guard | (r0 > 0))
     ends_beyond = (g1 < -margin) | ends_on
     high = jnp.where(dips, jnp.clip(lowest, 0, 1), 1.0)
     low = jnp.where(inside(highest, high), jnp.clip(highest, 0, 1), 0.0)
@@ -143,6 +148,10 @@ def crossings(
         newton = guess - value / jnp.where(slope == 0, 1, slope)
         good = (newton >= left) & (newton <= right)
         guess = jnp.where(good, newton, (left + right) / 2)
+    # A parabola that is beyond zero by its rounding has this slope where it crosses.
+    curved = 2 * jnp.sqrt(jnp.abs(g1 - a - r0) * noise)
+    size = jnp.abs(a) + jnp.abs(g1) + jnp.abs(r0) + jnp.abs(r1)
+    least_slope = jnp.maximum(jnp.finfo(g0.dtype).eps ** 0.5 * size, curved)
     return Crossings(
         sign=sign,
         expected=expected & has_length | at_once,
@@ -151,10 +160,10 @@ def crossings(
         guess=jnp.where(at_once, near, guess),
         at_once=at_once,
         late=late,
-        beyond=beyond & ~either & ~urgent & enabled[0],
+        beyond=beyond & ~either & ~urgent & ~passing & enabled[0],
         past_end=ends_beyond & ~dips,
         slope=r0,
-        size=jnp.abs(a) + jnp.abs(g1) + jnp.abs(r0) + jnp.abs(r1),
+        least_slope=least_slope,
     )
 
 
@@ -213,5 +222,5 @@ def locate(
     _, _, _, share, event, slope, crossed, _ = state
     crossed = active & (crossed | at_once)
     # It grazes where its slope is nothing beside what it changes along the step.
-    grazes = crossed & (-slope < eps**0.5 * pick(crossing.size, event))
+    grazes = crossed & (-slope < pick(crossing.least_slope, event))
     return jnp.where(crossed, jnp.minimum(share, 1), 1), event, crossed, grazes

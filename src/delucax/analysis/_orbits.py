@@ -2,18 +2,29 @@
 
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array
 
-from .._check import as_vector, check_bool, check_choice, check_count, check_instance
+from .._check import (
+    as_vector,
+    check_bool,
+    check_choice,
+    check_count,
+    check_instance,
+    is_concrete,
+)
 from .._jax import bounded_while, jacobian
 from .._module import as_float_array
 from .._results import choose, promote, raise_on_failure, Result, RESULTS
 from .._typing import Numbers, RealScalar
 from ..dynamics import Discretized
+
+
+_FORWARD = diffrax.DirectAdjoint, diffrax.ForwardMode
 
 
 class Return(eqx.Module):
@@ -127,6 +138,11 @@ def poincare_map(
 
 def _arguments(dynamics, event, x, u, where):
     check_instance(dynamics, Discretized, "dynamics", where)
+    if not dynamics.event_names:
+        raise ValueError(
+            f"{where}: dynamics must be of an AbstractHybridSystem, whose events it "
+            f"follows, got {type(dynamics.system).__name__}."
+        )
     check_choice(event, tuple(dynamics.event_names), "event", where)
     x = as_vector(x, dynamics.state_size, "x", where)
     u = jnp.zeros(dynamics.control_size, x.dtype) if u is None else u
@@ -204,9 +220,22 @@ def periodic_orbit(
     max_steps = check_count(max_steps, "max_steps", where)
     iterations = check_count(max_iterations, "max_iterations", where)
     check_bool(throw, "throw", where)
+    adaptive = dynamics.stepsize_controller is not None
+    if adaptive and not isinstance(dynamics.adjoint, _FORWARD):
+        raise ValueError(
+            f"{where}: dynamics with a stepsize_controller must have an adjoint with a "
+            f"forward mode, adjoint=diffrax.DirectAdjoint(), got {dynamics.adjoint!r}."
+        )
     least = 8 * float(jnp.finfo(x0.dtype).eps)
     given = index, x0, u, max(tolerance, least), iterations, max_steps
     orbit = _orbit(dynamics, *given)
+    if is_concrete(x0) and is_concrete(orbit.state):
+        if orbit.result != RESULTS.successful:
+            # Newton's method runs off where the guess itself does not return.
+            zero = jnp.zeros((), x0.dtype)
+            first = _return(dynamics, index, x0, u, zero, max_steps).result
+            result = choose(first == RESULTS.successful, orbit.result, first)
+            orbit = eqx.tree_at(lambda o: o.result, orbit, result)
     return raise_on_failure(orbit, where, throw, "the last iterate")
 
 

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._check import as_rows, as_vector, check_instance, check_step
@@ -97,6 +98,27 @@ class AbstractDynamics(AbstractPlant):
             )
         return *self.advance(t, x, u, w), None
 
+    def describe_fault(
+        self, times: Array, states: Array, controls: Array, w: Array | None
+    ) -> str:
+        """Where steps of a hybrid system fail, for the message of an error.
+
+        **Arguments:** `times`, `states`, `controls`, `w`: those at the start of each
+            step.
+
+        **Returns:** a sentence about the first step that fails; empty if none does.
+        """
+        _, results, events = _each_step(self, times, states, controls, w)
+        bad = np.asarray(results != RESULTS.successful)
+        if not bad.any() or events is None:
+            return ""
+        k = int(bad.argmax())
+        kind = int(events.fault_kind[k])
+        if kind >= 0:
+            name, time = self.event_names[kind], float(events.fault_time[k])
+            return f"It was the event {name} at t = {time:g}."
+        return f"It was the step from t = {float(times[k]):g} at x = {states[k]}."
+
     def __call__(
         self, t: RealScalar, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
     ) -> Array:
@@ -163,6 +185,12 @@ def open_loop(
     if w is not None:
         w = as_rows(w, dynamics.disturbance_size, "w", where, controls.shape[0])
     return _open_loop(dynamics, x0, controls, w, as_float_array(t0))
+
+
+@eqx.filter_jit
+def _each_step(dynamics, times, states, controls, w):
+    step = lambda t, x, u, w: dynamics.advance_with_events(t, x, u, w)
+    return jax.vmap(step)(times, states, controls, w)
 
 
 @eqx.filter_jit

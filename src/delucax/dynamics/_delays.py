@@ -40,6 +40,14 @@ class _AbstractDelay(AbstractWrapper):
         late += [f"y{i}[-{k + 1}]" for k in range(sensor) for i in outputs]
         return (*inner.state_names, *late)
 
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        inner, (controls, sensor) = self.dynamics, self._kept
+        units = tuple(inner.state_units) or ("",) * inner.state_size
+        late = (tuple(inner.control_units) or ("",) * inner.control_size) * controls
+        units += late + ("",) * (inner.observation_size * sensor)
+        return units if any(units) else ()
+
     def _cut(self, x: Array) -> tuple[Array, Array, Array]:
         """The plant's own state, the pending controls and the pending observations."""
         n = self.dynamics.state_size

@@ -105,18 +105,20 @@ class HybridFlow(eqx.Module):
         # Each entry is moved by roundings of its own, so that they do not cancel.
         shares = jnp.asarray(1 + np.modf(np.arange(x.size) * 1.618)[0], x.dtype)
         moved = self.args[1].t + s, shares * x
-        slack = 32 * eps * jnp.abs(jax.jvp(self.guards, (s, x), moved)[1])
+        noise = 32 * eps * jnp.abs(jax.jvp(self.guards, (s, x), moved)[1])
         span = self.dynamics.dt / self.dynamics.substeps
         unit = eps**0.6 * span
-        slack = slack + unit * (jnp.abs(r0) + jnp.abs(r1))
+        slack = noise + unit * (jnp.abs(r0) + jnp.abs(r1))
         # Less than what counts at the start of the next step.
         margin = unit / 2 * jnp.abs(r1)
         values = (g0, r0 * h), (g1, r1 * h)
         zero = slack, margin
         long = h > 64 * eps * span
-        urgent = [name in system.urgent_events for name in system.event_names]
-        kinds = jnp.array(directions), jnp.array(urgent)
-        return crossings(*values, *zero, *kinds, enabled, long)
+        special = system.urgent_events, system.crossing_events
+        named = [[n in names for n in system.event_names] for names in special]
+        urgent, passing = map(jnp.array, named)
+        kinds = jnp.array(directions), urgent, passing
+        return crossings(*values, *zero, *kinds, enabled, long, noise)
 
     def ahead(self, s: Array, x: Array, end: Array) -> Ahead:
         """What one step to `end` meets."""
@@ -256,7 +258,9 @@ class Intervals(eqx.Module):
         x_event, solved = plant.step(s, x, length)
         s_event = s + length
         x_after = jnp.where(fires, plant.reset(event, s_event, x_event), x_event)
-        time, events = plant.args[1].t + s_event, run.events
+        # Located to rounding, it may be just before the step; its time is not.
+        early = lax.stop_gradient(jnp.maximum(s - s_event, 0))
+        time, events = plant.args[1].t + (s_event + early), run.events
         result = first_failure(run.result, solved)
         failed = (result == RESULTS.successful) & grazes
         if events is not None:

@@ -137,6 +137,13 @@ class MethodOfSteps(Forwarding):
         late = [f"{name}.{part}[-{k + 1}]" for k, part in parts for name in names]
         return (*names, *late)
 
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        units = tuple(self.system.state_units)
+        # Those of the history are of values and of slopes, and are left out.
+        more = self.state_size - self.system.state_size
+        return units + ("",) * more if units else ()
+
     def _cut(self, x: Array) -> tuple[Array, Array]:
         """The system's own state, and the history, shape `(memory, 4, n)`."""
         n = self.system.state_size

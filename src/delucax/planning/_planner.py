@@ -44,6 +44,12 @@ def checked_plan(
 
     def facts():
         path = np.isfinite(np.asarray(plan.states)).all(axis=-1)
+        if problem is not None and problem.dynamics.event_names:
+            if plan.result == RESULTS.diverged:
+                steps = problem.times(plan.controls.shape[0])[:-1], plan.states[:-1]
+                faulty = *steps, plan.controls, problem.w
+                if fault := problem.dynamics.describe_fault(*faulty):
+                    return f"A step fails with its events. {fault}"
         if not path.all():
             return (
                 "The trajectory runs away: it is not finite from stage "

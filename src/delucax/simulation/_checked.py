@@ -7,6 +7,7 @@ import numpy as np
 
 from .._check import is_concrete
 from .._results import RESULTS
+from ..dynamics import AbstractDynamics
 from ..systems import AbstractPlant
 from ._trajectory import Trajectory
 
@@ -19,8 +20,14 @@ def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
     return fields | {"event_names": tuple(getattr(plant, "event_names", ()))}
 
 
-def checked(trajectory: Trajectory, where: str) -> Trajectory:
-    """Raise if the trajectory failed: now if its values are known, else at run time."""
+def checked(
+    trajectory: Trajectory, where: str, dynamics: AbstractDynamics | None = None
+) -> Trajectory:
+    """Raise if the trajectory failed: now if its values are known, else at run time.
+
+    With `dynamics` that are hybrid the error names the event, if states and controls
+    are kept.
+    """
     failed = trajectory.failed
     if not is_concrete(failed):
         # A random key in the controller's state is no argument of a run-time check.
@@ -41,5 +48,12 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
             k = int(np.argmax(np.asarray(events.fault_kind) >= 0))
             name = trajectory.event_names[int(events.fault_kind[k])]
             message += f" It was the event {name} at t = {events.fault_time[k]:g}."
+        elif dynamics is not None and dynamics.event_names:
+            states, controls, w = trajectory.states, trajectory.controls, None
+            if states is not None and controls is not None:
+                if trajectory.disturbance_size:
+                    w = trajectory.disturbances
+                steps = trajectory.times[:-1], states[:-1], controls, w
+                message = f"{message} {dynamics.describe_fault(*steps)}".rstrip()
         raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
     return trajectory

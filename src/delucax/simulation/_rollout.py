@@ -165,7 +165,7 @@ def rollout(
     trajectory = _rollout(
         environment, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate
     )
-    return checked(trajectory, where) if throw else trajectory
+    return checked(trajectory, where, environment.dynamics) if throw else trajectory
 
 
 @eqx.filter_jit

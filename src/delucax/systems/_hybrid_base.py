@@ -36,6 +36,10 @@ class AbstractHybridSystem(AbstractSystem):
     - `urgent_events`: those that also fire at once where the state is beyond their
         guard at the start of an interval or after a reset, none by default. A guard
         that depends on the control needs it, as a control may jump between intervals.
+    - `crossing_events`: those with a direction that only tell that the guard crosses
+        zero, such as the tick of a clock, a switch or the top of a flight: the state
+        may be on either side of the guard, and the reset may leave it there. None by
+        default.
     - `mode_names`: the names of discrete modes, none by default. With them one of the
         states is named `"mode"`; it holds 0.0, 1.0, ..., resets change it, and its
         derivative is zero. `mode` reads it.
@@ -73,6 +77,7 @@ class AbstractHybridSystem(AbstractSystem):
         event_names: eqx.AbstractVar[tuple[str, ...]]
     event_directions: ClassVar[Any] = ()
     urgent_events: ClassVar[Any] = ()
+    crossing_events: ClassVar[Any] = ()
     mode_names: ClassVar[Any] = ()
 
     def __check_init__(self):
@@ -89,10 +94,17 @@ class AbstractHybridSystem(AbstractSystem):
                 f"{tuple(names)}, got {self.event_directions!r}."
             )
         one_way = [n for n, way in zip(names, directions, strict=True) if way != 0]
-        if not set(self.urgent_events) <= set(one_way):
+        for kind in ("urgent_events", "crossing_events"):
+            given = getattr(self, kind)
+            if not set(given) <= set(one_way):
+                raise ValueError(
+                    f"{where}: {kind} must be among the events that have a direction, "
+                    f"{tuple(one_way)}, got {given!r}."
+                )
+        if both := sorted(set(self.urgent_events) & set(self.crossing_events)):
             raise ValueError(
-                f"{where}: urgent_events must be among the events that have a "
-                f"direction, {tuple(one_way)}, got {self.urgent_events!r}."
+                f"{where}: {both[0]!r} must not be both in urgent_events and in "
+                "crossing_events."
             )
         if self.mode_names and "mode" not in self.state_names:
             raise ValueError(
@@ -162,5 +174,5 @@ class AbstractHybridSystem(AbstractSystem):
         """
         if not self.mode_names:
             raise ValueError(f"{type(self).__name__}: mode needs mode_names.")
-        # Rounded, as a filter or a planner may hand back 0.9999.
+        # Rounded, for code that gets a mode from an estimate.
         return jnp.round(x[..., self.state_names.index("mode")]).astype(int)
