@@ -174,7 +174,8 @@ def orbits(quick: bool) -> list[dict[str, Any]]:
     near = walk(0.0145, walk(0.012, simplest.state).state).state
     beyond = lambda slope: abs(np.asarray(walk(slope, near).multipliers)).max() - 1
     doubling = brentq(beyond, 0.0148, 0.0154, xtol=1e-4 if quick else 1e-6)
-    gait = dlx.Discretized(s.CompassGait(), dt=0.02)
+    # The gravity of the paper, as its period tells.
+    gait = dlx.Discretized(s.CompassGait(gravity=9.8), dt=0.02)
     compass = orbit(gait, "step", [-0.323, 0.218, -0.378, -1.092])
     first = np.asarray(simplest.multipliers)[0]
     x = simplest.state

@@ -51,12 +51,15 @@ def test_the_simplest_walker_is_that_of_its_paper():
 
 @needs_x64
 def test_the_compass_gait_is_that_of_its_paper():
-    dynamics = dlx.Discretized(dlx.systems.CompassGait(), dt=0.02)
+    # All digits of the paper, with its gravity.
+    dynamics = dlx.Discretized(dlx.systems.CompassGait(gravity=9.8), dt=0.02)
     guess = [-0.323, 0.218, -0.378, -1.092]
     orbit = dlx.analysis.periodic_orbit(dynamics, "step", guess)
-    assert_close(orbit.period, 0.7347, atol=1e-3)
-    assert_close(jnp.abs(orbit.multipliers[:2]), abs(-0.1997 + 0.5445j), atol=1e-3)
-    assert_close(orbit.multipliers[2], 0.1316, atol=1e-3)
+    assert_close(orbit.state, [-0.3234, 0.2187, -0.3772, -1.0918], atol=5e-5)
+    assert_close(orbit.period, 0.7347, atol=5e-5)
+    assert_close(orbit.multipliers[:2].real, -0.1997, atol=5e-5)
+    assert_close(jnp.abs(orbit.multipliers[:2].imag), 0.5445, atol=5e-5)
+    assert_close(orbit.multipliers[2], 0.1316, atol=5e-5)
 
 
 @needs_x64

@@ -79,7 +79,7 @@ class Residual(AbstractController):
 
 def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
     """The LQR that an environment defines: for its dynamics and the curvature of its
-    cost, both at the operating point of [`delucax.Environment.trim`][].
+    cost, both at the operating point of `environment.trim()`.
 
     A direction in which the cost is flat or concave there is given the weight
     `regularisation` times the largest one, because an LQR needs a definite one.

@@ -310,7 +310,8 @@ class Discretized(AbstractDiscretization):
 
     def flow(self, args: Any, in_loop: bool = False) -> Any:
         """One step of the solver, `(s, x, h) -> (x_next, result)`: of `h` from `x` at
-        `s` after the start of the interval."""
+        `s` after the start of the interval. With `in_loop` its stages are in a
+        loop. `args` are those of the interval."""
         system, start, u, held = args
         assert self.solver is not None
         tableau = tableau_of(self.solver)

@@ -88,6 +88,8 @@ class CompassGait(AbstractHybridSystem):
     - `gravity`: g [m/s^2], 9.81 by default.
     - `slope`: [rad], of 3 degrees by default.
 
+    The numbers of the source are met with a gravity of 9.8.
+
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
 
