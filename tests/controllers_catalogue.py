@@ -212,6 +212,9 @@ CASES = {
     "Categorical": Case(choosing, reads_all=False),
     "Categorical, greedy": Case(lambda size: choosing(size).greedy, reads_all=False),
     "Scheduled": Case(scheduled),
+    "Residual": Case(
+        lambda size: c.Residual(c.Linear(size * FEEDBACK), mlp(size), (-1.0, 1.0))
+    ),
     "GPC": Case(lambda size: learner(c.gpc, size, memory=2)),
     "DRC": Case(lambda size: learner(c.drc, size, memory=2)),
     "DRC along the way": Case(swing),

@@ -580,7 +580,8 @@ def test_variance_behind_a_wrapper(wrappers):
 def test_a_wrapper_forwards_every_property():
     """Those that the base classes declare and do not derive from others."""
     derived = {"state_size", "control_size", "observation_size", "advance"}
-    derived |= {"advance_with_events"}  # which goes with `advance`
+    # Which go with `advance`.
+    derived |= {"advance_with_events", "describe_fault"}
     derived |= {"declares_noise"}  # which it does by its `noise`
     bases = dlx.AbstractDynamics, dlx.systems.AbstractPlant
     declared = {

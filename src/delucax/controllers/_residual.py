@@ -9,7 +9,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._check import bounds_field, check_instance, check_positive
+from .._check import as_bounds, bounds_field, check_instance, check_positive
 from .._controller import AbstractController, check_controller
 from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
@@ -32,7 +32,7 @@ class Residual(AbstractController):
     Both are told the control that was applied in all.
     [`delucax.training.fit`][] trains the correction alone by `trainable="correction"`.
 
-    **Raises:** `ValueError` if one of the two is not a controller.
+    **Raises:** `ValueError` if one of the two is not a controller, or bounds cross.
 
     Source: Johannink et al., 2019; Silver, Allen, Tenenbaum and Kaelbling, 2018
     (residual policy learning).
@@ -59,6 +59,7 @@ class Residual(AbstractController):
     def __check_init__(self):
         check_controller(self.base, "base", "Residual")
         check_controller(self.correction, "correction", "Residual")
+        as_bounds(self.bounds, "Residual")
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
         first, second = (None, None) if key is None else jr.split(key)
