@@ -71,7 +71,7 @@ class Residual(AbstractController):
         if self.bounds is not None:
             u = clip(u, *self.bounds)
         change, correction_state = self.correction(t, y, correction_state)
-        return u + change, (base_state, correction_state)
+        return (u + change).astype(y.dtype), (base_state, correction_state)
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         base, correction = self.base, self.correction
