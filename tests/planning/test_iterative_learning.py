@@ -50,7 +50,7 @@ def windy():
 
     @jax.jit
     def follow(states, controls, k, K, length):
-        return roll_out(sim, states, controls, K, k, length, None)
+        return roll_out(sim, states, controls, K, k, length, None)[:3]
 
     U = jnp.tile(hover, (100, 1))
     X = dlx.open_loop(env.dynamics, x0, U)
