@@ -62,6 +62,7 @@ def test_later_rounds_are_on_the_states_of_the_policy():
         (dlx.controllers.GRU(2, 1, 4, key=KEY), {}, "policy must have no memory"),
         (None, {}, "policy must be an AbstractController"),
         (dlx.controllers.Linear(jnp.zeros((1, 2))), dict(rounds=0), "rounds must be"),
+        (dlx.controllers.Linear(jnp.zeros((1, 2))), dict(horizon=0), "horizon must be"),
     ],
 )
 def test_bad_arguments(policy, options, match):

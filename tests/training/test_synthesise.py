@@ -71,6 +71,15 @@ def test_it_stops_where_the_user_does(monkeypatch):
     assert stopped.structure == "LQR" and not stopped.tried
 
 
+def test_an_interrupt_before_anything_is_known(monkeypatch):
+    def interrupted(self, *_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PolicySearch, "run", interrupted)
+    stopped = synthesise(env(), key=KEY, budget=5.0, progress=False)
+    assert stopped.structure == "zero" and np.all(np.isfinite(stopped.costs["zero"]))
+
+
 class NoDerivative(dlx.AbstractSystem):
     state_names, control_names = ("x",), ("u",)
 

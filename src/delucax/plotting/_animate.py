@@ -36,7 +36,7 @@ class Scene:
     """Draws the frames of an animation, one step of a trajectory each.
 
     The frame that is nearest to an event shows the moment of the event in place of its
-    step, so that what bounces is seen to touch the floor.
+    step, so that a ball touches the floor where it bounces.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ def animate(
 
     Of a system with events the frame that is nearest to an event shows the moment just
     after it, and its name is told in colour. Events that the rollout did not keep are
-    found by taking its steps again, which needs the disturbances, if there were any.
+    located by taking its steps again, which needs the disturbances, if there were any.
 
     **Arguments:**
 

@@ -36,14 +36,15 @@ def _times(run: Run, name: str) -> list[np.ndarray]:
 
 def _kinds(runs: Sequence[Run]) -> dict[str, list[int]]:
     """The kinds of event that fired in any run, and in which runs."""
-    found: dict[str, list[int]] = {}
+    runs_of: dict[str, list[int]] = {}
     for i, run in enumerate(runs):
         if run.trajectory.recorded_events is None:
             continue
         kinds = np.unique(np.concatenate([path.kinds for path in run.paths]))
         for kind in kinds.tolist():
-            found.setdefault(run.trajectory.event_names[kind], []).append(i)
-    return found
+            name = run.trajectory.event_names[kind]
+            runs_of.setdefault(name, []).append(i)
+    return runs_of
 
 
 def mark_events(axes: Sequence[Axes], runs: Sequence[Run]) -> None:

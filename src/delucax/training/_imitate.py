@@ -110,7 +110,8 @@ def imitate(
     counts = dict(rounds=rounds, episodes=episodes, steps=steps, batch_size=batch_size)
     for name, count in counts.items():
         check_count(count, name, _WHERE)
-    horizon = check_count(horizon or environment.horizon, "horizon", _WHERE)
+    horizon = environment.horizon if horizon is None else horizon
+    horizon = check_count(horizon, "horizon", _WHERE)
     if any(map(eqx.is_array, jax.tree.leaves(policy.init(key=key)))):
         raise ValueError(
             f"{_WHERE}: policy must have no memory, got a {type(policy).__name__} "

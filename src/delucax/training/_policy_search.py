@@ -64,11 +64,9 @@ class Attempt(NamedTuple):
 
         ```python
         import delucax as dlx
-        import jax
 
-        env = dlx.make("double_integrator", horizon=20)
-        found = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
-        [(attempt.method, attempt.cost) for attempt in found.tried]
+        attempt = dlx.training.Attempt("network", "evolution", 12.5, 3.0)
+        attempt.method, attempt.cost
         ```
     """
 
@@ -104,7 +102,10 @@ class PolicySearch:
         layout = "{desc}: {bar}| {n:.0f}/{total:.0f} s{postfix}"
         options: Any = dict(desc=_WHERE, bar_format=layout, disable=not progress)
         self.bar = tqdm(total=round(budget), **options)
-        self.best: dict[str, tuple[AbstractController, float]] = {}
+        # Also what an interrupt leaves before anything has been tried.
+        self.best: dict[str, tuple[AbstractController, float]] = {
+            "zero": (Zero(environment.control_size), np.inf)
+        }
         self.tried: list[Attempt] = []
         self.lqr: LQR | None = None
 
@@ -155,7 +156,7 @@ class PolicySearch:
     def run(self, width: int, depth: int) -> None:
         """Train until the time is up or nothing gains any more."""
         env = self.environment
-        zero = Zero(env.control_size)
+        zero, _ = self.best["zero"]
         self.best["zero"] = zero, self.cost(zero)
         self.lqr = _regulator(env)
         if self.lqr is not None:
@@ -223,7 +224,7 @@ class PolicySearch:
 
     def expert_is_better(self, policy: AbstractController) -> bool:
         """Whether MPC costs less, on some of the starts of the choice."""
-        if not _is_observed(self.environment) or self.ranges is not None:
+        if not self.environment.dynamics.observes_state or self.ranges is not None:
             return False
         keys = self.keys(_CHOICE)[:_COMPARISON]
         expert = np.mean(_costs_of_mpc(self.environment, None, self.lqr, keys))
@@ -272,7 +273,7 @@ class PolicySearch:
         return name, self.best[name][0]
 
     def compared(self, policy: AbstractController) -> dict[str, np.ndarray]:
-        """The costs of the policy and of others from starts that nothing has seen."""
+        """The costs of the policy and of others, from starts of their own."""
         env, ranges = self.environment, self.ranges
         keys = self.keys(_COMPARISON)
         floor = {n: self.best[n][0] for n in ("zero", "LQR") if n in self.best}
@@ -280,21 +281,16 @@ class PolicySearch:
             name: _costs(env, ranges, one, keys)
             for name, one in {"policy": policy, **floor}.items()
         }
-        if _is_observed(env) and self.seconds < self.budget:
+        if env.dynamics.observes_state and self.seconds < self.budget:
             costs["MPC"] = _costs_of_mpc(env, ranges, self.lqr, keys)
         if self.seconds < self.budget:
             costs["plan"] = _costs_of_plan(env, ranges, policy, keys)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}
 
 
-def _is_observed(environment: Environment) -> bool:
-    """Whether a controller is given the state, as far as sizes tell."""
-    return environment.observation_size == environment.state_size
-
-
 def _regulator(environment: Environment) -> LQR | None:
     """The LQR, where there is one."""
-    if not _is_observed(environment):
+    if not environment.dynamics.observes_state:
         return None
     try:
         return local_lqr(environment)

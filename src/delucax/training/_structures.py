@@ -46,7 +46,7 @@ def structures(
     ends = jnp.where(bounded, low, -half), jnp.where(bounded, high, half)
 
     size = environment.feature_size
-    if environment.observation_size != environment.state_size:
+    if not environment.dynamics.observes_state:
         options: Any = dict(features=features, bounds=ends, key=plain_key)
         return {"memory": GRU(size, m, width, **options)}
     network = lambda bounds, key: MLP(

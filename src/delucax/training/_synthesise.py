@@ -31,7 +31,7 @@ class Synthesis(NamedTuple):
         `"memory"`.
     - `costs`: from `"policy"`, `"zero"`, `"LQR"`, `"MPC"` and `"plan"` to the costs of
         episodes from starts that were used for nothing else, the same for each; those
-        that do not apply are left out.
+        that do not apply, or that the budget leaves no time for, are left out.
     - `tried`: a list of `Attempt`s, in the order in which they were made.
     - `seconds`: what it took.
 
@@ -39,11 +39,11 @@ class Synthesis(NamedTuple):
 
         ```python
         import delucax as dlx
-        import jax
+        import numpy as np
 
-        env = dlx.make("double_integrator", horizon=20)
-        found = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
-        found.structure, found.costs["policy"].mean()
+        costs = {"policy": np.array([1.0, 2.0]), "zero": np.array([5.0, 9.0])}
+        zero = dlx.controllers.Zero(1)
+        dlx.training.Synthesis(zero, "zero", costs, [], 5.0).to_pandas()
         ```
     """
 
@@ -86,10 +86,12 @@ def synthesise(
         there is one.
     2. Trials: a network, and a network that corrects the LQR
         ([`delucax.controllers.Residual`][]), or a recurrent network where the state is
-        not observed; each by the gradient of the rollout, by that gradient damped over
-        half a second, and by [`delucax.training.evolve`][], which needs no gradient.
-    3. Refinement of the best, by the method that still gains; imitation of MPC
-        ([`delucax.training.imitate`][]) once none does.
+        not observed. Each is trained by the gradient of the rollout, by that gradient
+        damped over 0.5 s and over 0.1 s, and by [`delucax.training.evolve`][], which
+        needs no gradient.
+    3. Refinement: the better half goes on for twice as long, until one is left. That
+        one is trained by each method that still gains, and once none does an imitation
+        of MPC ([`delucax.training.imitate`][]) is tried, if MPC costs less.
     4. Choice of the best on starts that it was not trained on. Where the LQR, or no
         control, is as good to half a percent, that is returned.
 
@@ -122,8 +124,8 @@ def synthesise(
         import jax
 
         env = dlx.make("double_integrator", horizon=20)
-        found = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
-        found.structure, found.costs["policy"].mean()
+        made = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
+        made.structure, made.costs["policy"].mean()
         ```
     """
     check_instance(environment, Environment, "environment", _WHERE)
