@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,7 @@ def test_a_linear_plant_gets_its_regulator():
 
 def test_what_was_tried_is_reported():
     structures = {attempt.structure for attempt in found().tried}
-    assert "network" in structures
+    assert structures and structures <= {"network", "LQR + network"}
     assert all(np.isfinite(attempt.cost) for attempt in found().tried)
     assert sum(attempt.seconds for attempt in found().tried) < found().seconds
 
@@ -60,6 +61,20 @@ def test_a_network_where_the_regulator_is_worse():
     assert search.chosen() == ("LQR", lqr)
     search.best["zero"] = zero, 1.0
     assert search.chosen() == ("zero", zero)
+
+
+@pytest.mark.parametrize("better", [0.0, 0.1])
+def test_it_ends_where_the_regulator_is_enough(monkeypatch, better):
+    module = sys.modules[PolicySearch.__module__]
+    monkeypatch.setattr(module, "_costs", lambda *_: np.ones(2))
+    monkeypatch.setattr(module, "_costs_of_plan", lambda *_: np.ones(2) - better)
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    search.best |= {"LQR": (dlx.controllers.Zero(1), 1.0)}
+    first = ("LQR + network", "gradient"), ("network", "evolution")
+    search.tried = [dlx.training.Attempt(*each, 0.999, 1.0) for each in first]
+    assert search.is_settled() == (not better)
+    search.tried = search.tried[:1]
+    assert not search.is_settled()
 
 
 def test_it_stops_where_the_user_does(monkeypatch):

@@ -16,6 +16,7 @@ from .._controller import AbstractController
 from .._typing import PRNGKey
 from ..controllers import Constant, local_lqr, LQR, MPC, OpenLoop, Zero
 from ..costs import AbstractCost, Function
+from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment, randomise
 from ..planning import ILQR
 from ..simulation import rollout
@@ -33,18 +34,22 @@ with warnings.catch_warnings():
 
 
 _WHERE = "synthesise"
-# Seconds over which a damped gradient is forgotten.
-_MEMORIES = {"gradient": jnp.inf, "gradient, 0.5 s": 0.5, "gradient, 0.1 s": 0.1}
-METHODS = (*_MEMORIES, "evolution")
+# After which share of the episode a damped gradient is forgotten.
+_MEMORIES = (1 / 30, 1 / 10, 1 / 4)
+# What is tried first where there is an LQR: they tell whether it is enough.
+_FIRST = [(LQR_AND_NETWORK, "gradient"), ("network", "evolution")]
 # Starts on which policies are chosen, and others on which the best is compared.
 _CHOICE, _COMPARISON = 64, 16
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
-# Steps and first learning rate of a round, and generations of one of evolution.
-_STEPS, _RATE, _GENERATIONS = 300, 5e-3, 150
+# Steps of a round, and generations of one of evolution.
+_STEPS, _GENERATIONS = 300, 150
+# First learning rates of a round: the second is for when nothing gains any more.
+_RATE, _FINE_RATE = 2e-2, 2e-3
 _BATCH, _LONGEST = 32, 200
-# The share of the budget that one attempt may take, after its first round.
-_ATTEMPT = 0.03
+# The share of the budget that a trial and a later attempt may take, after its first
+# round, and how many times fewer and longer the trials become.
+_TRIAL, _ATTEMPT, _FEWER = 0.01, 0.03, 3
 # A gain below which a method is given up, and one that is worth a network or an
 # expert.
 _GAIN, _WORTH = 1e-3, 5e-3
@@ -108,6 +113,12 @@ class PolicySearch:
         }
         self.tried: list[Attempt] = []
         self.lqr: LQR | None = None
+        self.steps = min(environment.horizon, _LONGEST)
+        lasting = self.steps * float(environment.dt)
+        memories = {f"gradient, {lasting * m:.2g} s": lasting * m for m in _MEMORIES}
+        # Seconds over which a gradient is forgotten.
+        self.methods = memories | {"gradient": jnp.inf, "evolution": None}
+        self.rate = _RATE
 
     @property
     def seconds(self) -> float:
@@ -162,23 +173,40 @@ class PolicySearch:
         if self.lqr is not None:
             self.best["LQR"] = self.lqr, self.cost(self.lqr)
         made = structures(env, self.lqr, width, depth, self.fresh_key())
-        lines = [
-            _Line(name, method, policy, np.inf)
-            for name, policy in made.items()
-            for method in METHODS
-        ]
-        # Successive halving: the better half goes on, for twice as long.
-        share = _ATTEMPT
+        pairs = [(name, method) for method in self.methods for name in made]
+        pairs = sorted(pairs, key=lambda pair: pair not in _FIRST)
+        lines = [_Line(name, method, made[name], np.inf) for name, method in pairs]
+        # Successive halving: the better third goes on, for three times as long.
+        share = _TRIAL
         while (self.may_train or not self.tried) and len(lines) > 1:
-            lines = [
-                self.attempt(line, share)
-                for line in lines
-                if self.may_train or not self.tried
-            ]
-            lines = sorted(lines, key=lambda line: line.cost)[: (len(lines) + 1) // 2]
-            share *= 2
+            after = []
+            for line in lines:
+                if not self.may_train and self.tried:
+                    break
+                after.append(self.attempt(line, share))
+                if self.is_settled():
+                    return
+            left = max(1, round(len(lines) / _FEWER))
+            lines = sorted(after, key=lambda line: line.cost)[:left]
+            share *= _FEWER
         if lines:
             self.finish(lines[0], made[lines[0].structure])
+
+    def is_settled(self) -> bool:
+        """Whether neither training around the LQR nor a search without gradient nor a
+        plan is better than the LQR, or MPC where a plan would know the disturbances."""
+        tried = [(attempt.structure, attempt.method) for attempt in self.tried]
+        if tried != _FIRST or self.chosen()[0] != "LQR":
+            return False
+        env, keys = self.environment, self.keys(_COMPARISON)
+        own = np.mean(_costs(env, self.ranges, self.lqr, keys))
+        known = isinstance(env.disturbance, NoDisturbance)
+        other = np.mean(
+            _costs_of_plan(env, self.ranges, self.lqr, keys)
+            if known
+            else _costs_of_mpc(env, self.ranges, self.lqr, keys)
+        )
+        return bool(own - other <= _WORTH * abs(own))
 
     def trained(self, line: _Line) -> AbstractController:
         """The policy of a line after a round of its method."""
@@ -196,29 +224,33 @@ class PolicySearch:
             )
             loss = expected_cost(env, batch=8, ranges=self.ranges)
             return evolve(loss, policy, _GENERATIONS, **options).model
-        adam = optax.adam(optax.cosine_decay_schedule(_RATE, _STEPS))
+        adam = optax.adam(optax.cosine_decay_schedule(self.rate, _STEPS))
         optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
         # An array, so that all compile once.
-        decay = jnp.exp(-env.dt / _MEMORIES[method])
-        shape: Any = dict(batch=_BATCH, horizon=min(env.horizon, _LONGEST))
+        decay = jnp.exp(-env.dt / self.methods[method])
+        shape: Any = dict(batch=_BATCH, horizon=self.steps)
         loss = expected_cost(env, gradient_decay=decay, ranges=self.ranges, **shape)
         return fit(loss, policy, optimiser, _STEPS, **options).model
 
     def finish(self, line: _Line, untrained: AbstractController) -> None:
-        """Train the last line on, by each method in turn until none gains, and from
-        what imitates MPC if that is better."""
-        others = [method for method in METHODS if method != line.method]
-        methods, left = [line.method, *others], len(METHODS)
+        """Train the last line on, by each method in turn until none gains, more
+        slowly, and from what imitates MPC if that is better."""
+        # From its own on to those that remember more.
+        methods = list(self.methods)
+        first, left = methods.index(line.method), len(methods)
+        methods = methods[first:] + methods[:first]
         has_imitated = False
         while self.may_train and left:
-            after = self.attempt(line._replace(method=methods[0]), 2 * _ATTEMPT)
+            after = self.attempt(line._replace(method=methods[0]), _ATTEMPT)
             gains = line.cost - after.cost > _GAIN * abs(line.cost)
             line = min(line, after, key=lambda line: line.cost)
-            left = len(METHODS) if gains else left - 1
+            left = len(methods) if gains else left - 1
             if not gains:
                 methods = [*methods[1:], methods[0]]
-            if not left and not has_imitated and self.expert_is_better(line.policy):
-                has_imitated, left = True, len(METHODS)
+            if not left and self.rate != _FINE_RATE:
+                self.rate, left = _FINE_RATE, len(methods)
+            elif not left and not has_imitated and self.expert_is_better(line.policy):
+                has_imitated, self.rate, left = True, _RATE, len(methods)
                 clone = line._replace(method="imitation", policy=untrained, cost=np.inf)
                 line = min(line, self.attempt(clone, 0.0), key=lambda line: line.cost)
 
@@ -234,15 +266,15 @@ class PolicySearch:
     def attempt(self, line: _Line, share: float) -> _Line:
         """The line after rounds of its method, for a share of the budget after the
         first, which compiles."""
-        began, compiled, now = self.seconds, None, line
-        best = now
+        began, compiled, best = self.seconds, None, line
         while compiled is None or self.seconds - compiled < share * self.budget:
-            before, policy = now.cost, self.trained(now)
-            now = now._replace(policy=policy, cost=self.cost(policy))
-            best = min(best, now, key=lambda line: line.cost)
+            policy = self.trained(best)
+            now = best._replace(policy=policy, cost=self.cost(policy))
             compiled = self.seconds if compiled is None else compiled
             # What changes nothing diverges at once.
-            if now.cost == before or not self.may_train:
+            stays = now.cost == best.cost
+            best = min(best, now, key=lambda line: line.cost)
+            if stays or not self.may_train:
                 break
         name = line.structure
         if best.cost < self.best.get(name, (None, np.inf))[1]:

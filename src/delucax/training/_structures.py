@@ -52,7 +52,7 @@ def structures(
     network = lambda bounds, key: MLP(
         size, m, width, depth, features=features, bounds=bounds, key=key
     )
-    made: dict[str, AbstractController] = {"network": network(ends, plain_key)}
+    made: dict[str, AbstractController] = {}
     if lqr is not None:
         # Its correction is zero at first.
         correction = network((-half, half), residual_key)
@@ -60,7 +60,7 @@ def structures(
         zeros = jax.tree.map(jnp.zeros_like, last(correction))
         correction = eqx.tree_at(last, correction, zeros)
         made[LQR_AND_NETWORK] = Residual(lqr, correction, bounds)
-    return made
+    return made | {"network": network(ends, plain_key)}
 
 
 @eqx.filter_jit

@@ -84,14 +84,16 @@ def synthesise(
 
     1. The floor: no control, and the LQR of [`delucax.controllers.local_lqr`][] where
         there is one.
-    2. Trials: a network, and a network that corrects the LQR
-        ([`delucax.controllers.Residual`][]), or a recurrent network where the state is
-        not observed. Each is trained by the gradient of the rollout, by that gradient
-        damped over 0.5 s and over 0.1 s, and by [`delucax.training.evolve`][], which
-        needs no gradient.
-    3. Refinement: the better half goes on for twice as long, until one is left. That
-        one is trained by each method that still gains, and once none does an imitation
-        of MPC ([`delucax.training.imitate`][]) is tried, if MPC costs less.
+    2. Trials: a network that corrects the LQR ([`delucax.controllers.Residual`][]) and
+        a network alone, or a recurrent network where the state is not observed. Each is
+        trained by the gradient of the rollout, by that gradient damped over a quarter,
+        a tenth and a thirtieth of the episode, and by [`delucax.training.evolve`][],
+        which needs no gradient. If after the first two trials neither they nor a plan
+        are better than the LQR, it ends with the LQR.
+    3. Refinement: the better third goes on for three times as long, until one is left.
+        That one is trained by each method that still gains, then at a tenth of the
+        learning rate. Once none gains, an imitation of MPC
+        ([`delucax.training.imitate`][]) is tried, if MPC costs less.
     4. Choice of the best on starts that it was not trained on. Where the LQR, or no
         control, is as good to half a percent, that is returned.
 
