@@ -42,6 +42,8 @@ _FIRST = [(LQR_AND_NETWORK, "gradient"), ("network", "evolution")]
 _CHOICE, _COMPARISON = 64, 16
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
+# How far a comparison may overrun it, if it takes as long as the longest compilation.
+_OVERRUN = 1.1
 # Steps of a round, and generations of one of evolution.
 _STEPS, _GENERATIONS = 300, 150
 # First learning rates of a round: the second is for when nothing gains any more.
@@ -50,6 +52,8 @@ _BATCH, _LONGEST = 32, 200
 # The share of the budget that a trial and a later attempt may take, after its first
 # round, and how many times fewer and longer the trials become.
 _TRIAL, _ATTEMPT, _FEWER = 0.01, 0.03, 3
+# Trials that cost more than the best by this share are given up.
+_CLOSE = 0.5
 # A gain below which a method is given up, and one that is worth a network or an
 # expert.
 _GAIN, _WORTH = 1e-3, 5e-3
@@ -119,6 +123,8 @@ class PolicySearch:
         # Seconds over which a gradient is forgotten.
         self.methods = memories | {"gradient": jnp.inf, "evolution": None}
         self.rate = _RATE
+        # Of the first round of an attempt, which compiles.
+        self.longest = 0.0
 
     @property
     def seconds(self) -> float:
@@ -129,6 +135,11 @@ class PolicySearch:
     def may_train(self) -> bool:
         """Whether there is time to train."""
         return self.seconds < _TRAINING * self.budget
+
+    @property
+    def may_compare(self) -> bool:
+        """Whether there is time to compare with one more controller."""
+        return self.seconds + self.longest < _OVERRUN * self.budget
 
     def keys(self, count: int) -> Array:
         """Keys of that many episodes, others for each count."""
@@ -187,7 +198,9 @@ class PolicySearch:
                 if self.is_settled():
                     return
             left = max(1, round(len(lines) / _FEWER))
-            lines = sorted(after, key=lambda line: line.cost)[:left]
+            after = sorted(after, key=lambda line: line.cost)[:left]
+            most = after[0].cost + _CLOSE * abs(after[0].cost)
+            lines = [line for line in after if line.cost <= most]
             share *= _FEWER
         if lines:
             self.finish(lines[0], made[lines[0].structure])
@@ -233,26 +246,27 @@ class PolicySearch:
         return fit(loss, policy, optimiser, _STEPS, **options).model
 
     def finish(self, line: _Line, untrained: AbstractController) -> None:
-        """Train the last line on, by each method in turn until none gains, more
-        slowly, and from what imitates MPC if that is better."""
-        # From its own on to those that remember more.
-        methods = list(self.methods)
-        first, left = methods.index(line.method), len(methods)
-        methods = methods[first:] + methods[:first]
-        has_imitated = False
-        while self.may_train and left:
-            after = self.attempt(line._replace(method=methods[0]), _ATTEMPT)
-            gains = line.cost - after.cost > _GAIN * abs(line.cost)
+        """Train the last line on by the method that gained most when it was last used,
+        until none gains; then more slowly, and from what imitates MPC if that is
+        better."""
+        fresh = dict.fromkeys([line.method, *self.methods], np.inf)
+        gains, has_imitated = fresh.copy(), False
+        while self.may_train:
+            method = max(gains, key=lambda method: gains[method])
+            after = self.attempt(line._replace(method=method), _ATTEMPT)
+            gains[method] = (line.cost - after.cost) / max(abs(line.cost), 1e-12)
             line = min(line, after, key=lambda line: line.cost)
-            left = len(methods) if gains else left - 1
-            if not gains:
-                methods = [*methods[1:], methods[0]]
-            if not left and self.rate != _FINE_RATE:
-                self.rate, left = _FINE_RATE, len(methods)
-            elif not left and not has_imitated and self.expert_is_better(line.policy):
-                has_imitated, self.rate, left = True, _RATE, len(methods)
+            if max(gains.values()) > _GAIN:
+                continue
+            gains = fresh.copy()
+            if self.rate != _FINE_RATE:
+                self.rate = _FINE_RATE
+            elif not has_imitated and self.expert_is_better(line.policy):
+                has_imitated, self.rate = True, _RATE
                 clone = line._replace(method="imitation", policy=untrained, cost=np.inf)
                 line = min(line, self.attempt(clone, 0.0), key=lambda line: line.cost)
+            else:
+                break
 
     def expert_is_better(self, policy: AbstractController) -> bool:
         """Whether MPC costs less, on some of the starts of the choice."""
@@ -270,7 +284,9 @@ class PolicySearch:
         while compiled is None or self.seconds - compiled < share * self.budget:
             policy = self.trained(best)
             now = best._replace(policy=policy, cost=self.cost(policy))
-            compiled = self.seconds if compiled is None else compiled
+            if compiled is None:
+                compiled = self.seconds
+                self.longest = max(self.longest, compiled - began)
             # What changes nothing diverges at once.
             stays = now.cost == best.cost
             best = min(best, now, key=lambda line: line.cost)
@@ -313,9 +329,9 @@ class PolicySearch:
             name: _costs(env, ranges, one, keys)
             for name, one in {"policy": policy, **floor}.items()
         }
-        if env.dynamics.observes_state and self.seconds < self.budget:
+        if env.dynamics.observes_state and self.may_compare:
             costs["MPC"] = _costs_of_mpc(env, ranges, self.lqr, keys)
-        if self.seconds < self.budget:
+        if self.may_compare:
             costs["plan"] = _costs_of_plan(env, ranges, policy, keys)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}
 

@@ -72,7 +72,7 @@ def synthesise(
     environment: Environment,
     *,
     key: PRNGKey,
-    budget: Any = 60.0,
+    budget: Any = 75.0,
     ranges: dict[str, Any] | None = None,
     width: int = 32,
     depth: int = 1,
@@ -91,7 +91,7 @@ def synthesise(
         which needs no gradient. If after the first two trials neither they nor a plan
         are better than the LQR, it ends with the LQR.
     3. Refinement: the better third goes on for three times as long, until one is left.
-        That one is trained by each method that still gains, then at a tenth of the
+        That one is trained by the methods that still gain, then at a tenth of the
         learning rate. Once none gains, an imitation of MPC
         ([`delucax.training.imitate`][]) is tried, if MPC costs less.
     4. Choice of the best on starts that it was not trained on. Where the LQR, or no
@@ -101,7 +101,7 @@ def synthesise(
 
     - `environment`: the environment. Its dynamics and cost must be differentiable.
     - `key`: a random key.
-    - `budget`: seconds for all of it with compilation, 60 by default, at least 5. A
+    - `budget`: seconds for all of it with compilation, 75 by default, at least 5. A
         training or comparison that has begun is finished. What is tried depends on the
         speed of the machine, and so does the result.
     - `ranges`: of parameters, as in [`delucax.randomise`][]: the policy is for a family
