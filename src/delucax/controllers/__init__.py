@@ -11,6 +11,12 @@ from ._basic import (
 from ._composed import History as History, Scheduled as Scheduled
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._hinfinity import HInfinity as HInfinity
+from ._local import (
+    local_lqr as local_lqr,
+    local_model as local_model,
+    local_mpc as local_mpc,
+    LocalModel as LocalModel,
+)
 from ._lqr import LQI as LQI, LQR as LQR
 from ._mpc import MPC as MPC
 from ._network import (
@@ -21,7 +27,7 @@ from ._network import (
 )
 from ._output_feedback import LQG as LQG, OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
-from ._residual import local_lqr as local_lqr, Residual as Residual
+from ._residual import Residual as Residual
 from ._safety_filter import SafetyFilter as SafetyFilter
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._stochastic import Categorical as Categorical, Gaussian as Gaussian

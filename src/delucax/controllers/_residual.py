@@ -1,20 +1,12 @@
-"""A network around a controller, and the regulator that an environment defines."""
+"""A controller and a learned correction."""
 
-from typing import Any
-
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._check import as_bounds, bounds_field, check_instance, check_positive
+from .._check import as_bounds, bounds_field
 from .._controller import AbstractController, check_controller
 from .._typing import PRNGKey, RealScalar
-from ..environments import Environment
 from ..math import clip
-from ._lqr import LQR
 
 
 class Residual(AbstractController):
@@ -76,57 +68,3 @@ class Residual(AbstractController):
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         base, correction = self.base, self.correction
         return base.applied(u, cost, state[0]), correction.applied(u, cost, state[1])
-
-
-def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
-    """The LQR that an environment defines: for its dynamics and the curvature of its
-    cost, both at the operating point of `environment.trim()`.
-
-    A direction in which the cost is flat or concave there is given the weight
-    `regularisation` times the largest one, because an LQR needs a definite one.
-
-    **Arguments:**
-
-    - `environment`: the environment. Its state must be observed.
-    - `regularisation`: 1e-4 by default.
-
-    **Returns:** a [`delucax.controllers.LQR`][].
-
-    **Raises:** `ValueError` if the state is not observed, the environment has no target
-    and no equilibrium, or the cost is not twice differentiable there; an error at run
-    time if there is no operating point or no stabilising gain.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-
-        env = dlx.make("quadrotor")
-        dlx.controllers.local_lqr(env).K.shape
-        ```
-    """
-    where = "local_lqr"
-    check_instance(environment, Environment, "environment", where)
-    check_positive(regularisation, "regularisation", where)
-    dynamics = environment.dynamics
-    point = environment.trim()
-    x, u = point.x, point.u
-    H = np.asarray(_curvature(environment.cost, x, u), float)
-    if not np.all(np.isfinite(H)):
-        raise ValueError(
-            f"{where}: the cost must be twice differentiable at x = {x}, u = {u}."
-        )
-    values, vectors = np.linalg.eigh(H)
-    least = regularisation * max(values.max(), 1e-3)
-    H = jnp.asarray(vectors * np.clip(values, least, None) @ vectors.T, x.dtype)
-    n = x.shape[0]
-    weights = H[:n, :n], H[n:, n:], H[:n, n:]
-    return LQR(dynamics, *weights, point=point, difference=dynamics.difference)
-
-
-@eqx.filter_jit
-def _curvature(cost: Any, x: Array, u: Array) -> Array:
-    """H of the stage cost, `dz' H dz` to second order, `dz` the change of (x, u)."""
-    n = x.shape[0]
-    stage = lambda z: cost(jnp.zeros(()), x + z[:n], u + z[n:])
-    return jax.hessian(stage)(jnp.zeros(n + u.shape[0], x.dtype)) / 2

@@ -19,9 +19,7 @@ from jaxtyping import Array
 from .. import controllers
 from .._controller import AbstractController
 from ..controllers import mlp_policy, OpenLoop, Zero
-from ..costs import Function
-from ..disturbances import Gaussian
-from ..dynamics import linearize
+from ..disturbances import Gaussian, Zero as Undisturbed
 from ..environments import Environment, make, registered, UniformState
 from ..experiments import experiment
 from ..lung import BreathCost, Breathing
@@ -33,8 +31,8 @@ from ..training import actor_critic, expected_cost, fit, PPO, SHAC
 # Of every training: steps of the optimiser on the gradient, episodes a step, and the
 # most steps of an episode. PPO and SHAC are given as many steps of the environment.
 TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
-# Of a plan in MPC.
-LOOKAHEAD = 30
+# Trained controllers of each kind.
+TRAINING_SEEDS = 3
 
 
 class EnergyPumping(AbstractController):
@@ -64,32 +62,27 @@ def task_of(name: str) -> Environment:
     return make(name, **options)
 
 
+def is_disturbed(name: str) -> bool:
+    """Whether the task draws disturbances, which a plan knows and no controller."""
+    return not isinstance(task_of(name).disturbance, Undisturbed)
+
+
 @functools.cache
-def _local(name: str) -> tuple[Any, Any, Any]:
-    """The linear model at the equilibrium and the curvature of the cost there, with
-    what a design needs added where it is flat."""
-    env = task_of(name)
-    x, u = env.dynamics.equilibrium()
-    model = linearize(env.dynamics, jnp.zeros(()), x, u)
-    n = x.shape[0]
-    cost = lambda z: env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
-    # A cost `x @ Q @ x + u @ R @ u` has twice those for its Hessian.
-    H = np.asarray(jax.hessian(cost)(jnp.zeros(n + u.shape[0]))) / 2
-    if not np.all(np.isfinite(H)):
-        raise Unsuitable("the cost has no curvature at the equilibrium")
-    # Designs need R definite: a direction that costs nothing is given a weight that is
-    # a ten-thousandth of the largest.
-    values, vectors = np.linalg.eigh(H)
-    scale = max(values.max(), 1e-3)
-    H = vectors * np.clip(values, 1e-4 * scale, None) @ vectors.T
-    return model, jnp.asarray(H[:n, :n]), jnp.asarray(H[n:, n:])
+def _local(name: str) -> controllers.LocalModel:
+    return controllers.local_model(task_of(name))
 
 
 def _regulator(
     name: str, env: Environment, design: Callable[..., Any], **options: Any
 ) -> Any:
     """A design from the linear model and the curvature of the cost."""
-    return design(*_local(name), difference=env.dynamics.difference, **options)
+    dynamics, Q, R, S = _local(name)
+    weights = (Q, R, S)
+    if design is controllers.HInfinity:
+        if np.any(S):
+            raise Unsuitable("the cost weights products of state and control")
+        weights = (Q, R)
+    return design(dynamics, *weights, difference=env.dynamics.difference, **options)
 
 
 def _following(name: str, env: Environment) -> Any:
@@ -114,33 +107,28 @@ def _receding(
     real_time: bool = False,
     **options: Any,
 ) -> Any:
-    """MPC with the model and the cost of the task and, at the end of a plan, the cost
-    to go of the LQR where there is one."""
-    if env.dynamics.observation_size != env.dynamics.state_size:
-        raise Unsuitable("the state is not observed")
+    """MPC, with the cost to go of the LQR where there is one."""
     bounds = env.control_bounds
     if kind in (MPPI, CEM) and bounds is not None:
         low, high = (np.asarray(bound, float) for bound in bounds)
         width = high - low
         options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
-    cost, lqr = env.cost, _suited(name, "LQR")
-    if lqr is not None:
+    how: dict[str, Any] = dict(real_time=real_time, throw=False)
+    lqr = _suited(name, "LQR")
+    return controllers.local_mpc(env, lqr, planner=kind(**options), **how)
 
-        def to_go(t, x):
-            deviation = env.dynamics.difference(x, lqr.x_ref)
-            return deviation @ lqr.P @ deviation
 
-        cost = Function(env.cost, to_go)
-    how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
-    return controllers.MPC(env.dynamics, cost, LOOKAHEAD, real_time=real_time, **how)
+def _seeds() -> Any:
+    """Of the controllers that are trained as a batch, every array with it in front."""
+    return jax.random.split(jax.random.key(1), TRAINING_SEEDS)
 
 
 def _by_gradient(env: Environment, network: Callable[..., Any], **options: Any) -> Any:
-    """A network, by gradient descent through the rollout."""
-    first, key = jax.random.split(jax.random.key(1))
-    horizon = min(env.horizon, LONGEST)
+    """Networks, by gradient descent through the rollout."""
+    keys, horizon = _seeds(), min(env.horizon, LONGEST)
     loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
-    return _fitted(loss, network(env, key=first, **options), TRAINING_STEPS, key)
+    models = eqx.filter_vmap(lambda key: network(env, key=key, **options))(keys)
+    return _fitted(loss, models, TRAINING_STEPS, keys)
 
 
 def _gru(env: Environment, key: Any) -> Any:
@@ -152,24 +140,24 @@ def _gru(env: Environment, key: Any) -> Any:
 
 
 def _by_actor_critic(env: Environment, method: type[PPO] | type[SHAC]) -> Any:
-    """The MLP by reinforcement learning."""
-    head = "gaussian" if method is PPO else "deterministic"
-    first, key = jax.random.split(jax.random.key(1))
-    model = actor_critic(env, width=32, depth=1, head=head, key=first)
+    """The MLPs by reinforcement learning."""
+    head, keys = "gaussian" if method is PPO else "deterministic", _seeds()
+    shape: dict[str, Any] = dict(width=32, depth=1, head=head)
+    models = eqx.filter_vmap(lambda key: actor_critic(env, **shape, key=key))(keys)
     loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
     steps = TRAINING_STEPS
     if isinstance(loss, PPO):
         steps *= loss.epochs * loss.minibatches
-    policy = _fitted(loss, model, steps, key).policy
+    policy = _fitted(loss, models, steps, keys).policy
     return policy.base if method is PPO else policy
 
 
-def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
-    """The model, trained by Adam."""
+def _fitted(loss: Any, models: Any, steps: int, keys: Any) -> Any:
+    """The models, trained by Adam, all in one program."""
     adam = optax.adam(optax.cosine_decay_schedule(0.01, steps))
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
-    options: Any = dict(key=key, progress=False, throw=False)
-    return fit(loss, model, optimiser, steps, **options).model
+    options: Any = dict(key=keys, progress=False, throw=False)
+    return fit(loss, models, optimiser, steps, **options).model
 
 
 FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
@@ -211,9 +199,12 @@ FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
 """The methods by family: each makes a controller for the task of a name."""
 
 
+TRAINED = tuple(FAMILIES["Training"])
+
+
 @functools.cache
 def agent_of(name: str, method: str) -> Any:
-    """The controller, designed at the equilibrium or trained.
+    """The controller, designed at the operating point; or a batch of those trained.
 
     **Raises:** `Unsuitable` if the task lacks what the method needs.
     """
@@ -255,10 +246,18 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
     return OpenLoop(best)
 
 
+def _members(agent: Any, method: str) -> list[Any]:
+    """The controllers of a batch, one for each training; or the one that there is."""
+    if method not in TRAINED:
+        return [agent]
+    of = lambda k: jax.tree.map(lambda a: a[k] if eqx.is_array(a) else a, agent)
+    return [of(k) for k in range(TRAINING_SEEDS)]
+
+
 def _suited(task: str, method: str) -> Any:
-    """The controller, or none if it does not suit."""
+    """The controller, the first of a training, or none if it does not suit."""
     try:
-        return agent_of(task, method)
+        return _members(agent_of(task, method), method)[0]
     except Unsuitable:
         return None
 
@@ -273,36 +272,52 @@ def _costs(env: Environment, agent: Any, keys: Any) -> Any:
     return jax.vmap(lambda key: _cost(env, agent, key))(keys)
 
 
-@functools.cache
-def _batch(task: str, method: str, block: int) -> tuple[list[float], float | None]:
-    """The costs of a block of seeds, and microseconds per step of one of them."""
-    env = task_of(task)
+def _keys(block: int) -> Any:
+    """Those of the episodes of a block of seeds."""
     seeds = range(block * BATCH, (block + 1) * BATCH)
-    keys = jax.vmap(jax.random.key)(jnp.array(seeds))
+    return jax.vmap(jax.random.key)(jnp.array(seeds))
+
+
+def costs_of(task: str, agent: AbstractController) -> list[float]:
+    """The costs of a controller of yours, from the starts of the scoreboard."""
+    return np.asarray(_costs(task_of(task), agent, _keys(0))).tolist()
+
+
+@functools.cache
+def _batch(task: str, method: str, block: int) -> tuple[Any, float | None]:
+    """The costs of a block of seeds, for each training a row, and microseconds per
+    step of one of them."""
+    env, keys = task_of(task), _keys(block)
     if method == "plan":
         guides = [agent for name in GUIDES if (agent := _suited(task, name))]
         if task in PUMPED:
             guides.append(EnergyPumping(jnp.ones(1)))
         plans = [_planned(env, guides, key) for key in keys]
         pairs = zip(plans, keys, strict=True)
-        return [float(_cost(env, plan, key)) for plan, key in pairs], None
-    agent, best, spent = agent_of(task, method), np.inf, 0.0
-    costs = np.asarray(_costs(env, agent, keys))
+        return np.array([[_cost(env, plan, key) for plan, key in pairs]]), None
+    agents, best, spent = _members(agent_of(task, method), method), np.inf, 0.0
+    costs = np.array([_costs(env, agent, keys) for agent in agents])
     while spent < TIMED:
         begin = time.perf_counter()
-        jax.block_until_ready(_costs(env, agent, keys))
+        jax.block_until_ready(_costs(env, agents[0], keys))
         took = time.perf_counter() - begin
         best, spent = min(best, took), spent + took
-    return costs.tolist(), 1e6 * best / (BATCH * env.horizon)
+    return costs, 1e6 * best / (BATCH * env.horizon)
 
 
 @experiment.parametrize("task", [name for name in registered() if "/" not in name])
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:
-    """The cost of an episode, and microseconds per step."""
+    """The cost of an episode, the middle one of several trainings, these costs, and
+    microseconds per step."""
     try:
-        costs, speed = _batch(task, method, seed // BATCH)
+        batch, speed = _batch(task, method, seed // BATCH)
     except Unsuitable as error:
-        return {"cost": None, "us_per_step": None, "unsuitable": str(error)[:200]}
-    return {"cost": costs[seed % BATCH], "us_per_step": speed, "unsuitable": None}
+        nothing = dict.fromkeys(("cost", "trainings", "us_per_step"))
+        return nothing | {"unsuitable": str(error)[:200]}
+    costs = batch[:, seed % BATCH].astype(float)
+    middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
+    trainings = costs.tolist() if method in TRAINED else None
+    found = {"cost": middle, "trainings": trainings, "us_per_step": speed}
+    return found | {"unsuitable": None}

@@ -14,8 +14,7 @@ from jaxtyping import Array
 
 from .._controller import AbstractController
 from .._typing import PRNGKey
-from ..controllers import Constant, local_lqr, LQR, MPC, OpenLoop, Zero
-from ..costs import AbstractCost, Function
+from ..controllers import Constant, local_lqr, local_mpc, LQR, OpenLoop, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment, randomise
 from ..planning import ILQR
@@ -59,8 +58,6 @@ _CLOSE = 0.5
 _GAIN, _WORTH = 1e-3, 5e-3
 # How wide an evolution begins: for each structure, and near the best.
 _WIDTHS, _NEAR = {"network": 1.0, LQR_AND_NETWORK: 0.3, "memory": 0.3}, 0.05
-# Of MPC, as the expert and in the comparison.
-_LOOKAHEAD, _ITERATIONS = 30, 8
 
 
 class Attempt(NamedTuple):
@@ -230,7 +227,8 @@ class PolicySearch:
             "correction" if line.structure == LQR_AND_NETWORK else None
         )
         if method == "imitation":
-            return imitate(env, _mpc(env, self.lqr), policy, **options).model
+            expert = local_mpc(env, self.lqr, throw=False)
+            return imitate(env, expert, policy, **options).model
         if method == "evolution":
             options["sigma"] = (
                 _NEAR if np.isfinite(line.cost) else _WIDTHS[line.structure]
@@ -346,23 +344,6 @@ def _regulator(environment: Environment) -> LQR | None:
         return None
 
 
-def _mpc(environment: Environment, lqr: LQR | None) -> MPC:
-    """MPC with the model and the cost of the task, and at the end of a plan the LQR's
-    cost to go, where there is one."""
-    dynamics, cost = environment.dynamics, environment.cost
-    if lqr is not None:
-        P, x_ref, difference = lqr.P, lqr.x_ref, dynamics.difference
-
-        def to_go(t: Any, x: Array) -> Array:
-            away = difference(x, x_ref)
-            return away @ P @ away
-
-        cost: AbstractCost = Function(cost, to_go)
-    planner = ILQR(max_iterations=_ITERATIONS)
-    bounds = environment.control_bounds
-    return MPC(dynamics, cost, _LOOKAHEAD, planner=planner, bounds=bounds, throw=False)
-
-
 def _on_plants(
     environment: Environment, ranges: dict[str, Any] | None, keys: Array, of: Any
 ) -> Array:
@@ -389,7 +370,8 @@ def _costs(environment, ranges, policy, keys):
 @eqx.filter_jit
 def _costs_of_mpc(environment, ranges, lqr, keys):
     def of(plant, key):
-        return rollout(plant, _mpc(plant, lqr), key=key, **_QUIETLY).total_cost
+        mpc = local_mpc(plant, lqr, throw=False)
+        return rollout(plant, mpc, key=key, **_QUIETLY).total_cost
 
     return _on_plants(environment, ranges, keys, of)
 
