@@ -33,14 +33,15 @@ def names() -> list[str]:
 
 
 def case(task: str, seed: int) -> dict[str, Any]:
-    """The policy of one task and seed, in this process."""
+    """The policy of one task and seed, in this process: its costs on starts of its own
+    beside those of others, and on the starts of the scoreboard."""
     began = time.perf_counter()
     # With all cores, as a user has; the benchmark itself may be on one.
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
     import jax
 
-    from delucax.studies._scoreboard import task_of
+    from delucax.studies._scoreboard import costs_of, task_of
     from delucax.training import synthesise
 
     found = synthesise(task_of(task), key=jax.random.key(seed), progress=False)
@@ -48,6 +49,7 @@ def case(task: str, seed: int) -> dict[str, Any]:
     costs = {name: cost.tolist() for name, cost in found.costs.items()}
     tried = [attempt._asdict() for attempt in found.tried]
     about = {"task": task, "seed": seed, "structure": found.structure}
+    about["scoreboard"] = costs_of(task, found.policy)
     return about | {"seconds": seconds, "costs": costs, "tried": tried}
 
 

@@ -5,10 +5,10 @@ import importlib
 import importlib.util
 import json
 import re
-import shutil
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers import once
 
@@ -499,13 +499,65 @@ def test_paper(monkeypatch):
     assert all(kept) and all(row["holds"] for row in lungs)
 
 
-def test_scoreboard(tmp_path, monkeypatch):
-    """The tables of the page are those of what is stored."""
+def test_scoreboard(monkeypatch):
+    """The page is that of what is stored, nothing is better than the best known, and
+    what the summary says is so."""
     monkeypatch.syspath_prepend(str(ROOT))
-    board = importlib.import_module("benchmarks.scoreboard")
-    shutil.copy(board.STORE, tmp_path / "scoreboard.jsonl")
-    made = board.tables(board.Results.read(tmp_path / "scoreboard.jsonl"))
-    assert made in (ROOT / "docs/scoreboard.md").read_text()
+    made = importlib.import_module("benchmarks.scoreboard")
+    board, page = made.stored(), (ROOT / "docs/scoreboard.md").read_text()
+    assert made.example(board) in page and made.best_table(board) in page
+    assert made.tables(board) in page
+    tasks = board.names
+    pairs = [(task, method) for task in tasks for method in board.methods]
+    scores = [e for pair in pairs if (e := board.excess(*pair)) is not None]
+    assert len(tasks) >= 31 and len(scores) > 450 and min(scores) == 0
+    # A policy that beats all on every start is the best known, by a line of its own.
+    own = {"task": "pendulum", "scoreboard": [1.0] * 8}
+    beaten = made.board_of(made.Results.read(made.STORE), [json.dumps(own)])
+    assert beaten.best("pendulum") == 1.0 < board.best("pendulum")
+    assert beaten.excess("pendulum", "synthesise") == 0
+
+    of = lambda task: [m for _, m in board.ranked(task) if m != "synthesise"]
+    assert all(of(task)[0] == "GRU" for task in board.tasks["lungs"])
+    assert of("pendulum")[0] == of("acrobot")[0] == "MPC"
+    mpc = [e for task in tasks if (e := board.excess(task, "MPC")) is not None]
+    assert sum(e <= 0.05 for e in mpc) > len(mpc) / 2
+    for task in ("cartpole", "compass_gait"):
+        assert board.excess(task, "MPC") > 0.5 > 5 * board.excess(task, "CEM")
+        assert 0.1 > board.excess(task, "MPPI")
+    for task in ("mountain_car", "mountain_car_discrete"):
+        assert board.excess(task, of(task)[0]) > 0.5
+
+
+def test_the_score_of_the_scoreboard(monkeypatch):
+    """Relative cost where the floor is far, the share of a saving where it is near."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    made = importlib.import_module("benchmarks._scores")
+
+    def excess(zero, cost, best):
+        costs = {"zero": zero, "MPC": cost, "plan": best}
+        rows = {("task", name): np.full((1, 8), c) for name, c in costs.items()}
+        return made.Board(rows, {}).excess("task", "MPC")
+
+    assert np.isclose(excess(1000.0, 103.0, 100.0), 0.03)
+    assert np.isclose(excess(110.0, 103.0, 100.0), 0.3)
+    # Rewards; what zero control does as well; and a best known of zero.
+    assert np.isclose(excess(0.0, -40.0, -100.0), 0.6)
+    assert np.isclose(excess(100.1, 103.0, 100.0), 0.03)
+    assert np.isclose(excess(4.0, 1.0, 0.0), 0.25)
+    assert excess(np.inf, np.inf, 100.0) == excess(0.0, 3.0, 0.0) == np.inf
+    assert excess(np.inf, np.inf, np.inf) == np.inf and excess(0.0, 0.0, 0.0) == 0
+
+    # With disturbances, the best single controller and not the luck of each draw.
+    draws = np.array([[1.0, 3.0, 3.0, 1.0]]), np.array([[3.0, 1.0, 1.0, 4.0]])
+    costs = {("task", name): c for name, c in zip(("zero", "LQR"), draws, strict=True)}
+    costs["task", "plan"] = np.zeros((1, 4))
+    assert made.Board(costs, {}).best("task") == 0
+    board = made.Board(costs, {}, frozenset({"task"}))
+    assert board.best("task") == board.cost("task", "zero").middle == 2
+    # Of trainings the middle one.
+    costs["task", "MLP"] = np.array([[4.0] * 4, [3.0] * 4, [np.inf] * 4])
+    assert made.Board(costs, {}).cost("task", "MLP") == (4.0, 3.0, np.inf, 3)
 
 
 def test_no_address_of_a_repository_is_invented():
