@@ -22,6 +22,15 @@ if TYPE_CHECKING:
         mountain_car_discrete as mountain_car_discrete,
         pendulum as pendulum,
     )
+    from ._hard import (
+        cartpole_swing_up as cartpole_swing_up,
+        double_pendulum_cart as double_pendulum_cart,
+        drift as drift,
+        furuta as furuta,
+        quadrotor_flip as quadrotor_flip,
+        reactor_start_up as reactor_start_up,
+        slung_load as slung_load,
+    )
     from ._hybrid import (
         bouncing_ball as bouncing_ball,
         compass_gait as compass_gait,

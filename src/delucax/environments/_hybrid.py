@@ -1,13 +1,11 @@
 """Tasks of plants with events: bounce, roll, walk, switch, slip and land."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._module import parameter
 from .._typing import BoolScalar, Control, Real, Scalar, State, Time
-from ..costs import AbstractCost, Arrival, Quadratic
+from ..costs import AbstractCost, Quadratic
 from ..math import cos
 from ..systems import (
     BouncingBall,
@@ -17,7 +15,7 @@ from ..systems import (
     Thermostat,
     ValveWithStops,
 )
-from ._task import box, Fields, Limit, Number, Positive, task, UniformState
+from ._task import box, Fields, Limit, Number, once, Positive, task, UniformState
 
 
 def peak(system: BouncingBall, x: State) -> Scalar:
@@ -90,16 +88,11 @@ def bouncing_ball(
     """
     rests = _Rests(system)
     return dict(
-        cost=PeakCost(system, height) + _once(rests, rest_cost),
+        cost=PeakCost(system, height) + once(rests, rest_cost),
         initial_state=UniformState([0.5, 0.0], [1.5, 0.0]),
         control_bounds=(-max_force, max_force),
         terminated=rests,
     )
-
-
-def _once(ended: Callable[[Time, State], BoolScalar], cost: Number) -> Arrival:
-    """What the end of an episode costs."""
-    return Arrival(ended, step_cost=0.0, arrival_cost=cost)
 
 
 class _RollsBack(eqx.Module):
@@ -143,7 +136,7 @@ def rimless_wheel(
     back = _RollsBack()
     cost = Quadratic([0.0, 1.0], [0.1], state_target=[0.0, speed])
     return dict(
-        cost=cost + _once(back, stall_cost),
+        cost=cost + once(back, stall_cost),
         initial_state=UniformState([-0.2, 0.8], [0.2, 1.6]),
         control_bounds=(-max_torque, max_torque),
         terminated=back,
@@ -222,7 +215,7 @@ def compass_gait(
     angles = [-0.27105 - system.slope, 0.27105 - system.slope]
     centre = jnp.stack([*angles, *map(jnp.asarray, (-0.3772, -1.0918))])
     return dict(
-        cost=WalkingCost(system, speed) + _once(falls, fall_cost),
+        cost=WalkingCost(system, speed) + once(falls, fall_cost),
         initial_state=UniformState(*box([0.01, 0.01, 0.03, 0.03], centre)),
         control_bounds=(-max_torque, max_torque),
         terminated=falls,

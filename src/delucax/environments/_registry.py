@@ -10,6 +10,8 @@ from ._environment import Environment
 
 TASKS = {
     "_classic_control": "acrobot cartpole mountain_car mountain_car_discrete pendulum",
+    "_hard": "cartpole_swing_up double_pendulum_cart drift furuta quadrotor_flip "
+    "reactor_start_up slung_load",
     "_hybrid": "bouncing_ball compass_gait rimless_wheel stick_slip thermostat "
     "valve_with_stops",
     "_linear": "cartpole_linear lds",

@@ -24,7 +24,8 @@ from .._check import (
 )
 from .._jax import host_unless_traced, xp
 from .._module import parameter
-from .._typing import Array, PRNGKey, Real
+from .._typing import Array, BoolScalar, PRNGKey, Real, State, Time
+from ..costs import Arrival
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
@@ -75,6 +76,11 @@ _CHANGES_OBSERVATIONS = frozenset(
     "disturbance dynamics encode initial_state sensor_noise terminated".split()
 )
 """Arguments of `Environment` that can invalidate the task's bounds of observations."""
+
+
+def once(ended: Callable[[Time, State], BoolScalar], cost: Any) -> Arrival:
+    """What the end of an episode costs."""
+    return Arrival(ended, step_cost=0.0, arrival_cost=cost)
 
 
 Fields: TypeAlias = dict[str, Any]

@@ -33,6 +33,10 @@ if TYPE_CHECKING:
         MassSpringDamper as MassSpringDamper,
         VanDerPol as VanDerPol,
     )
+    from ._pendulums import (
+        DoublePendulumCart as DoublePendulumCart,
+        FurutaPendulum as FurutaPendulum,
+    )
     from ._quadrotors import (
         ConstantWind as ConstantWind,
         DissipativeWind as DissipativeWind,
@@ -50,6 +54,7 @@ if TYPE_CHECKING:
         Thermostat as Thermostat,
         ValveWithStops as ValveWithStops,
     )
+    from ._vehicles import DriftingCar as DriftingCar, SlungLoad as SlungLoad
     from ._walkers import CompassGait as CompassGait, SimplestWalker as SimplestWalker
 else:
     # The catalogue is imported as it is used.
@@ -60,10 +65,12 @@ else:
             "_hybrid": "BouncingBall RimlessWheel",
             "_industrial": "CSTR PermanentMagnetMotor TwoTank",
             "_oscillators": "DoubleIntegrator Lorenz MassSpringDamper VanDerPol",
+            "_pendulums": "DoublePendulumCart FurutaPendulum",
             "_quadrotors": "ConstantWind DissipativeWind PlanarQuadrotor Quadrotor "
             "VortexWind",
             "_robots": "DynamicBicycle KinematicBicycle Reacher",
             "_switching": "StickSlip Thermostat ValveWithStops",
+            "_vehicles": "DriftingCar SlungLoad",
             "_walkers": "CompassGait SimplestWalker",
         },
     )

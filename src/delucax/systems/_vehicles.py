@@ -1,0 +1,264 @@
+"""Vehicles at their limits: a quadrotor that carries a load, and a car that drifts."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._check import is_concrete
+from .._jax import host_unless_traced, xp
+from .._message import shortened
+from .._module import parameter, positive
+from .._typing import Control, Disturbance, Real, Scalar, State, Time, Vector
+from ..math import clip, cos, sin
+from ._base import AbstractSystem
+
+
+class SlungLoad(AbstractSystem):
+    r"""A load on a cable under a quadrotor, in a vertical plane:
+
+    ```
+    (M + m) (a + g e_y) = (F . q - M l swing_rate^2) q
+    M l d(swing_rate)/dt = -F . dq/d(swing)
+    J d(rate)/dt = arm (right - left)
+    ```
+
+    with the acceleration a of the load, the thrust
+    `F = (left + right) (-sin(angle), cos(angle))` and the direction of the cable from
+    the quadrotor to the load, `q = (sin(swing), -cos(swing))`. The cable has no mass
+    and is taut: like a rod, it pushes where a slack one would fold.
+
+    The state is (x [m], y [m], angle [rad], swing [rad], vx [m/s], vy [m/s], rate
+    [rad/s], swing_rate [rad/s]), x and y being the position of the load. The control is
+    (left [N], right [N]), the thrusts of the two rotors. At `swing = 0` the load hangs
+    straight below. The vector field is smooth, and takes thrusts of either sign.
+
+    **Arguments:**
+
+    - `mass`: M, of the quadrotor [kg], 0.5 by default.
+    - `load`: m, its mass [kg], 0.1 by default.
+    - `cable`: l, its length [m], 0.5 by default.
+    - `arm`: from the centre to a rotor [m], 0.2 by default.
+    - `inertia`: J [kg m^2], 0.005 by default.
+    - `gravity`: g [m/s^2], 9.81 by default.
+
+    **Raises:** `ValueError` if a mass, length or inertia is not positive, or a number
+    is not finite.
+
+    Source: Sreenath, Lee and Kumar, 2013.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        carrier = dlx.systems.SlungLoad(load=0.2)
+        x, u = carrier.equilibrium()
+        carrier.vector_field(0.0, x.at[3].set(0.1), u, None)
+        carrier.quadrotor(x)
+        ```
+    """
+
+    mass: Real = parameter(0.5, constraint=positive)
+    load: Real = parameter(0.1, constraint=positive)
+    cable: Real = parameter(0.5, constraint=positive)
+    arm: Real = parameter(0.2, constraint=positive)
+    inertia: Real = parameter(0.005, constraint=positive)
+    gravity: Real = parameter(9.81)
+
+    state_names = ("x", "y", "angle", "swing", "vx", "vy", "rate", "swing_rate")
+    state_units = ("m", "m", "rad", "rad", "m/s", "m/s", "rad/s", "rad/s")
+    control_names, control_units = ("left", "right"), ("N", "N")
+    angle_names = ("angle", "swing")
+
+    def quadrotor(self, x: State) -> Vector:
+        """The position of the quadrotor.
+
+        **Arguments:** `x`: state.
+
+        **Returns:** shape `(2,)` [m].
+        """
+        s, c = sin(x[3]), cos(x[3])
+        return jnp.stack([x[0] - self.cable * s, x[1] + self.cable * c])
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        thrust, s, c = u[0] + u[1], sin(x[3]), cos(x[3])
+        fx, fy = -thrust * sin(x[2]), thrust * cos(x[2])
+        # Along the cable, the load and the quadrotor are one; across it, neither feels
+        # the other.
+        along = fx * s - fy * c - self.mass * self.cable * (x[7] * x[7])
+        pull = along / (self.mass + self.load)
+        swing = -(fx * c + fy * s) / (self.mass * self.cable)
+        turn = self.arm * (u[1] - u[0]) / self.inertia
+        ax, ay = pull * s, -pull * c - self.gravity
+        return jnp.stack([x[4], x[5], x[6], x[7], ax, ay, turn, swing])
+
+    @host_unless_traced
+    def equilibrium(self) -> tuple[State, Control]:
+        """Hovering, with the load at the origin.
+
+        **Returns:** the zero state, and a half of the whole weight for each rotor.
+        """
+        half = (self.mass + self.load) * self.gravity / 2
+        return xp.zeros(8), xp.stack([half, half])
+
+
+class DriftingCar(AbstractSystem):
+    r"""A car that is driven at the rear, as a bicycle on Fiala's brush tyres, of which
+    the rear one shares its grip between driving and cornering:
+
+    `m d(vx)/dt = force - F_f sin(steering) + m vy rate`,
+    `m d(vy)/dt = F_f cos(steering) + F_r - m vx rate`,
+    `I d(rate)/dt = front F_f cos(steering) - rear F_r`,
+
+    `F = -C z (1 - s + s^2 / 3)` for each axle, `z` being the tangent of its slip angle
+    and `s = |z| / z*`. At `z* = 3 G / C` the tyre begins to slide, and from there on
+    `F = -G sign(z)`. The grip G is `mu N_f` in front and `sqrt((mu N_r)^2 - force^2)`
+    at the rear, with the loads N at rest.
+
+    The state is (vx [m/s], vy [m/s], rate [rad/s]), the velocities those of the centre
+    of mass along and across the car; the control is (steering [rad], force [N]), the
+    force being that of the rear tyre along the car. The derivative of the vector field
+    is continuous.
+
+    In a drift the rear tyre slides, and the car turns against its steering. This
+    equilibrium is unstable: it holds only with feedback.
+
+    A slip angle has no value at rest: `z = v / sqrt(along^2 + standstill^2)`, v being
+    the velocity across the tyre. Nor does a tyre that drives with all its grip corner:
+    the rear one is left with a fiftieth of it.
+
+    **Arguments:**
+
+    - `mass`: m [kg], 1724 by default.
+    - `inertia`: I, about the vertical axis [kg m^2], 1300 by default.
+    - `front`, `rear`: from the centre of mass to the axles [m], 1.35 and 1.15 by
+        default.
+    - `front_stiffness`, `rear_stiffness`: C of both tyres of an axle [N/rad], 120000
+        and 175000 by default.
+    - `grip`: mu, the coefficient of friction, 0.55 by default, of wet asphalt.
+    - `gravity`: g [m/s^2], 9.81 by default.
+    - `standstill`: a speed [m/s], 0.1 by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014, who take
+    `cos(steering)` for 1.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        car = dlx.systems.DriftingCar()
+        x, u = car.equilibrium(speed=8.0, steering=-0.2)
+        car.vector_field(0.0, x, u, None)
+        ```
+    """
+
+    mass: Real = parameter(1724.0, constraint=positive)
+    inertia: Real = parameter(1300.0, constraint=positive)
+    front: Real = parameter(1.35, constraint=positive)
+    rear: Real = parameter(1.15, constraint=positive)
+    front_stiffness: Real = parameter(120000.0, constraint=positive)
+    rear_stiffness: Real = parameter(175000.0, constraint=positive)
+    grip: Real = parameter(0.55, constraint=positive)
+    gravity: Real = parameter(9.81, constraint=positive)
+    standstill: Real = parameter(0.1, constraint=positive)
+
+    state_names, state_units = ("vx", "vy", "rate"), ("m/s", "m/s", "rad/s")
+    control_names, control_units = ("steering", "force"), ("rad", "N")
+
+    def grips(self) -> tuple[Scalar, Scalar]:
+        """The largest force of each axle.
+
+        **Returns:** `mu N_f` and `mu N_r` [N].
+        """
+        whole = self.grip * self.mass * self.gravity / (self.front + self.rear)
+        return whole * self.rear, whole * self.front
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        vx, vy, rate, force = x[0], x[1], x[2], u[1]
+        s, c = sin(u[0]), cos(u[0])
+        grip_front, grip_rear = self.grips()
+        share = force / grip_rear
+        left = jnp.maximum(1 - share * share, 4e-4) ** 0.5
+        ahead, aside = vy + self.front * rate, vy - self.rear * rate
+        slip_front = self._slip(aside=ahead * c - vx * s, along=vx * c + ahead * s)
+        slip_rear = self._slip(aside=aside, along=vx)
+        force_front = _brush(slip_front, self.front_stiffness, grip_front)
+        force_rear = _brush(slip_rear, self.rear_stiffness, left * grip_rear)
+        lateral = force_front * c
+        return jnp.stack(
+            [
+                (force - force_front * s) / self.mass + vy * rate,
+                (lateral + force_rear) / self.mass - vx * rate,
+                (self.front * lateral - self.rear * force_rear) / self.inertia,
+            ]
+        )
+
+    def _slip(self, aside: Scalar, along: Scalar) -> Scalar:
+        """The tangent of a slip angle."""
+        return aside / (along * along + self.standstill**2) ** 0.5
+
+    @host_unless_traced
+    def equilibrium(
+        self, speed: Any = 8.0, steering: Any = -12 * 2 * np.pi / 360
+    ) -> tuple[State, Control]:
+        """The drift to the left at a speed and a steering angle.
+
+        **Arguments:**
+
+        - `speed`: vx, above 0 [m/s], 8 by default.
+        - `steering`: [rad], -12 degrees by default: to the right.
+
+        **Returns:** `(x, u)`.
+
+        **Raises:** `ValueError` if there is no such drift.
+        """
+        v, steering = (
+            xp.asarray(number, jnp.result_type(float)) for number in (speed, steering)
+        )
+        s, c = xp.sin(steering), xp.cos(steering)
+        grip_front, grip_rear = self.grips()
+        ahead, whole = self.front, self.front + self.rear
+        slides = 3 * grip_front / self.front_stiffness
+
+        # What balances the moments and the lateral forces, with the share 1 - y^3 of
+        # its grip in front; there y is how far the slip is from sliding.
+        def balanced(y):
+            used = (1 - y**3) * c
+            rate = used * self.grip * self.gravity / v
+            force = grip_rear * (1 - used * used) ** 0.5
+            return rate, force, v * self.rear / whole * s / c - force / self.mass / rate
+
+        def miss(y):
+            rate, _, vy = balanced(y)
+            moves, slip = vy + ahead * rate, slides * (y - 1)
+            along = v * c + moves * s
+            along = (along * along + self.standstill**2) ** 0.5
+            return rate * (moves * c - v * s - slip * along)
+
+        # Newton's method, by differences that are small enough.
+        y, h = xp.asarray(0.45, v.dtype), 1e-3
+        for _ in range(12):
+            y = y - 2 * h * miss(y) / (miss(y + h) - miss(y - h))
+        rate, force, vy = balanced(y)
+        if is_concrete(y) and is_concrete(vy):
+            left = self.rear_stiffness * (self.rear * rate - vy) / v
+            is_drift = (0 < y) & (y < 1) & (v > 0) & (abs(miss(y)) < 1e-3)
+            if not np.all(is_drift & (left > 3 * (grip_rear**2 - force**2) ** 0.5)):
+                raise ValueError(
+                    "DriftingCar: speed and steering must be those of a drift, such as "
+                    f"8 and -0.2, got {shortened(speed)} and {shortened(steering)}."
+                )
+        return xp.stack([v, vy, rate]), xp.stack([steering, force])
+
+
+def _brush(slip: Scalar, stiffness: Scalar, grip: Scalar) -> Scalar:
+    """The lateral force of a brush tyre."""
+    most = 3 * grip / stiffness
+    slip = clip(slip, -most, most)
+    share = abs(slip) / most
+    return -stiffness * slip * (1 - share + share * share / 3)
