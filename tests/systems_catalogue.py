@@ -124,6 +124,18 @@ SYSTEMS = {
         *box(5.0, 0.2),
         0.01,
     ),
+    "DoublePendulumCart": Case(
+        s.DoublePendulumCart, *box(2.0, 3.2, 3.2, 3.0, 9.0, 9.0), *box(40.0), 0.01
+    ),
+    "FurutaPendulum": Case(
+        s.FurutaPendulum, *box(3.2, 3.2, 15.0, 25.0), *box(10.0), 0.01
+    ),
+    "SlungLoad": Case(
+        s.SlungLoad, *box(4.0, 4.0, 3.2, 3.2, 3.0, 3.0, 5.0, 5.0), *box(5.0, 5.0), 0.02
+    ),
+    "DriftingCar": Case(
+        s.DriftingCar, [-2.0, -6.0, -2.0], [15.0, 6.0, 2.0], *box(0.6, 6000.0), 0.01
+    ),
     "BouncingBall": Case(
         lambda: s.BouncingBall(drag=0.1), [0.1, -5.0], [3.0, 5.0], *box(5.0), 0.02
     ),

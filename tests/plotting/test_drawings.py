@@ -61,7 +61,7 @@ def drawn(env, x, u=None):
 def test_every_task_has_a_drawing_that_moves(name, arguments):
     env = dlx.make(name, **arguments)
     generic = _BY_TYPE[dlx.AbstractDynamics]
-    phase_planes = ("cstr", "lds", "neural", "van_der_pol")
+    phase_planes = ("cstr", "lds", "neural", "reactor_start_up", "van_der_pol")
     assert (drawing_for(env) is generic) == (name in phase_planes)
     rng = np.random.default_rng(0)
     states = 0.5 * rng.normal(size=(4, env.state_size))

@@ -2,11 +2,12 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from ..._figures import color_of
 from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector
 
 
@@ -104,55 +105,70 @@ HINGE = WHEEL + HEIGHT
 def _cart_pole(
     canvas: Canvas,
     episode: Episode,
-    length: float,
-    lean: Callable[[Vector], float],
+    lengths: Sequence[float],
+    lean: Callable[[Vector], Vector],
     hangs: bool,
     bob: float = 0.0,
 ) -> Drawing:
-    """A cart on its track, and a pole that leans to the right by `lean(x)`, with a mass
-    at its tip if `bob` is not 0. The track ends where the task says, and the view goes
-    lower if the pole hangs at times."""
+    """A cart on its track, and a chain of poles that lean to the right by `lean(x)`,
+    with a mass at the tip if `bob` is not 0. The track ends where the task says, and
+    the view goes lower if the poles hang at times."""
     canvas.ground()
+    whole, size = sum(lengths), sum(lengths) / len(lengths)
     end = getattr(episode.environment.terminated, "max_position", None)
     if end is None:
         positions = np.abs(episode.states[:, 0]).max(initial=0.0)
-        reach = float(np.clip(positions, 1.2 * length, 2.5 * length))
+        reach = float(np.clip(positions, 1.2 * whole, 2.5 * whole))
     else:
         reach = float(end)
         for side in (-reach, reach):
-            ends = [(side, -0.12 * length), (side, 0.12 * length)]
+            ends = [(side, -0.12 * size), (side, 0.12 * size)]
             canvas.line(ends, color=canvas.NEUTRAL, lw=2)
-    low = HINGE - 1.2 if hangs else -0.3
-    low, high = low * length, (HINGE + 1.2) * length
-    half = reach + 0.5 * WIDTH * length, (high - low) / 2
+    low = HINGE * size - 1.2 * whole if hangs else -0.3 * size
+    high = HINGE * size + 1.2 * whole
+    half = reach + 0.5 * WIDTH * size, (high - low) / 2
     view = canvas.view((0.0, (high + low) / 2), half)
-    width, radius = WIDTH * length, WHEEL * length
-    middle = radius + HEIGHT * length / 2
+    width, radius = WIDTH * size, WHEEL * size
+    middle = radius + HEIGHT * size / 2
+    colors = canvas.SECOND, color_of(4)
 
     def draw(x: Vector, u: Vector) -> None:
-        position, angle = float(x[0]), lean(x)
-        hinge = np.array([position, HINGE * length])
-        cart = box(width, HEIGHT * length, 0.05 * length)
+        position = float(x[0])
+        cart = box(width, HEIGHT * size, 0.05 * size)
         canvas.polygon(cart, (position, middle))
         for side in (-0.27, 0.27):
             canvas.wheel((position + side * width * 1.1, radius), radius)
-        tip = hinge + length * np.array([math.sin(angle), math.cos(angle)])
-        canvas.link(hinge, tip, width=7, color=canvas.SECOND, zorder=3)
-        canvas.joint(hinge, 0.045 * length)
-        share, gap = float(episode.shares(u)[0]), width / 2 + 0.04 * length
-        canvas.push((position, middle), gap, 0.6 * length, share)
+        hinge = tip = np.array([position, HINGE * size])
+        for length, angle, color in zip(lengths, lean(x), colors, strict=False):
+            hinge = tip
+            tip = hinge + length * np.array([math.sin(angle), math.cos(angle)])
+            canvas.link(hinge, tip, width=7, color=color, zorder=3)
+            canvas.joint(hinge, 0.045 * size)
+        share, gap = float(episode.shares(u)[0]), width / 2 + 0.04 * size
+        canvas.push((position, middle), gap, 0.6 * size, share)
         view.follow((position, view.centre[1]), 0.5 * width)
         if bob:
-            canvas.disc(tip, bob * length, canvas.SECOND, zorder=3)
+            canvas.disc(tip, bob * size, canvas.SECOND, zorder=3)
 
     return Drawing(draw)
 
 
+def _hangs(angles: Points) -> bool:
+    """Whether a pole hangs at times."""
+    return bool(np.cos(angles).min(initial=1.0) < 0.3)
+
+
 def cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
     """A pole that leans to the right for positive angles."""
-    length = 2 * float(episode.system.half_length)
-    hangs = np.cos(episode.states[:, 2]).min(initial=1.0) < 0.3
-    return _cart_pole(canvas, episode, length, lambda x: float(x[2]), bool(hangs))
+    lengths, hangs = [2 * float(episode.system.half_length)], episode.states[:, 2:3]
+    return _cart_pole(canvas, episode, lengths, lambda x: x[2:3], _hangs(hangs))
+
+
+def double_pendulum_cart(canvas: Canvas, episode: Episode) -> Drawing:
+    """Two poles that lean to the right for positive angles."""
+    lengths = [float(episode.system.length_1), float(episode.system.length_2)]
+    hangs = _hangs(episode.states[:, 1:3])
+    return _cart_pole(canvas, episode, lengths, lambda x: x[1:3], hangs)
 
 
 def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
@@ -161,9 +177,9 @@ def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
     B = np.asarray(episode.system.B, float).reshape(-1, 4, 1)
     cart, turning = B[0, 2:, 0]
     length = float(cart / turning) if turning * cart > 0 else 1.0
-    lean = lambda x: -float(x[1])
+    lean = lambda x: -x[1:2]
     # The model is true near the upright alone, so its pole never hangs.
-    return _cart_pole(canvas, episode, length, lean, hangs=False, bob=0.09)
+    return _cart_pole(canvas, episode, [length], lean, hangs=False, bob=0.09)
 
 
 COILS = 6

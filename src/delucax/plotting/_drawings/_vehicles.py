@@ -1,4 +1,4 @@
-"""Vehicles that a camera follows: cars from above, and quadrotors."""
+"""Cars from above, and what flies or turns in space."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,19 @@ from jaxtyping import Array, Float
 from matplotlib.collections import LineCollection
 
 from ..._figures import color_of
-from ._canvas import box, Canvas, Drawing, Episode, rotation, Vector, View
+from ._canvas import (
+    box,
+    Canvas,
+    Drawing,
+    Episode,
+    Past,
+    Point,
+    Points,
+    rotation,
+    States,
+    Vector,
+    View,
+)
 
 
 LANES = 3
@@ -32,6 +44,23 @@ def car(canvas: Canvas, episode: Episode) -> Drawing:
     half = 4.2 * base, float(np.clip(aside + base, 1.25 * edge, 3 * edge))
     canvas.view((0.0, 0.0), half)
 
+    draw_car = _car_of(canvas, front, rear)
+
+    def draw(x: Vector, u: Vector) -> None:
+        place = np.asarray(x[:2], float)
+        middle = place[0] + 0.6 * base
+        canvas.view((middle, 0.0), half).follow((middle, place[1]), base)
+        _draw_dashes(canvas, middle, half[0], base)
+        share = float(episode.shares(u)[0])
+        draw_car(place, float(x[2]), steering=float(u[1]), share=share)
+
+    return Drawing(draw, lambda states: states[:, :2])
+
+
+def _car_of(canvas: Canvas, front: float, rear: float) -> Callable[..., None]:
+    """`draw(place, heading, steering, share)` of a car from above, `share` being that
+    of the largest force along it."""
+    base = front + rear
     width = 0.64 * base
     hood, boot = front + 0.3 * base, -rear - 0.28 * base
     chassis = box(hood - boot, 0.88 * width, 0.16 * base)
@@ -39,27 +68,64 @@ def car(canvas: Canvas, episode: Episode) -> Drawing:
     rubber: dict[str, Any] = {"color": canvas.DARK, "zorder": 3}
     shine: dict[str, Any] = {"color": "white", "alpha": 0.55, "zorder": 4}
 
-    def draw(x: Vector, u: Vector) -> None:
-        place, heading = np.asarray(x[:2], float), float(x[2])
+    def draw(place: Point, heading: float, steering: float, share: float) -> None:
         turned = rotation(heading)
-        middle = place[0] + 0.6 * base
-        canvas.view((middle, 0.0), half).follow((middle, place[1]), base)
-        _draw_dashes(canvas, middle, half[0], base)
         axis = place + turned @ ((hood + boot) / 2, 0.0)
-        for along, steering in ((front, float(u[1])), (-rear, 0.0)):
+        for along, angle in ((front, steering), (-rear, 0.0)):
             for side in (-0.48, 0.48):
                 at = place + turned @ (along, side * width)
-                canvas.polygon(tyre, at, heading + steering, **rubber)
+                canvas.polygon(tyre, at, heading + angle, **rubber)
         canvas.polygon(chassis, axis, heading)
         for near, far, inner in ((0.28, 0.02, 0.3), (-0.62, -0.5, 0.32)):
             corners = [(near, -0.36), (far, -inner), (far, inner), (near, 0.36)]
             glass = np.array(corners) * [base, width]
             canvas.polygon(glass, axis, heading, **shine)
         canvas.disc(place, 0.05 * base, "white", zorder=4)
-        gap, share = (hood - boot) / 2 + 0.12 * base, float(episode.shares(u)[0])
+        gap = (hood - boot) / 2 + 0.12 * base
         canvas.push(axis, gap, 1.2 * base, share, heading)
 
-    return Drawing(draw, lambda states: states[:, :2])
+    return draw
+
+
+def drifting_car(canvas: Canvas, episode: Episode) -> Drawing:
+    """The car on an open field with a grid, where its velocities lead it from the
+    origin, with its wheels steered and the force of the rear tyre."""
+    front, rear = float(episode.system.front), float(episode.system.rear)
+    base = front + rear
+    half = np.full(2, 3.2 * base)
+    draw_car = _car_of(canvas, front, rear)
+
+    def draw(x: Vector, u: Vector, past: Past) -> None:
+        times, states = past
+        headings, course = _course(times, states)
+        canvas.line(course, color=canvas.BODY, alpha=0.5, lw=2, zorder=1)
+        view = canvas.view(course[-1], half)
+        _draw_grid(canvas, view, 2 * base)
+        steering, share = float(u[0]), float(episode.shares(u)[1])
+        draw_car(course[-1], headings[-1], steering=steering, share=share)
+
+    return Drawing(draw, walks=True)
+
+
+def _course(times: Vector, states: States) -> tuple[Vector, Points]:
+    """Headings and places of a car with states (vx, vy, rate), from (0, 0) along x."""
+    steps = np.diff(times)
+    middle = (states[1:] + states[:-1]) / 2
+    headings = np.append(0.0, np.cumsum(steps * middle[:, 2]))
+    between = (headings[1:] + headings[:-1]) / 2
+    c, s, vx, vy = np.cos(between), np.sin(between), middle[:, 0], middle[:, 1]
+    moves = steps * np.stack([c * vx - s * vy, s * vx + c * vy])
+    return headings, np.cumsum(np.insert(moves, 0, 0.0, axis=1), axis=1).T
+
+
+def _draw_grid(canvas: Canvas, view: View, pitch: float) -> None:
+    """The lines of a grid that stays where it is on the ground."""
+    low, high = view.centre - view.half, view.centre + view.half
+    style: dict[str, Any] = {"color": canvas.NEUTRAL, "alpha": 0.25, "lw": 1}
+    for column, line in enumerate((canvas.ax.axvline, canvas.ax.axhline)):
+        first = math.ceil(low[column] / pitch) * pitch
+        for at in np.arange(first, high[column], pitch):
+            line(float(at), zorder=0, **style)
 
 
 def _draw_dashes(canvas: Canvas, middle: float, half: float, base: float) -> None:
@@ -95,19 +161,50 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     largest = np.maximum(episode.largest_controls, 0.5 * weight)
 
     def draw(x: Vector, u: Vector) -> None:
-        centre, angle = np.asarray(x[:2], float), float(x[2])
-        turned = rotation(angle)
-        canvas.polygon(box(2 * arm, 0.16 * arm, 0.07 * arm), centre, angle)
-        canvas.disc(centre, 0.2 * arm)
-        canvas.disc(centre, 0.09 * arm, "white", zorder=3)
-        blade, up = turned @ (0.42 * arm, 0.0), turned @ (0.0, 0.1 * arm)
-        for side, share in zip((-1, 1), np.clip(u / largest, -1, 1), strict=True):
-            foot = centre + turned @ (0.92 * side * arm, 0.0)
-            hub = centre + turned @ (0.92 * side * arm, 0.26 * arm)
-            canvas.link(foot, hub, width=2, color=canvas.DARK)
-            canvas.link(hub - blade, hub + blade, width=3.5, color=canvas.SECOND)
-            canvas.force(hub + up, turned @ (0.0, 1.5 * arm * share), 1.5 * arm)
+        centre = np.asarray(x[:2], float)
+        _draw_two_rotors(canvas, centre, float(x[2]), arm, np.clip(u / largest, -1, 1))
         view.follow(centre, 1.5 * arm)
+
+    return Drawing(draw, lambda states: states[:, :2])
+
+
+def _draw_two_rotors(
+    canvas: Canvas, centre: Point, angle: float, arm: float, shares: Vector
+) -> None:
+    """A body with a rotor at each end, and above it the share of its thrust."""
+    turned = rotation(angle)
+    canvas.polygon(box(2 * arm, 0.16 * arm, 0.07 * arm), centre, angle)
+    canvas.disc(centre, 0.2 * arm)
+    canvas.disc(centre, 0.09 * arm, "white", zorder=3)
+    blade, up = turned @ (0.42 * arm, 0.0), turned @ (0.0, 0.1 * arm)
+    for side, share in zip((-1, 1), shares, strict=True):
+        foot = centre + turned @ (0.92 * side * arm, 0.0)
+        hub = centre + turned @ (0.92 * side * arm, 0.26 * arm)
+        canvas.link(foot, hub, width=2, color=canvas.DARK)
+        canvas.link(hub - blade, hub + blade, width=3.5, color=canvas.SECOND)
+        canvas.force(hub + up, turned @ (0.0, 1.5 * arm * share), 1.5 * arm)
+
+
+def slung_load(canvas: Canvas, episode: Episode) -> Drawing:
+    """A planar quadrotor, the load on its cable, and the goal of the load."""
+    system, target = episode.system, episode.target
+    visited, cable = episode.visited((0, 1)), float(system.cable)
+    low, high = visited.min(axis=0), visited.max(axis=0) + [0, cable]
+    half = 0.5 * float(np.max(high - low)) + cable
+    # About all of it; of what is too large, about its end.
+    centre = (low + high) / 2 if half <= 10 * cable else visited[-1]
+    view = canvas.view(centre, np.full(2, min(half, 10 * cable)))
+    arm = max(float(system.arm), 0.12 * float(view.half[0]))
+    if target is not None:
+        canvas.goal(target[:2], 0.3 * arm)
+
+    def draw(x: Vector, u: Vector) -> None:
+        load, swing = np.asarray(x[:2], float), float(x[3])
+        centre = load + cable * np.array([-math.sin(swing), math.cos(swing)])
+        canvas.line([centre, load], color=canvas.DARK, lw=1.5)
+        canvas.disc(load, 0.2 * arm, canvas.SECOND, zorder=3)
+        _draw_two_rotors(canvas, centre, float(x[2]), arm, episode.shares(u))
+        view.follow(load, 1.5 * arm)
 
     return Drawing(draw, lambda states: states[:, :2])
 
@@ -201,3 +298,34 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
         view.follow(projected(place), 1.5 * arm)
 
     return Drawing(draw, lambda states: projected(states[:, :3]))
+
+
+def furuta(canvas: Canvas, episode: Episode) -> Drawing:
+    """An arm that turns in the plane, and a pendulum at its end, seen from above at an
+    angle, with the voltage as an arc about the motor."""
+    arm, length = float(episode.system.arm_length), 2 * float(episode.system.center)
+    reach = arm + length
+    canvas.view((0.0, 0.0), (1.15 * reach, 1.15 * reach))
+    canvas.polygon(projected(arm * RIM), color=canvas.NEUTRAL, alpha=0.15, zorder=0)
+    base = projected(np.array([[0.0, 0.0, -0.5 * reach], [0.0, 0.0, 0.0]]))
+    canvas.link(*base, width=14, color=canvas.NEUTRAL, zorder=0)
+
+    def draw(x: Vector, u: Vector) -> None:
+        out = arm * np.array([math.cos(x[0]), math.sin(x[0]), 0.0])
+        hub, hinge = np.zeros(2), projected(out)
+        tip = projected(_tips(x[None], arm, length))[0]
+        canvas.link(hub, hinge)
+        canvas.link(hinge, tip, width=7, color=canvas.SECOND, zorder=3)
+        canvas.joint(hinge, 0.03 * reach)
+        canvas.joint(hub, 0.03 * reach)
+        canvas.torque(hub, 0.2 * reach, math.pi / 2, float(episode.shares(u)[0]))
+
+    return Drawing(draw, lambda states: projected(_tips(states, arm, length)))
+
+
+def _tips(states: States, arm: float, length: float) -> Float[np.ndarray, "times 3"]:
+    """Where the pendulum of an arm ends, in space."""
+    turn, angle = states[:, 0], states[:, 1]
+    c, s, aside = np.cos(turn), np.sin(turn), length * np.sin(angle)
+    flat = [arm * c - aside * s, arm * s + aside * c]
+    return np.stack([*flat, length * np.cos(angle)], axis=-1)
