@@ -134,7 +134,7 @@ SYSTEMS = {
         s.SlungLoad, *box(4.0, 4.0, 3.2, 3.2, 3.0, 3.0, 5.0, 5.0), *box(5.0, 5.0), 0.02
     ),
     "DriftingCar": Case(
-        s.DriftingCar, [-2.0, -6.0, -2.0], [15.0, 6.0, 2.0], *box(0.6, 6000.0), 0.01
+        s.DriftingCar, [-2.0, -6.0, -2.0], [15.0, 6.0, 2.0], *box(6000.0, 0.6), 0.01
     ),
     "BouncingBall": Case(
         lambda: s.BouncingBall(drag=0.1), [0.1, -5.0], [3.0, 5.0], *box(5.0), 0.02

@@ -121,16 +121,16 @@ def test_the_drift_is_that_of_the_paper():
     assert_close(car.vector_field(0.0, x, u, None), np.zeros(3), atol=1e-12)
     assert_close(np.rad2deg(np.arctan(x[1] / x[0])), -20.44, rtol=0.01)
     assert_close(x[2], 0.600, rtol=2e-3)
-    assert_close(u[1], 2293.0, rtol=5e-3)
+    assert_close(u[0], 2293.0, rtol=5e-3)
     # What the rear tyre has left to corner with; all of it is used.
     _, grip = car.grips()
-    assert_close(np.hypot(u[1], 4469.0), grip, rtol=2e-3)
+    assert_close(np.hypot(u[0], 4469.0), grip, rtol=2e-3)
     # Countersteered, and unstable.
     poles = np.linalg.eigvals(dlx.linearize(car, 0.0, x, u).A)
-    assert u[0] < 0 < x[2] and np.max(poles.real) > 1
+    assert u[1] < 0 < x[2] and np.max(poles.real) > 1
     for speed, steering in ((5.0, 0.0), (15.0, -0.4)):
         x, u = car.equilibrium(speed, steering)
-        assert_close([x[0], u[0]], [speed, steering])
+        assert_close([x[0], u[1]], [speed, steering])
         assert_close(car.vector_field(0.0, x, u, None), np.zeros(3), atol=1e-12)
     for arguments in (dict(speed=8.0, steering=0.4), dict(speed=-8.0)):
         with user_error(match="DriftingCar: speed and steering must be those of a dri"):
@@ -148,17 +148,17 @@ def test_brush_tyres_are_linear_at_small_slips_and_slide_at_large_ones():
     car = s.DriftingCar()
     same = dict(mass=1724.0, inertia=1300.0, front=1.35, rear=1.15, standstill=0.1)
     linear = s.DynamicBicycle(front_stiffness=120000.0, rear_stiffness=175000.0, **same)
-    x, u = jnp.array([20.0, 1e-4, 1e-4]), jnp.array([1e-5, 300.0])
+    x, u = jnp.array([20.0, 1e-4, 1e-4]), jnp.array([300.0, 1e-5])
     ours = car.vector_field(0.0, x, u, None)
     longer = jnp.concatenate([jnp.zeros(3), x])
-    theirs = linear.vector_field(0.0, longer, u / jnp.array([1.0, 1724.0]), None)[3:]
+    theirs = linear.vector_field(0.0, longer, u / jnp.array([1724.0, 1.0]), None)[3:]
     assert_close(ours[1:], theirs[1:], rtol=1e-3)
     assert_close(ours[0], theirs[0], atol=1e-8)
     # Aside, without driving: both axles push back with all their grip.
     aside = car.vector_field(0.0, jnp.array([0.0, 5.0, 0.0]), jnp.zeros(2), None)
     assert_close(aside, [0.0, -0.55 * 9.81, 0.0], atol=1e-12)
     # With all of the grip driving, the front axle alone does, but for a fiftieth.
-    full = jnp.array([0.0, car.grips()[1]])
+    full = jnp.array([car.grips()[1], 0.0])
     aside = car.vector_field(0.0, jnp.array([0.0, 5.0, 0.0]), full, None)
     share = (1.15 + 0.02 * 1.35) / 2.5
     assert_close(aside[1], -0.55 * 9.81 * share, rtol=1e-6)

@@ -280,24 +280,24 @@ def drift(
     *,
     speed: Positive = 8.0,
     steering: Number = -12 * 2 * np.pi / 360,
-    max_steering: Limit = 0.6,
     max_force: Limit = 4500.0,
+    max_steering: Limit = 0.6,
 ) -> Fields:
     """Make a car that drives straight ahead drift, and hold the drift.
 
-    State (vx, vy, rate); control (steering, force). Starts with vx within 2 m/s of the
+    State (vx, vy, rate); control (force, steering). Starts with vx within 2 m/s of the
     speed of the drift, vy in +-0.2 m/s and the rate in +-0.1 rad/s. Cost
-    `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 + (steering - steering*)^2 +
-    1e-7 (force - force*)^2` per step, measured from the drift to the left, which is an
+    `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 + 1e-7 (force - force*)^2 +
+    (steering - steering*)^2` per step, measured from the drift to the left, which is an
     unstable equilibrium. Never terminates.
 
     **Arguments:**
 
     - `speed`: vx of the drift [m/s], 8 by default.
     - `steering`: of the drift [rad], 12 degrees to the right by default.
-    - `max_steering`: to either side [rad], 0.6 by default.
     - `max_force`: of the rear tyre, in either direction [N], 4500 by default, which is
         nine tenths of its grip.
+    - `max_steering`: to either side [rad], 0.6 by default.
 
     Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014.
 
@@ -310,12 +310,12 @@ def drift(
         ```
     """
     x, u = system.equilibrium(speed, steering)
-    weights = [1.0, 1.0, 10.0], [1.0, 1e-7]
+    weights = [1.0, 1.0, 10.0], [1e-7, 1.0]
     ahead = jnp.zeros(3, x.dtype).at[0].set(x[0])
     return dict(
         cost=Quadratic(*weights, state_target=x, control_target=u),
         initial_state=UniformState(*box([2.0, 0.2, 0.1], ahead)),
-        control_bounds=box([max_steering, max_force]),
+        control_bounds=box([max_force, max_steering]),
     )
 
 

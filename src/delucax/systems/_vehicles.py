@@ -118,7 +118,7 @@ class DriftingCar(AbstractSystem):
     at the rear, with the loads N at rest.
 
     The state is (vx [m/s], vy [m/s], rate [rad/s]), the velocities those of the centre
-    of mass along and across the car; the control is (steering [rad], force [N]), the
+    of mass along and across the car; the control is (force [N], steering [rad]), the
     force being that of the rear tyre along the car. The derivative of the vector field
     is continuous.
 
@@ -168,7 +168,7 @@ class DriftingCar(AbstractSystem):
     standstill: Real = parameter(0.1, constraint=positive)
 
     state_names, state_units = ("vx", "vy", "rate"), ("m/s", "m/s", "rad/s")
-    control_names, control_units = ("steering", "force"), ("rad", "N")
+    control_names, control_units = ("force", "steering"), ("N", "rad")
 
     def grips(self) -> tuple[Scalar, Scalar]:
         """The largest force of each axle.
@@ -179,8 +179,8 @@ class DriftingCar(AbstractSystem):
         return whole * self.rear, whole * self.front
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        vx, vy, rate, force = x[0], x[1], x[2], u[1]
-        s, c = sin(u[0]), cos(u[0])
+        vx, vy, rate, force = x[0], x[1], x[2], u[0]
+        s, c = sin(u[1]), cos(u[1])
         grip_front, grip_rear = self.grips()
         share = force / grip_rear
         left = jnp.maximum(1 - share * share, 4e-4) ** 0.5
@@ -242,7 +242,7 @@ class DriftingCar(AbstractSystem):
 
         # Newton's method, by differences that are small enough.
         y, h = xp.asarray(0.45, v.dtype), 1e-3
-        for _ in range(12):
+        for _ in range(6):
             y = y - 2 * h * miss(y) / (miss(y + h) - miss(y - h))
         rate, force, vy = balanced(y)
         if is_concrete(y) and is_concrete(vy):
@@ -253,7 +253,7 @@ class DriftingCar(AbstractSystem):
                     "DriftingCar: speed and steering must be those of a drift, such as "
                     f"8 and -0.2, got {shortened(speed)} and {shortened(steering)}."
                 )
-        return xp.stack([v, vy, rate]), xp.stack([steering, force])
+        return xp.stack([v, vy, rate]), xp.stack([force, steering])
 
 
 def _brush(slip: Scalar, stiffness: Scalar, grip: Scalar) -> Scalar:

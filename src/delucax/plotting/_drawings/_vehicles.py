@@ -101,7 +101,7 @@ def drifting_car(canvas: Canvas, episode: Episode) -> Drawing:
         canvas.line(course, color=canvas.BODY, alpha=0.5, lw=2, zorder=1)
         view = canvas.view(course[-1], half)
         _draw_grid(canvas, view, 2 * base)
-        steering, share = float(u[0]), float(episode.shares(u)[1])
+        steering, share = float(u[1]), float(episode.shares(u)[0])
         draw_car(course[-1], headings[-1], steering=steering, share=share)
 
     return Drawing(draw, walks=True)

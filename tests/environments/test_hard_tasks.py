@@ -1,0 +1,77 @@
+"""The harder tasks: no control breaks them, and there is a control that solves them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, once
+
+import delucax as dlx
+
+
+NAMES = "cartpole_swing_up double_pendulum_cart drift furuta quadrotor_flip".split()
+NAMES += ["reactor_start_up", "slung_load"]
+
+
+@once
+@pytest.mark.parametrize("name", NAMES)
+def test_no_control_breaks_it(name, key):
+    """None at all, constants, noise, and switching between the bounds: the costs of
+    whole episodes and their gradients are finite, in the precision that overflows
+    first."""
+    env, rng = dlx.make(name), np.random.default_rng(0)
+    m = env.control_size
+    low, high = (np.broadcast_to(bound, m) for bound in env.control_bounds)
+    shape = (3, env.horizon, m)
+    held = [np.broadcast_to(value, shape) for value in (0.0 * low, low, high)]
+    ends = np.where(rng.uniform(size=shape) < 0.5, low, high)
+    controls = np.concatenate([*held, rng.uniform(low, high, shape), ends])
+
+    def cost(controls, key):
+        held = dlx.controllers.OpenLoop(controls)
+        run = dlx.rollout(env, held, key=key, keep=(), throw=False)
+        return run.total_cost, (run.failed, run.length)
+
+    given = jnp.asarray(controls), jax.random.split(key, len(controls))
+    episode = jax.jit(jax.vmap(jax.value_and_grad(cost, has_aux=True)))
+    (costs, (failed, length)), gradients = episode(*given)
+    assert not np.any(failed)
+    assert np.all(np.isfinite(costs)) and np.all(np.isfinite(gradients))
+    assert np.all(np.any(gradients != 0, axis=(1, 2)))
+    # Full force leads off the track, where there is one.
+    over = np.asarray(length) < env.horizon
+    assert np.all(over[3:9]) if env.terminated else not np.any(over)
+    if env.terminated:
+        assert np.all(costs[3:9] > np.max(costs[:3]))
+
+
+@once
+def test_angles_go_all_the_way_around():
+    """A turn more costs the same and looks the same; half a turn costs the most."""
+    env = dlx.make("double_pendulum_cart")
+    u, turn = jnp.zeros(1), jnp.zeros(6).at[1:3].set(2 * np.pi)
+    x = jnp.array([0.1, 0.2, -0.3, 0.4, 0.5, 0.6])
+    assert_close(env.cost(0.0, x + turn, u), env.cost(0.0, x, u), rtol=1e-5)
+    assert_close(env.encode(x + turn), env.encode(x), atol=1e-5)
+    hanging = jnp.zeros(6).at[1].set(np.pi)
+    assert_close(env.cost(0.0, hanging, u), 4.0, rtol=1e-6)
+    # The cable of an arm that turns is wound up.
+    assert dlx.make("furuta").cost(0.0, jnp.array([7.0, 0, 0, 0]), u) > 4
+
+
+@needs_x64
+def test_a_plan_enters_the_drift_and_the_regulator_does_not(key):
+    env = dlx.make("drift")
+    x0 = jnp.array([9.0, 0.0, 0.0])
+    lqr = dlx.controllers.local_lqr(env)
+    alone = dlx.rollout(env, lqr, key=key, x0=x0)
+    guess, bounds = alone.controls, env.control_bounds
+    options = dict(bounds=bounds, max_iterations=200, throw=False)
+    plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, guess, **options)
+    target, _ = env.cost.targets
+    assert plan.cost < 300 < 1000 < alone.total_cost
+    assert_close(plan.states[-30:], np.tile(target, (30, 1)), atol=0.05)
+    # The regulator holds it once it is there.
+    near = target + jnp.array([0.2, 0.1, -0.05])
+    held = dlx.rollout(env, lqr, key=key, x0=near)
+    assert_close(held.final_state, target, atol=1e-3)
