@@ -319,7 +319,7 @@ def drift(
     )
 
 
-@task(CSTR, dt=0.05, horizon=120, substeps=2)
+@task(CSTR, dt=0.05, horizon=120, substeps=8)
 def reactor_start_up(
     system: CSTR,
     *,
