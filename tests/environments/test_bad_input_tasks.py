@@ -96,7 +96,7 @@ NUMBERS = {
     "permanent_magnet_motor": ["speed", "max_voltage"],
     "quadrotor": ["max_thrust"],
     "quadrotor_flip": ["max_thrust"],
-    "reactor_start_up": ["concentration", "min_coolant", "max_coolant"],
+    "reactor_start_up": ["max_coolant", "max_temperature", "shutdown_cost"],
     "rimless_wheel": ["speed", "max_torque", "stall_cost"],
     "slung_load": ["max_thrust"],
     "stick_slip": ["max_force"],

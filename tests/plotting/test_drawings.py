@@ -13,6 +13,7 @@ import delucax as dlx
 from delucax.plotting._animate import Scene
 from delucax.plotting._drawings._mechanics import arm_points, zigzag
 from delucax.plotting._drawings._registry import _BY_TYPE, drawing_for
+from delucax.plotting._drawings._vehicles import _course
 from delucax.plotting._runs import as_runs
 
 
@@ -140,6 +141,16 @@ def test_time_is_told_in_the_unit_of_the_plant():
         scene = scene_of(env, trajectory_of(env, np.zeros((4, env.state_size))))
         scene.frame(2)
         assert scene.texts[0].get_text() == text
+
+
+def test_a_car_that_turns_steadily_goes_round_a_circle():
+    times = np.linspace(0.0, 4.0, 401)
+    headings, course = _course(times, np.tile([3.0, 4.0, 0.5], (401, 1)))
+    np.testing.assert_allclose(headings, 0.5 * times)
+    # At 5 m/s, ahead and to the left, about a centre that is across of that.
+    away = np.linalg.norm(course - 10.0 * np.array([-0.8, 0.6]), axis=-1)
+    np.testing.assert_allclose(away, 10.0, rtol=1e-4)
+    assert np.all(np.diff(course[:100, 1]) > 0)
 
 
 def test_spring_joins_its_ends():

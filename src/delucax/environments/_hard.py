@@ -319,13 +319,24 @@ def drift(
     )
 
 
-@task(CSTR, dt=0.05, horizon=120, substeps=8)
+class _RunsAway(eqx.Module):
+    """Whether the reactor is too hot."""
+
+    max_temperature: Real = parameter()
+
+    def __call__(self, t: Time, x: State) -> BoolScalar:
+        return x[1] > self.max_temperature
+
+
+@task(CSTR, dt=0.05, horizon=120, substeps=5)
 def reactor_start_up(
     system: CSTR,
     *,
     concentration: Positive = 0.3,
     min_coolant: Limit = 290.0,
     max_coolant: Limit = 310.0,
+    max_temperature: Positive = 420.0,
+    shutdown_cost: Number = 5000.0,
 ) -> Fields:
     """Start a stirred-tank reactor from cold, and hold it where most of the feed
     reacts.
@@ -334,16 +345,19 @@ def reactor_start_up(
     the concentration uniform in [0.9, 1] mol/l, hardly any having reacted, and the
     temperature in [295, 305] K. Cost
     `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per step, with
-    the equilibrium at the concentration. Never terminates. The time is in minutes.
+    the equilibrium at the concentration. The episode ends, at `shutdown_cost`, above
+    the highest temperature. The time is in minutes.
 
     As in [`delucax.environments.cstr`][], but from where the jacket must heat first,
     and to a point with two unstable poles. Without enough heat the reaction never
-    starts; with too much it runs away, and then goes out, again and again.
+    starts; with too much it runs away.
 
     **Arguments:**
 
     - `concentration`: to hold [mol/l], below that of the feed; 0.3 by default.
     - `min_coolant`, `max_coolant`: what the jacket can do [K], 290 and 310 by default.
+    - `max_temperature`: above which the reactor is shut down [K], 420 by default.
+    - `shutdown_cost`: 5000 by default, more than an episode of doing nothing costs.
 
     Source: Henson and Seborg, 1997.
 
@@ -356,8 +370,11 @@ def reactor_start_up(
         ```
     """
     x, u = system.equilibrium(concentration)
+    cost = Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u)
+    hot = _RunsAway(max_temperature)
     return dict(
-        cost=Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u),
+        cost=cost + once(hot, shutdown_cost),
         initial_state=UniformState([0.9, 295.0], [1.0, 305.0]),
         control_bounds=(min_coolant, max_coolant),
+        terminated=hot,
     )
