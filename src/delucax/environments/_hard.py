@@ -328,14 +328,14 @@ class _RunsAway(eqx.Module):
         return x[1] > self.max_temperature
 
 
-@task(CSTR, dt=0.05, horizon=120, substeps=5)
+@task(CSTR, dt=0.05, horizon=120, substeps=8)
 def reactor_start_up(
     system: CSTR,
     *,
     concentration: Positive = 0.3,
     min_coolant: Limit = 290.0,
     max_coolant: Limit = 310.0,
-    max_temperature: Positive = 420.0,
+    max_temperature: Positive = 380.0,
     shutdown_cost: Number = 5000.0,
 ) -> Fields:
     """Start a stirred-tank reactor from cold, and hold it where most of the feed
@@ -356,7 +356,7 @@ def reactor_start_up(
 
     - `concentration`: to hold [mol/l], below that of the feed; 0.3 by default.
     - `min_coolant`, `max_coolant`: what the jacket can do [K], 290 and 310 by default.
-    - `max_temperature`: above which the reactor is shut down [K], 420 by default.
+    - `max_temperature`: above which the reactor is shut down [K], 380 by default.
     - `shutdown_cost`: 5000 by default, more than an episode of doing nothing costs.
 
     Source: Henson and Seborg, 1997.
