@@ -132,13 +132,13 @@ def cartpole_swing_up(
     return _on_track(fields, start, max_force, max_position, exit_cost)
 
 
-@task(DoublePendulumCart, dt=0.02, horizon=200)
+@task(DoublePendulumCart, dt=0.04, horizon=100, substeps=2)
 def double_pendulum_cart(
     system: DoublePendulumCart,
     *,
     max_force: Limit = 40.0,
     max_position: Positive = 3.0,
-    exit_cost: Number = 3000.0,
+    exit_cost: Number = 1500.0,
 ) -> Fields:
     """Swing up both rods of a double pendulum on a cart, and keep them upright.
 
@@ -157,7 +157,7 @@ def double_pendulum_cart(
 
     - `max_force`: 40 by default.
     - `max_position`: where the track ends, 3 by default.
-    - `exit_cost`: 3000 by default.
+    - `exit_cost`: 1500 by default.
 
     Source: Bogdanov, 2004 (the plant); Graichen, Treuer and Zeitz, 2007 (the task).
 
