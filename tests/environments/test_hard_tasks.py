@@ -23,7 +23,8 @@ def test_no_control_breaks_it(name, key):
     m = env.control_size
     low, high = (np.broadcast_to(bound, m) for bound in env.control_bounds)
     shape = (3, env.horizon, m)
-    held = [np.broadcast_to(value, shape) for value in (0.0 * low, low, high)]
+    none = np.clip(0.0, low, high)
+    held = [np.broadcast_to(value, shape) for value in (none, low, high)]
     ends = np.where(rng.uniform(size=shape) < 0.5, low, high)
     controls = np.concatenate([*held, rng.uniform(low, high, shape), ends])
 

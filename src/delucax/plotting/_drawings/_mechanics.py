@@ -153,15 +153,16 @@ def _cart_pole(
     return Drawing(draw)
 
 
-def _hangs(angles: Points) -> bool:
+def _hangs(angles: Float[np.ndarray, "times poles"]) -> bool:
     """Whether a pole hangs at times."""
     return bool(np.cos(angles).min(initial=1.0) < 0.3)
 
 
 def cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
     """A pole that leans to the right for positive angles."""
-    lengths, hangs = [2 * float(episode.system.half_length)], episode.states[:, 2:3]
-    return _cart_pole(canvas, episode, lengths, lambda x: x[2:3], _hangs(hangs))
+    lengths = [2 * float(episode.system.half_length)]
+    hangs = _hangs(episode.states[:, 2:3])
+    return _cart_pole(canvas, episode, lengths, lambda x: x[2:3], hangs)
 
 
 def double_pendulum_cart(canvas: Canvas, episode: Episode) -> Drawing:
