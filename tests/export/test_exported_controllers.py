@@ -248,3 +248,18 @@ def test_a_plant_with_events(tmp_path):
         states.append(step(0.0, states[-1], np.zeros(1)))
     expected = dlx.open_loop(dynamics, x, jnp.zeros((20, 1)))
     np.testing.assert_allclose(states, expected, atol=tolerance(1e-5, 1e-12))
+
+
+def test_a_corrected_regulator_keeps_its_cost(tmp_path):
+    env = dlx.make("pendulum", horizon=50)
+    scaled = dlx.controllers.Standardise(jnp.full(3, 0.1), jnp.full(3, 2.0), env.encode)
+    how: Any = dict(features=scaled, bounds=(-1.0, 1.0), key=KEY)
+    network = dlx.controllers.MLP(3, 1, 8, 1, **how)
+    lqr = dlx.controllers.local_lqr(env)
+    policy = dlx.controllers.Residual(lqr, network, env.control_bounds)
+    export.c(policy, tmp_path, name="both", example=ONES)
+    in_c = export.load(tmp_path)
+    starts = jnp.array([[0.2, 0.1], [-0.3, 0.5]])
+    run = lambda law, x0: dlx.rollout(env, law, x0=x0, key=KEY, keep=()).total_cost
+    for x0 in starts:
+        np.testing.assert_allclose(run(in_c, x0), run(policy, x0), rtol=1e-5)

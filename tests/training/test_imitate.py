@@ -1,6 +1,8 @@
 """Imitation of an expert, and the controllers that it and `synthesise` build on."""
 
+import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +86,29 @@ def test_the_local_lqr_is_at_the_target():
     start = lqr.x_ref
     held = dlx.rollout(motor, lqr, key=KEY, x0=start, horizon=50).final_state
     assert_close(held, start, atol=1e-3 * np.max(np.abs(start)))
+
+
+class Given(dlx.AbstractSystem):
+    # A function that is not declared static.
+    state_names, control_names = ("x",), ("u",)
+    rate: Any
+
+    def vector_field(self, t, x, u, w):
+        return self.rate(x) + u
+
+
+def test_the_local_lqr_of_a_plant_that_holds_a_function():
+    dynamics = dlx.Discretized(Given(jnp.sin), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0], [1.0])
+    law = local_lqr(dlx.Environment(dynamics, cost, horizon=5))
+    A, B = np.exp(0.1), np.exp(0.1) - 1  # of the linear model
+    assert abs(A - B * law.K[0, 0]) < 1
+
+
+def test_the_local_lqr_of_a_cost_of_integers():
+    count = dlx.costs.Function(lambda t, x, u: jnp.where(x[0] > 0, 1, 0))
+    law = local_lqr(dataclasses.replace(env(), cost=count))
+    assert np.all(law.K > 0)
 
 
 def test_no_local_lqr():

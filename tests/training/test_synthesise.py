@@ -51,6 +51,24 @@ def test_costs_are_from_the_same_starts():
     assert table.loc["zero", "mean"] == pytest.approx(costs["zero"].mean())
 
 
+def test_a_family_tells_its_worst_plant():
+    ranges, path = {"dynamics.system.mass": (0.5, 2.0)}, "dynamics.system.mass"
+    search = PolicySearch(env(), ranges, KEY, 0.0, progress=False)
+    drawn = search.plants()[path]
+    zero = dlx.controllers.Zero(1)
+    costs = search.compared(zero)
+    assert drawn.shape == costs["policy"].shape and np.ptp(drawn) > 1
+    made = dlx.training.Synthesis(zero, "zero", costs, [], 1.0, {path: drawn})
+    worst = made.to_pandas().loc["policy"]
+    assert worst[f"{path}, worst"] == drawn[costs["policy"].argmax()]
+    # The plant is that of the episode.
+    key, plant_key = jax.random.split(search.comparison[3])
+    plant = dlx.randomise(env(), plant_key, ranges)
+    assert plant.dynamics.system.mass == pytest.approx(drawn[3])
+    alone = dlx.rollout(plant, zero, key=key, keep=()).total_cost
+    assert alone == pytest.approx(costs["policy"][3], rel=1e-5)
+
+
 def test_a_network_where_the_regulator_is_worse():
     # Nothing is trained: what is better by more than half a percent is chosen.
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
@@ -108,9 +126,30 @@ def plain(system):
     return dlx.Environment(dynamics, dlx.costs.Quadratic([1.0], [1.0]), horizon=5)
 
 
-def test_a_model_without_derivative():
+class InNumPy(dlx.AbstractSystem):
+    state_names, control_names = ("x",), ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return np.tanh(np.asarray(x)) + u
+
+
+@pytest.mark.parametrize("system", [NoDerivative(), InNumPy()])
+def test_a_model_without_derivative(system):
     with pytest.raises(ValueError, match="synthesise: .* that JAX can differentiate"):
-        synthesise(plain(NoDerivative()), key=KEY)
+        synthesise(plain(system), key=KEY)
+
+
+def test_it_cannot_be_traced():
+    with pytest.raises(ValueError, match="synthesise: .* cannot be called under"):
+        jax.jit(lambda key: synthesise(env(), key=key).seconds)(KEY)
+
+
+def test_a_cost_that_stays_infinite(monkeypatch):
+    costs = {"policy": np.array([1.0, np.inf])}
+    monkeypatch.setattr(PolicySearch, "run", lambda *_: None)
+    monkeypatch.setattr(PolicySearch, "compared", lambda *_: costs)
+    with pytest.warns(UserWarning, match="'zero', which .* from 1 of 2"):
+        synthesise(env(), key=KEY, progress=False)
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,8 @@ def _local_model(environment: Any, regularisation: Any, where: str) -> LocalMode
 def _curvature(cost: Any, x: Array, u: Array) -> Array:
     """H of the stage cost, `dz' H dz` to second order, `dz` the change of (x, u)."""
     n = x.shape[0]
-    stage = lambda z: cost(jnp.zeros(()), x + z[:n], u + z[n:])
+    # A cost that only counts may be of integers.
+    stage = lambda z: jnp.asarray(cost(jnp.zeros(()), x + z[:n], u + z[n:]), x.dtype)
     return jax.hessian(stage)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
 
 

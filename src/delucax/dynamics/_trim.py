@@ -253,7 +253,7 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     eps = jnp.finfo(dtype).eps
     zero, zeros = jnp.zeros(len(problem.free), dtype), jnp.zeros(n, dtype)
     one, inf = jnp.ones((), dtype), jnp.full((), jnp.inf, dtype)
-    blank = jax.eval_shape(_expand, problem, zero, zeros)
+    blank = eqx.filter_eval_shape(_expand, problem, zero, zeros)
     blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, dtype), blank)
     blank = eqx.tree_at(lambda point: (point.cost, point.terms), blank, (inf, zeros))
     select = lambda which, a, b: jax.tree.map(functools.partial(jnp.where, which), a, b)

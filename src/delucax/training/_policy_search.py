@@ -13,6 +13,7 @@ import optax
 from jaxtyping import Array
 
 from .._controller import AbstractController
+from .._module import get_path
 from .._typing import PRNGKey
 from ..controllers import Constant, local_lqr, local_mpc, LQR, OpenLoop, Zero
 from ..disturbances import Zero as NoDisturbance
@@ -37,8 +38,9 @@ _WHERE = "synthesise"
 _MEMORIES = (1 / 30, 1 / 10, 1 / 4)
 # What is tried first where there is an LQR: they tell whether it is enough.
 _FIRST = [(LQR_AND_NETWORK, "gradient"), ("network", "evolution")]
-# Starts on which policies are chosen, and others on which the best is compared.
-_CHOICE, _COMPARISON = 64, 16
+# Starts on which policies are chosen, and others on which the best is compared: more
+# where each has a plant of its own.
+_CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
 # How far a comparison may overrun it, if it takes as long as the longest compilation.
@@ -150,6 +152,16 @@ class PolicySearch:
     def check(self) -> None:
         """Raise where nothing could be trained, whatever the method."""
         env, keys = self.environment, self.keys(_CHOICE)
+        loss = expected_cost(env, batch=1, horizon=1, ranges=self.ranges)
+        held = Constant(jnp.zeros(env.control_size))
+        try:
+            jax.eval_shape(eqx.filter_grad(loss), held, keys[0])
+        except Exception as error:
+            raise ValueError(
+                f"{_WHERE}: environment must have dynamics and a cost that JAX can "
+                f"differentiate, got: {str(error).splitlines()[0]} For others use "
+                "delucax.training.evolve."
+            ) from error
         starts, costs, steps = map(np.asarray, _first_steps(env, keys))
         for what, values in (("first state", starts), ("cost of a first state", costs)):
             finite = np.isfinite(values.reshape(_CHOICE, -1)).all(axis=1)
@@ -162,15 +174,6 @@ class PolicySearch:
                 f"{_WHERE}: no control keeps the first step finite from x0 = "
                 f"{starts[kept.argmin()]}."
             )
-        loss = expected_cost(env, batch=1, horizon=1, ranges=self.ranges)
-        held = Constant(jnp.zeros(env.control_size))
-        try:
-            jax.eval_shape(eqx.filter_grad(loss), held, keys[0])
-        except Exception as error:
-            raise ValueError(
-                f"{_WHERE}: environment must have dynamics and a cost that JAX can "
-                f"differentiate, got: {error} For others use delucax.training.evolve."
-            ) from error
 
     def run(self, width: int, depth: int) -> None:
         """Train until the time is up or nothing gains any more."""
@@ -208,7 +211,7 @@ class PolicySearch:
         tried = [(attempt.structure, attempt.method) for attempt in self.tried]
         if tried != _FIRST or self.chosen()[0] != "LQR":
             return False
-        env, keys = self.environment, self.keys(_COMPARISON)
+        env, keys = self.environment, self.comparison
         own = np.mean(_costs(env, self.ranges, self.lqr, keys))
         known = isinstance(env.disturbance, NoDisturbance)
         other = np.mean(
@@ -318,10 +321,21 @@ class PolicySearch:
         name = min(self.best, key=lambda name: self.best[name][1])
         return name, self.best[name][0]
 
+    @property
+    def comparison(self) -> Array:
+        """Keys of the episodes in which policies are compared."""
+        return self.keys(_COMPARISON if self.ranges is None else _PLANTS)
+
+    def plants(self) -> dict[str, np.ndarray]:
+        """What is drawn for the plants of the comparison."""
+        ranges = self.ranges or {}
+        of = lambda plant, key: {path: get_path(plant, path) for path in ranges}
+        drawn = _on_plants(self.environment, ranges, self.comparison, of)
+        return {path: np.asarray(values) for path, values in drawn.items()}
+
     def compared(self, policy: AbstractController) -> dict[str, np.ndarray]:
         """The costs of the policy and of others, from starts of their own."""
-        env, ranges = self.environment, self.ranges
-        keys = self.keys(_COMPARISON)
+        env, ranges, keys = self.environment, self.ranges, self.comparison
         floor = {n: self.best[n][0] for n in ("zero", "LQR") if n in self.best}
         costs = {
             name: _costs(env, ranges, one, keys)
@@ -346,7 +360,7 @@ def _regulator(environment: Environment) -> LQR | None:
 
 def _on_plants(
     environment: Environment, ranges: dict[str, Any] | None, keys: Array, of: Any
-) -> Array:
+) -> Any:
     """`of(plant, key)` for each key, the plant being drawn as by `expected_cost`."""
 
     def one(key):

@@ -1,10 +1,19 @@
 """A policy for any environment with a model, from one call."""
 
+import warnings
 from typing import Any, NamedTuple, TYPE_CHECKING
 
+import jax
 import numpy as np
 
-from .._check import check_count, check_instance, check_key, check_number
+from .._check import (
+    check_bool,
+    check_count,
+    check_instance,
+    check_key,
+    check_number,
+    is_concrete,
+)
 from .._controller import AbstractController
 from .._extras import extra
 from .._typing import PRNGKey
@@ -34,6 +43,8 @@ class Synthesis(NamedTuple):
         that do not apply, or that the budget leaves no time for, are left out.
     - `tried`: a list of `Attempt`s, in the order in which they were made.
     - `seconds`: what it took.
+    - `plants`: of a family, from each path of `ranges` to what the plants of these
+        episodes have there; empty otherwise.
 
     !!! example
 
@@ -52,20 +63,28 @@ class Synthesis(NamedTuple):
     costs: dict[str, np.ndarray]
     tried: list[Attempt]
     seconds: float
+    plants: dict[str, np.ndarray] = {}
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A table with a row for each controller that was compared: mean, median and
-        worst cost.
+        worst cost, and of a family the plant of the median and of the worst episode.
 
         **Returns:** a `pandas.DataFrame`.
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
-        rows = {
-            name: dict(mean=np.mean(c), median=np.median(c), worst=np.max(c))
-            for name, c in self.costs.items()
-        }
-        return extra("pandas", "tables").DataFrame(rows).T
+        rows = {}
+        for name, costs in self.costs.items():
+            order = np.argsort(costs)
+            places = {"median": order[len(order) // 2], "worst": order[-1]}
+            rows[name] = dict(
+                mean=np.mean(costs), median=np.median(costs), worst=np.max(costs)
+            ) | {
+                f"{path}, {what}": values[at]
+                for what, at in places.items()
+                for path, values in self.plants.items()
+            }
+        return extra("pandas", "tables").DataFrame.from_dict(rows, orient="index")
 
 
 def synthesise(
@@ -117,7 +136,8 @@ def synthesise(
 
     **Raises:** `ValueError` on an argument of the wrong kind; if the cost of a first
     state is not finite, no control keeps one finite over the first step, or the
-    dynamics or the cost have no derivative; all before anything is trained.
+    dynamics or the cost have no derivative; all before anything is trained. A warning
+    if the cost of the policy is not finite from every start.
 
     !!! example
 
@@ -132,6 +152,11 @@ def synthesise(
     """
     check_instance(environment, Environment, "environment", _WHERE)
     key = check_key(key, _WHERE)
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((environment, key))):
+        raise ValueError(
+            f"{_WHERE}: environment and key must hold values; {_WHERE} cannot be "
+            "called under jax.jit, jax.vmap or jax.grad."
+        )
     check_number(budget, "budget", _WHERE)
     if budget < _LEAST_BUDGET:
         raise ValueError(
@@ -140,6 +165,7 @@ def synthesise(
         )
     width = check_count(width, "width", _WHERE)
     depth = check_count(depth, "depth", _WHERE)
+    check_bool(progress, "progress", _WHERE)
     search = PolicySearch(environment, ranges, key, float(budget), progress)
     search.check()
     with search.bar:
@@ -149,4 +175,12 @@ def synthesise(
             pass
         structure, policy = search.chosen()
         costs = search.compared(policy)
-    return Synthesis(policy, structure, costs, search.tried, search.seconds)
+    if lost := np.sum(~np.isfinite(costs["policy"])):
+        warnings.warn(
+            f"{_WHERE}: no policy was found whose cost is finite from every "
+            f"start; that of {structure!r}, which is returned, is not from {lost} of "
+            f"{len(costs['policy'])}.",
+            stacklevel=2,
+        )
+    tried, plants = search.tried, search.plants()
+    return Synthesis(policy, structure, costs, tried, search.seconds, plants)
