@@ -4,21 +4,16 @@ Each task and seed is a process of its own, so that its seconds have all compila
 them. What is stored already is not run again.
 """
 
-import json
-import os
-import subprocess
-import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from benchmarks._machine import describe
+from benchmarks import _cases
 
 
-STORE = Path(__file__).parent / "results" / "synthesis.jsonl"
+STORE = _cases.RESULTS / "synthesis.jsonl"
 SEEDS = 5
 WITHIN = 0.05
 """How far from the best known a policy may be."""
@@ -36,9 +31,6 @@ def case(task: str, seed: int) -> dict[str, Any]:
     """The policy of one task and seed, in this process: its costs on starts of its own
     beside those of others, and on the starts of the scoreboard."""
     began = time.perf_counter()
-    # With all cores, as a user has; the benchmark itself may be on one.
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))
     import jax
 
     from delucax.studies._scoreboard import costs_of, task_of
@@ -48,32 +40,24 @@ def case(task: str, seed: int) -> dict[str, Any]:
     seconds = time.perf_counter() - began
     costs = {name: cost.tolist() for name, cost in found.costs.items()}
     tried = [attempt._asdict() for attempt in found.tried]
-    about = {"task": task, "seed": seed, "structure": found.structure}
+    about = {"structure": found.structure, "seconds": seconds}
     about["scoreboard"] = costs_of(task, found.policy)
-    return about | {"seconds": seconds, "costs": costs, "tried": tried}
+    return about | {"costs": costs, "tried": tried}
 
 
 def run(only: list[str], seeds: int) -> list[dict[str, Any]]:
     """The cases, those that are missing run first."""
-    rows = [json.loads(line) for line in STORE.open()] if STORE.exists() else []
-    known = {(row["task"], row["seed"]) for row in rows}
     # A seed of every task before the next, so that a run that is cut off shows all.
-    for seed in range(seeds):
-        for task in only or names():
-            if (task, seed) in known:
-                continue
-            command = [sys.executable, "-m", "benchmarks._synthesis", task, str(seed)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                print(f"  {task}, {seed}: {done.stderr.strip().splitlines()[-1]}")
-                continue
-            row = json.loads(done.stdout) | {"machine": describe()}
-            rows.append(row)
-            with STORE.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-            print(f"  {task}, {seed}: {row['structure']}, {regret(row):+.1%} ", end="")
-            print(f"in {row['seconds']:.0f} s", flush=True)
-    return [row for row in rows if not only or row["task"] in only]
+    cases = [
+        {"task": task, "seed": seed}
+        for seed in range(seeds)
+        for task in only or names()
+    ]
+
+    def said(row):
+        return f"{row['structure']}, {regret(row):+.1%} in {row['seconds']:.0f} s"
+
+    return _cases.run("benchmarks._synthesis", STORE, cases, said)
 
 
 def regret(row: dict[str, Any], of: str = "policy") -> float:
@@ -125,4 +109,4 @@ def tasks(only: list[str], seeds: int = SEEDS) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(case(sys.argv[1], int(sys.argv[2]))))
+    _cases.answer(case)

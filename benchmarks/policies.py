@@ -1,15 +1,24 @@
 """`python -m benchmarks.policies`: training by the gradient, by PPO and by SHAC.
 
-Four parts, each written to `benchmarks/results/policies.json` when it is done:
+Parts, written to `benchmarks/results/policies.json` when they are done:
 
 - `swing-up`: the analytic gradient and PPO, ten seeds each, with the steps and the
   seconds that they take;
 - `tuning`: eight settings of each method, on seeds that are not among those reported;
-- `tasks`: every named task by `training.synthesise`, five seeds each, stored one by one
-  in `results/synthesis.jsonl`; `--task pendulum` runs one;
 - `learning`: PPO, SHAC and the analytic gradient at equal steps of the environment, 30
   seeds, with the best of these; draws `docs/assets/learning.svg`. `--steps 40000` runs
-  one of the budgets.
+  one of the budgets;
+
+and those that store each case in a file of their own, `results/*.jsonl`, and go on
+where they were cut off:
+
+- `tasks`: every named task by `training.synthesise`, five seeds each; `--task pendulum`
+  runs one;
+- `family`: one policy for a family of cart-poles, beside LQR and MPC that know each
+  plant;
+- `rivals`: PPO and SAC of Stable-Baselines3 at 20 times the seconds (needs the group
+  `sb3`); `--at-once 2` runs two trainings of theirs at once;
+- `export`: the policies in C.
 
 How the estimators compare is in the paper's studies: `python -m delucax reproduce
 policy-gradient` and `estimator-variance`.
@@ -31,9 +40,12 @@ import optax
 import pandas as pd
 
 import delucax as dlx
+from benchmarks._exported_policies import exported
+from benchmarks._family import family
 from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._paired import middle, spread
 from benchmarks._results import updated
+from benchmarks._rivals import rivals
 from benchmarks._synthesis import tasks
 from delucax.studies import holds_upright, train_swing_up
 from delucax.training import (
@@ -47,7 +59,7 @@ from delucax.training import (
 
 RESULTS = Path(__file__).parent / "results" / "policies.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "assets" / "learning.svg"
-PARTS = ("swing-up", "tuning", "learning", "tasks")
+PARTS = ("swing-up", "tuning", "learning", "tasks", "family", "rivals", "export")
 BUDGETS = (40_000, 80_000, 160_000, 320_000)
 """Steps of the environment that a seed is trained for."""
 STARTS = 100
@@ -292,16 +304,24 @@ def main() -> None:
     parser.add_argument("--part", choices=PARTS, action="append")
     parser.add_argument("--steps", type=int, choices=BUDGETS, help="one budget, again")
     parser.add_argument("--task", action="append", default=[], help="one task alone")
-    parser.add_argument("--seeds", type=int, default=5, help="of each task")
+    parser.add_argument("--seeds", type=int, help="of each case; 5, or 3 of rivals")
+    parser.add_argument("--at-once", type=int, default=1, help="trainings of rivals")
     parser.add_argument("--small", action="store_true", help="to try it; not written")
     options = parser.parse_args()
     compile_anew()
     about = {"machine": describe()}
     runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}
+    seeds = {} if options.seeds is None else {"seeds": options.seeds}
+    row_by_row = {
+        "tasks": lambda: tasks(options.task, **seeds),
+        "family": lambda: family(**seeds),
+        "rivals": lambda: rivals(options.task, options.at_once, **seeds),
+        "export": lambda: exported(options.task),
+    }
     for part in options.part or PARTS:
         print(f"\n== {part}", flush=True)
-        if part == "tasks":
-            tasks(options.task, options.seeds)
+        if part in row_by_row:
+            row_by_row[part]()
             continue
         found = runs[part](options)
         if options.small:

@@ -1,0 +1,148 @@
+"""What policies cost in C: the part `export` of `benchmarks.policies`.
+
+Every structure that `training.synthesise` may return for a task is trained for some
+steps and written by `export.c`. The C takes its place in the closed loop, from the same
+starts. The costs differ by rounding, which an unstable or chaotic loop amplifies; so
+beside the C stands what JAX itself gives from starts that are moved by one rounding.
+"""
+
+import dataclasses
+import tempfile
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+import pandas as pd
+
+import delucax as dlx
+from benchmarks import _cases
+
+
+STORE = _cases.RESULTS / "exported_policies.jsonl"
+LIMIT = 1e-5
+"""Of the difference of the total cost of all starts, relative to it."""
+BLIND = "pendulum, angle alone"
+TASKS = (
+    "pendulum",
+    BLIND,
+    "double_integrator",
+    "cartpole_linear",
+    "cstr",
+    "quadrotor",
+    "mountain_car",
+    "balloon_lung",
+)
+PRECISIONS = ("float64", "float32")
+STARTS, STEPS, LONGEST = 16, 200, 100
+
+
+class AngleAlone(dlx.systems.Pendulum):
+    """A pendulum whose velocity no sensor shows."""
+
+    def observe(self, t: Any, x: Any) -> Any:
+        return x[:1]
+
+
+def both_parts(y: Any) -> Any:
+    """Cosine and sine of the angle."""
+    return jnp.stack([jnp.cos(y[0]), jnp.sin(y[0])])
+
+
+def task_of(name: str) -> dlx.Environment:
+    """A task of the scoreboard, or the pendulum that needs a memory."""
+    from delucax.studies import _scoreboard
+
+    if name != BLIND:
+        return _scoreboard.task_of(name)
+    dynamics = dlx.Discretized(AngleAlone(), dt=0.05)
+    change: Any = dict(dynamics=dynamics, encode=both_parts, observation_bounds=None)
+    return dataclasses.replace(dlx.make("pendulum"), **change)
+
+
+def policies(env: Any) -> dict[str, Any]:
+    """One of each structure, trained."""
+    from delucax.training._policy_search import _regulator
+    from delucax.training._structures import LQR_AND_NETWORK, structures
+
+    lqr, key = _regulator(env), jr.key(0)
+    made: dict[str, Any] = {"zero": dlx.controllers.Zero(env.control_size)}
+    if lqr is not None:
+        made["LQR"] = lqr
+    horizon = min(env.horizon, LONGEST)
+    loss = dlx.training.expected_cost(env, batch=8, horizon=horizon, gradient_decay=0.9)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(5e-3))
+    for name, policy in structures(env, lqr, 32, 1, key).items():
+        part = "correction" if name == LQR_AND_NETWORK else None
+        how: Any = dict(key=key, trainable=part, progress=False, throw=False)
+        made[name] = dlx.training.fit(loss, policy, optimiser, STEPS, **how).model
+    return made
+
+
+def case(task: str, precision: str) -> dict[str, Any]:
+    """The difference of each structure, in this process."""
+    jax.config.update("jax_enable_x64", precision == "float64")
+    env = task_of(task)
+    x0 = jax.vmap(env.reset)(jr.split(jr.key(2**20), STARTS))
+    moved = jnp.nextafter(x0, jnp.full_like(x0, jnp.inf))
+    found = {}
+    for name, policy in policies(env).items():
+        with tempfile.TemporaryDirectory() as folder:
+            size = env.dynamics.observation_size
+            dlx.export.c(policy, folder, name="law", example=jnp.zeros(size))
+            in_c = dlx.export.load(folder)
+        cost = total(env, policy, x0)
+        found[name] = {
+            "cost": cost / STARTS,
+            "difference": off(total(env, in_c, x0), cost),
+            "rounding": off(total(env, policy, moved), cost),
+        }
+    return {"structures": found}
+
+
+def total(env: Any, policy: Any, starts: Any) -> float:
+    """The cost of all starts."""
+    how: Any = dict(key=jr.key(0), keep=(), throw=False)
+    runs = [dlx.rollout(env, policy, x0=x0, **how).total_cost for x0 in starts]
+    return float(np.sum(np.asarray(runs, float)))
+
+
+def off(found: float, expected: float) -> float:
+    """Their difference, relative to the expected one."""
+    return 0.0 if found == expected else abs(found - expected) / abs(expected)
+
+
+def exported(only: list[str]) -> pd.DataFrame:
+    """Run what is missing, and print what all reach."""
+    cases = [
+        {"task": task, "precision": precision}
+        for task in only or TASKS
+        for precision in PRECISIONS
+    ]
+
+    def said(row):
+        each = row["structures"].items()
+        return ", ".join(f"{name} {s['difference']:.1e}" for name, s in each)
+
+    rows = _cases.run("benchmarks._exported_policies", STORE, cases, said)
+    table = pd.DataFrame(
+        {"task": row["task"], "precision": row["precision"], "structure": name} | found
+        for row in rows
+        for name, found in row["structures"].items()
+    )
+    print(table.to_string(index=False, float_format="%.2g"))
+    for precision, group in table.groupby("precision"):
+        worst = group.loc[group["difference"].idxmax()]
+        within = int(np.sum(group["difference"] <= LIMIT))
+        print(
+            f"{precision}: {within} of {len(group)} within {LIMIT:g}, at most "
+            f"{worst['difference']:.1e} ({worst['structure']} of {worst['task']}): "
+            f"{'met' if within == len(group) else 'NOT met'}"
+        )
+    return table
+
+
+if __name__ == "__main__":
+    _cases.answer(case)

@@ -1,0 +1,271 @@
+"""PPO and SAC of Stable-Baselines3: the part `rivals` of `benchmarks.policies`.
+
+Both sides control the same plant at the same cost. Theirs is stepped by compiled C, and
+is given 20 times the seconds that `training.synthesise` took for that task and seed
+with all its compilation; evaluations are not counted. Their best policy on starts of a
+validation is kept, checked 20 times on the way. Each algorithm has its defaults, and
+where the authors publish settings for Gym's version of the task (rl-baselines3-zoo,
+`hyperparams/`) these too. The networks are small, so that each training has one thread.
+
+All are compared on the same starts, which none was trained or chosen on.
+"""
+
+import copy
+import time
+from typing import Any
+
+import jax
+import jax.random as jr
+import numpy as np
+import pandas as pd
+
+import delucax as dlx
+from benchmarks import _cases
+from benchmarks._family import cartpole
+
+
+STORE = _cases.RESULTS / "rivals.jsonl"
+SEEDS, BUDGET, TIMES = 3, 15.0, 20
+STARTS, VALIDATION, CHECKS = 32, 16, 20
+TASKS = ("pendulum", "acrobot", "cart-pole")
+OURS = "synthesise"
+# Published for Pendulum-v1, Acrobot-v1 and CartPole-v1. `envs` and `normalised` are
+# those of the training; a rate or a range that is `falling` ends at zero.
+PUBLISHED: dict[tuple[str, str], dict[str, Any]] = {
+    ("pendulum", "PPO"): dict(
+        envs=4,
+        n_steps=1024,
+        gae_lambda=0.95,
+        gamma=0.9,
+        n_epochs=10,
+        ent_coef=0.0,
+        learning_rate=1e-3,
+        clip_range=0.2,
+        use_sde=True,
+        sde_sample_freq=4,
+    ),
+    ("pendulum", "SAC"): dict(learning_rate=1e-3),
+    ("acrobot", "PPO"): dict(
+        envs=16,
+        normalised=True,
+        n_steps=256,
+        gae_lambda=0.94,
+        gamma=0.99,
+        n_epochs=4,
+        ent_coef=0.0,
+    ),
+    ("cart-pole", "PPO"): dict(
+        envs=8,
+        n_steps=32,
+        batch_size=256,
+        gae_lambda=0.8,
+        gamma=0.98,
+        n_epochs=20,
+        ent_coef=0.0,
+        learning_rate=1e-3,
+        clip_range=0.2,
+        falling=("learning_rate", "clip_range"),
+    ),
+}
+
+
+def task_of(name: str) -> dlx.Environment:
+    """The plant and the cost; the cart-pole is the nominal one of the family."""
+    return cartpole() if name == "cart-pole" else dlx.make(name)
+
+
+def drawn(env: Any, seed: int, count: int) -> np.ndarray:
+    """Starts."""
+    return np.asarray(jax.vmap(env.reset)(jr.split(jr.key(seed), count)))
+
+
+def case(task: str, method: str, seed: int, seconds: float = 0.0) -> dict[str, Any]:
+    """What one policy costs from each start, in this process."""
+    env = task_of(task)
+    if method != OURS:
+        algorithm, setting = method.split(", ")
+        return theirs(env, task, algorithm, setting, seed, seconds)
+    began = time.perf_counter()
+    how: Any = dict(key=jr.key(seed), budget=BUDGET, progress=False)
+    made = dlx.training.synthesise(env, **how)
+    taken = time.perf_counter() - began
+    quiet: Any = dict(key=jr.key(0), keep=(), throw=False)
+    run = lambda x0: dlx.rollout(env, made.policy, x0=x0, **quiet).total_cost
+    costs = [float(run(x0)) for x0 in drawn(env, 2**20, STARTS)]
+    return {"structure": made.structure, "taken": taken, "costs": costs}
+
+
+def theirs(
+    env: Any, task: str, algorithm: str, setting: str, seed: int, seconds: float
+) -> dict[str, Any]:
+    """PPO or SAC, for so many seconds."""
+    import stable_baselines3  # pyright: ignore
+    import torch  # pyright: ignore
+    from gymnasium.wrappers import RescaleAction
+    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore
+    from stable_baselines3.common.vec_env import (  # pyright: ignore
+        DummyVecEnv,
+        VecNormalize,
+    )
+
+    from delucax.interop.gymnasium import GymnasiumEnv
+
+    torch.set_num_threads(1)
+    given = dict(PUBLISHED[task, algorithm]) if setting == "published" else {}
+    count, normalised = given.pop("envs", 1), given.pop("normalised", False)
+
+    def one():
+        plant = GymnasiumEnv(env, discrete=False, backend="c")
+        # A first deviation of 1 has to mean something.
+        return RescaleAction(plant, np.float32(-1), np.float32(1))
+
+    venv: Any = DummyVecEnv([one] * count)
+    if normalised:
+        venv = VecNormalize(venv, gamma=given["gamma"])
+
+    class Clock(BaseCallback):
+        """Stops in time, and keeps the best policy."""
+
+        began = paused = 0.0
+        best, checked = (np.inf, {}, None), 0
+
+        @property
+        def share(self) -> float:
+            """The part of the time that is over."""
+            return (time.perf_counter() - self.began - self.paused) / seconds
+
+        def _on_training_start(self):
+            self.began = time.perf_counter()
+
+        def _on_step(self):
+            if self.share >= (self.checked + 1) / CHECKS:
+                self.check()
+            return self.share < 1
+
+        def check(self):
+            at, self.checked = time.perf_counter(), self.checked + 1
+            cost = float(np.mean(costs_of(self.model, venv, one, held_out)))
+            if cost < self.best[0]:
+                state = copy.deepcopy(self.model.policy.state_dict())
+                self.best = cost, state, copy.deepcopy(getattr(venv, "obs_rms", None))
+            self.paused += time.perf_counter() - at
+
+    held_out, clock = drawn(env, 2**21, VALIDATION), Clock()
+    for name in given.pop("falling", ()):
+        first = given[name]
+        given[name] = lambda _, first=first: first * max(0.0, 1 - clock.share)
+    kind = getattr(stable_baselines3, algorithm)
+    model = kind("MlpPolicy", venv, seed=seed, device="cpu", **given)
+    model.learn(10**9, callback=clock)
+    steps = model.num_timesteps
+    if clock.best[1]:
+        model.policy.load_state_dict(clock.best[1])
+        if normalised:
+            venv.obs_rms = clock.best[2]
+    costs = costs_of(model, venv, one, drawn(env, 2**20, STARTS)).tolist()
+    return {"steps": steps, "taken": seconds, "costs": costs}
+
+
+def costs_of(model: Any, venv: Any, one: Any, starts: np.ndarray) -> np.ndarray:
+    """The cost of an episode from each start, all stepped together."""
+    plants = [one() for _ in starts]
+    seen = np.stack(
+        [
+            plant.reset(seed=0, options={"state": x0})[0]
+            for plant, x0 in zip(plants, starts, strict=True)
+        ]
+    )
+    costs, active = np.zeros(len(starts)), np.ones(len(starts), bool)
+    shown = getattr(venv, "normalize_obs", lambda y: y)
+    while np.any(active):
+        actions, _ = model.predict(shown(seen), deterministic=True)
+        for k in np.flatnonzero(active):
+            seen[k], reward, terminated, truncated, _ = plants[k].step(actions[k])
+            costs[k] -= float(reward)
+            active[k] = not (terminated or truncated)
+    return costs
+
+
+def methods(task: str) -> list[str]:
+    """The rivals of a task."""
+    published = [name for at, name in PUBLISHED if at == task]
+    defaults = [f"{algorithm}, defaults" for algorithm in ("PPO", "SAC")]
+    return defaults + [f"{algorithm}, published" for algorithm in published]
+
+
+def rivals(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> pd.DataFrame:
+    """Run what is missing, and print what all reach."""
+    names = only or list(TASKS)
+    cases = [
+        {"task": task, "method": OURS, "seed": seed}
+        for seed in range(seeds)
+        for task in names
+    ]
+    said = lambda row: f"costs {np.mean(row['costs']):.4g}, {row['taken']:.0f} s"
+    own = _cases.run("benchmarks._rivals", STORE, cases, said)
+    cases = [
+        {
+            "task": row["task"],
+            "method": method,
+            "seed": row["seed"],
+            "seconds": TIMES * row["taken"],
+        }
+        for row in own
+        for method in methods(row["task"])
+    ]
+    rows = own + _cases.run("benchmarks._rivals", STORE, cases, said, at_once)
+    made = []
+    for task in names:
+        ours = costs(rows, task, OURS)
+        for method in (OURS, *methods(task)):
+            other = costs(rows, task, method)
+            if not len(ours) or other.shape != ours.shape:
+                continue
+            low, high = interval(ours - other)
+            made.append(
+                {
+                    "task": task,
+                    "method": method,
+                    "cost": np.mean(other),
+                    "worst seed": np.max(np.mean(other, axis=1)),
+                    "ours less theirs": np.mean(ours - other),
+                    "low": low,
+                    "high": high,
+                }
+            )
+    table = pd.DataFrame(made)
+    print(table.to_string(index=False, float_format="%.4g"))
+    if len(table):
+        judge(table[table["method"] != OURS])
+    return table
+
+
+def costs(rows: list[dict[str, Any]], task: str, method: str) -> np.ndarray:
+    """A row for each seed, a column for each start."""
+    which = [row for row in rows if (row["task"], row["method"]) == (task, method)]
+    return np.array(
+        [row["costs"] for row in sorted(which, key=lambda row: row["seed"])]
+    )
+
+
+def interval(values: np.ndarray, resamples: int = 2000) -> np.ndarray:
+    """The ends of the 95% interval of a mean over seeds and starts, by the bootstrap of
+    both."""
+    rng, (seeds, starts) = np.random.default_rng(0), values.shape
+    rows = rng.integers(seeds, size=(resamples, seeds, 1))
+    columns = rng.integers(starts, size=(resamples, 1, starts))
+    return np.quantile(np.mean(values[rows, columns], axis=(1, 2)), [0.025, 0.975])
+
+
+def judge(table: Any) -> None:
+    """Print where ours is better, and where it is not."""
+    better = table["high"] < 0
+    for _, row in table[~better].iterrows():
+        how = "is worse than" if row["low"] > 0 else "is not told from"
+        print(f"{row['task']}: {OURS} {how} {row['method']}")
+    met = "met" if np.all(better) else "NOT met"
+    print(f"better than {np.sum(better)} of {len(table)}: {met}")
+
+
+if __name__ == "__main__":
+    _cases.answer(case)
