@@ -14,6 +14,7 @@ where they were cut off:
 
 - `tasks`: every named task by `training.synthesise`, five seeds each; `--task pendulum`
   runs one;
+- `ablation`: the same without one of its parts, on tasks of each kind;
 - `family`: one policy for a family of cart-poles, beside LQR and MPC that know each
   plant;
 - `rivals`: PPO and SAC of Stable-Baselines3 at 20 times the seconds (needs the group
@@ -40,6 +41,7 @@ import optax
 import pandas as pd
 
 import delucax as dlx
+from benchmarks._ablation import ablation
 from benchmarks._exported_policies import exported
 from benchmarks._family import family
 from benchmarks._machine import compile_anew, describe, limit_cores
@@ -59,7 +61,16 @@ from delucax.training import (
 
 RESULTS = Path(__file__).parent / "results" / "policies.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "assets" / "learning.svg"
-PARTS = ("swing-up", "tuning", "learning", "tasks", "family", "rivals", "export")
+PARTS = (
+    "swing-up",
+    "tuning",
+    "learning",
+    "tasks",
+    "ablation",
+    "family",
+    "rivals",
+    "export",
+)
 BUDGETS = (40_000, 80_000, 160_000, 320_000)
 """Steps of the environment that a seed is trained for."""
 STARTS = 100
@@ -314,6 +325,7 @@ def main() -> None:
     seeds = {} if options.seeds is None else {"seeds": options.seeds}
     row_by_row = {
         "tasks": lambda: tasks(options.task, **seeds),
+        "ablation": lambda: ablation(options.task, **seeds),
         "family": lambda: family(**seeds),
         "rivals": lambda: rivals(options.task, options.at_once, **seeds),
         "export": lambda: exported(options.task),

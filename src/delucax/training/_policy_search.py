@@ -180,7 +180,7 @@ class PolicySearch:
         env = self.environment
         zero, _ = self.best["zero"]
         self.best["zero"] = zero, self.cost(zero)
-        self.lqr = _regulator(env)
+        self.lqr = self.regulator()
         if self.lqr is not None:
             self.best["LQR"] = self.lqr, self.cost(self.lqr)
         made = structures(env, self.lqr, width, depth, self.fresh_key())
@@ -204,6 +204,15 @@ class PolicySearch:
             share *= _FEWER
         if lines:
             self.finish(lines[0], made[lines[0].structure])
+
+    def regulator(self) -> LQR | None:
+        """The LQR, where there is one."""
+        if not self.environment.dynamics.observes_state:
+            return None
+        try:
+            return local_lqr(self.environment)
+        except (ValueError, RuntimeError):
+            return None
 
     def is_settled(self) -> bool:
         """Whether neither training around the LQR nor a search without gradient nor a
@@ -346,16 +355,6 @@ class PolicySearch:
         if self.may_compare:
             costs["plan"] = _costs_of_plan(env, ranges, policy, keys)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}
-
-
-def _regulator(environment: Environment) -> LQR | None:
-    """The LQR, where there is one."""
-    if not environment.dynamics.observes_state:
-        return None
-    try:
-        return local_lqr(environment)
-    except (ValueError, RuntimeError):
-        return None
 
 
 def _on_plants(

@@ -1,0 +1,107 @@
+"""What each part of `training.synthesise` brings: the part `ablation` of
+`benchmarks.policies`.
+
+The same search within the same seconds, without one of its parts, on tasks of each
+kind. `gradient alone` is what one writes without it: a network, trained by the gradient
+of the rollout.
+"""
+
+import time
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+
+from benchmarks import _cases
+from benchmarks._synthesis import regret
+
+
+STORE = _cases.RESULTS / "ablation.jsonl"
+SEEDS = 3
+TASKS = (
+    "acrobot",
+    "cartpole_swing_up",
+    "furuta",
+    "learned_lung",
+    "mountain_car",
+    "pendulum",
+    "quadrotor",
+    "slung_load",
+)
+ALL = "all of it"
+WITHOUT = (
+    ALL,
+    "no LQR inside",
+    "no damping",
+    "no evolution",
+    "no imitation",
+    "gradient alone",
+)
+
+
+def case(task: str, without: str, seed: int) -> dict[str, Any]:
+    """The policy of one task and seed without a part of the search."""
+    began = time.perf_counter()
+    from delucax.studies._scoreboard import task_of
+    from delucax.training._policy_search import PolicySearch
+
+    alone = without == "gradient alone"
+
+    class Reduced(PolicySearch):
+        def regulator(self):
+            return None if alone or without == "no LQR inside" else super().regulator()
+
+        def expert_is_better(self, policy):
+            kept = not alone and without != "no imitation"
+            return kept and super().expert_is_better(policy)
+
+    key = jax.random.key(seed)
+    search = Reduced(task_of(task), None, key, budget=75.0, progress=False)
+    dropped = {
+        "no damping": lambda name: name.startswith("gradient,"),
+        "no evolution": lambda name: name == "evolution",
+        "gradient alone": lambda name: name != "gradient",
+    }.get(without, lambda name: False)
+    search.methods = {n: m for n, m in search.methods.items() if not dropped(n)}
+    search.run(width=32, depth=1)
+    structure, policy = search.chosen()
+    costs = {n: cost.tolist() for n, cost in search.compared(policy).items()}
+    seconds = time.perf_counter() - began
+    return {"structure": structure, "costs": costs, "seconds": seconds}
+
+
+def ablation(only: list[str], seeds: int = SEEDS) -> list[dict[str, Any]]:
+    """Run what is missing; a row for each task, a column for each part left out."""
+    cases = [
+        {"task": task, "without": without, "seed": seed}
+        for seed in range(seeds)
+        for task in only or TASKS
+        for without in WITHOUT
+    ]
+
+    def said(row):
+        return f"{row['structure']}, {np.mean(row['costs']['policy']):.5g}"
+
+    rows = _cases.run("benchmarks._ablation", STORE, cases, said)
+    table = pd.DataFrame(_above_best(rows))
+    table = table.pivot_table("above", "task", "without", aggfunc="median")
+    table = table[[name for name in WITHOUT if name in table]]
+    print("Above the best known of each start, median of the seeds")
+    print(table.to_string(float_format="{:+.1%}".format))
+    return table.reset_index().to_dict("records")
+
+
+def _above_best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How far each is above the best of all searches with its seed."""
+    found = []
+    for row in rows:
+        same = [r for r in rows if (r["task"], r["seed"]) == (row["task"], row["seed"])]
+        costs = {f"{n}, {r['without']}": c for r in same for n, c in r["costs"].items()}
+        costs["policy"] = row["costs"]["policy"]
+        found.append(row | {"above": regret(row | {"costs": costs})})
+    return found
+
+
+if __name__ == "__main__":
+    _cases.answer(case)
