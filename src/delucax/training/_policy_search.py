@@ -220,7 +220,7 @@ class PolicySearch:
         tried = [(attempt.structure, attempt.method) for attempt in self.tried]
         if tried != _FIRST or self.chosen()[0] != "LQR":
             return False
-        env, keys = self.environment, self.comparison
+        env, keys = self.environment, self.keys(_CHOICE)[: len(self.comparison)]
         own = np.mean(_costs(env, self.ranges, self.lqr, keys))
         known = isinstance(env.disturbance, NoDisturbance)
         other = np.mean(
@@ -264,7 +264,9 @@ class PolicySearch:
         while self.may_train:
             method = max(gains, key=lambda method: gains[method])
             after = self.attempt(line._replace(method=method), _ATTEMPT)
-            gains[method] = (line.cost - after.cost) / max(abs(line.cost), 1e-12)
+            gain = (line.cost - after.cost) / max(abs(after.cost), 1e-12)
+            # NaN where neither is finite.
+            gains[method] = np.nan_to_num(gain)
             line = min(line, after, key=lambda line: line.cost)
             if max(gains.values()) > _GAIN:
                 continue
