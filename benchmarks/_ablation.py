@@ -71,7 +71,9 @@ def case(task: str, without: str, seed: int) -> dict[str, Any]:
     return {"structure": structure, "costs": costs, "seconds": seconds}
 
 
-def ablation(only: list[str], seeds: int = SEEDS) -> list[dict[str, Any]]:
+def ablation(
+    only: list[str], at_once: int = 1, seeds: int = SEEDS
+) -> list[dict[str, Any]]:
     """Run what is missing; a row for each task, a column for each part left out."""
     cases = [
         {"task": task, "without": without, "seed": seed}
@@ -83,7 +85,7 @@ def ablation(only: list[str], seeds: int = SEEDS) -> list[dict[str, Any]]:
     def said(row):
         return f"{row['structure']}, {np.mean(row['costs']['policy']):.5g}"
 
-    rows = _cases.run("benchmarks._ablation", STORE, cases, said)
+    rows = _cases.run("benchmarks._ablation", STORE, cases, said, at_once)
     table = pd.DataFrame(_above_best(rows))
     table = table.pivot_table("above", "task", "without", aggfunc="median")
     table = table[[name for name in WITHOUT if name in table]]

@@ -18,8 +18,10 @@ where they were cut off:
 - `family`: one policy for a family of cart-poles, beside LQR and MPC that know each
   plant;
 - `rivals`: PPO and SAC of Stable-Baselines3 at 20 times the seconds (needs the group
-  `sb3`); `--at-once 2` runs two trainings of theirs at once;
+  `sb3`);
 - `export`: the policies in C.
+
+With `--at-once 2` two cases share the cores, each with the same seconds.
 
 How the estimators compare is in the paper's studies: `python -m delucax reproduce
 policy-gradient` and `estimator-variance`.
@@ -316,7 +318,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, choices=BUDGETS, help="one budget, again")
     parser.add_argument("--task", action="append", default=[], help="one task alone")
     parser.add_argument("--seeds", type=int, help="of each case; 5, or 3 of rivals")
-    parser.add_argument("--at-once", type=int, default=1, help="trainings of rivals")
+    parser.add_argument("--at-once", type=int, default=1, help="cases")
     parser.add_argument("--small", action="store_true", help="to try it; not written")
     options = parser.parse_args()
     compile_anew()
@@ -324,8 +326,8 @@ def main() -> None:
     runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}
     seeds = {} if options.seeds is None else {"seeds": options.seeds}
     row_by_row = {
-        "tasks": lambda: tasks(options.task, **seeds),
-        "ablation": lambda: ablation(options.task, **seeds),
+        "tasks": lambda: tasks(options.task, options.at_once, **seeds),
+        "ablation": lambda: ablation(options.task, options.at_once, **seeds),
         "family": lambda: family(**seeds),
         "rivals": lambda: rivals(options.task, options.at_once, **seeds),
         "export": lambda: exported(options.task),
