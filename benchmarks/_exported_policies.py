@@ -64,10 +64,11 @@ def task_of(name: str) -> dlx.Environment:
 
 def policies(env: Any) -> dict[str, Any]:
     """One of each structure, trained."""
-    from delucax.training._policy_search import _regulator
+    from delucax.training._policy_search import PolicySearch
     from delucax.training._structures import LQR_AND_NETWORK, structures
 
-    lqr, key = _regulator(env), jr.key(0)
+    key = jr.key(0)
+    lqr = PolicySearch(env, None, key, budget=1.0, progress=False).regulator()
     made: dict[str, Any] = {"zero": dlx.controllers.Zero(env.control_size)}
     if lqr is not None:
         made["LQR"] = lqr

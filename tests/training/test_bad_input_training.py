@@ -24,6 +24,10 @@ LOSS = training.expected_cost(ENV, batch=2, horizon=3)
         ("scored_cost", training.scored_cost(ENV)),
         ("analytic", lambda c, key: training.analytic(LOSS, c, key)),
         (
+            "ClippedSamples",
+            lambda c, key: training.ClippedSamples(4)(LOSS, c, key),
+        ),
+        (
             "EvolutionStrategies",
             lambda c, key: training.EvolutionStrategies(0.1, 4)(LOSS, c, key),
         ),

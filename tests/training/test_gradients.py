@@ -18,6 +18,7 @@ from jaxtyping import Array
 import delucax as dlx
 from delucax.training import (
     analytic,
+    ClippedSamples,
     EvolutionStrategies,
     LikelihoodRatio,
     scored_cost,
@@ -230,10 +231,33 @@ def test_antithetic_noise_cancels_even_terms():
     assert both.std() < 0.5 * one.std()
 
 
-ESTIMATORS = [analytic, EvolutionStrategies(0.1, 4), LikelihoodRatio(4)]
+def test_samples_that_run_away_are_shortened():
+    # Slopes 1, ..., 7; one of a million; and one that is not finite.
+    slopes = jnp.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 1e6, jnp.nan])
+    keys = jr.split(jr.key(0), slopes.size)
+
+    def loss(m, key):
+        matches = jnp.all(jr.key_data(keys) == jr.key_data(key), axis=1)
+        return m * jnp.sum(jnp.where(matches, slopes, 0))
+
+    start = jnp.asarray(2.0)
+    value, slope = ClippedSamples(slopes.size, factor=2.0)(loss, start, jr.key(0))
+    # The middle one of the eight is 4.5.
+    assert_close(slope, (28 + 2 * 4.5) / 8, rtol=1e-6)
+    assert_close(value, 2 * (28 + 1e6) / 8, rtol=1e-6)
+    _, slope = ClippedSamples(4)(lambda m, key: m * jnp.nan, start, jr.key(0))
+    assert np.isnan(slope)
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS, ids=["analytic", "es", "likelihood"])
+ESTIMATORS = [
+    analytic,
+    ClippedSamples(4),
+    EvolutionStrategies(0.1, 4),
+    LikelihoodRatio(4),
+]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
 def test_estimators_share_one_signature(estimator):
     class Part(dlx.AbstractController):
         gain: Array = dlx.weight()
@@ -264,13 +288,14 @@ def test_estimators_share_one_signature(estimator):
 
 
 def test_a_loss_without_metrics_returns_a_scalar():
-    for estimator in ESTIMATORS[:2]:
+    for estimator in ESTIMATORS[:3]:
         value, _ = estimator(lambda x, key: jnp.sum(x**2), jnp.ones(2), jr.key(0))
         assert_close(value, 2.0, rtol=1e-6)
 
 
 def test_wrong_estimators_are_named():
     for match, make in (
+        ("factor must be positive", lambda: ClippedSamples(factor=0.0)),
         ("sigma must be positive", lambda: EvolutionStrategies(0.0, 4)),
         (
             "samples must be even when antithetic, got 3",

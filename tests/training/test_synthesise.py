@@ -12,7 +12,7 @@ from helpers import once
 
 import delucax as dlx
 from delucax.training import synthesise
-from delucax.training._policy_search import PolicySearch
+from delucax.training._policy_search import _Line, PolicySearch
 
 
 KEY = jax.random.key(0)
@@ -73,21 +73,42 @@ def test_a_network_where_the_regulator_is_worse():
     # Nothing is trained: what is better by more than half a percent is chosen.
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     zero, lqr, net = (dlx.controllers.Constant([float(i)]) for i in range(3))
-    search.best = {"zero": (zero, 9.0), "LQR": (lqr, 1.01), "network": (net, 1.0)}
+    enter = lambda name, policy, cost: search.enter(known(name, policy, cost))
+    search.best = {}
+    enter("zero", zero, 9.0)
+    enter("LQR", lqr, 1.01)
+    enter("network", net, 1.0)
     assert search.chosen() == ("network", net)
-    search.best["LQR"] = lqr, 1.004
+    enter("LQR", lqr, 1.004)
     assert search.chosen() == ("LQR", lqr)
-    search.best["zero"] = zero, 1.0
+    enter("zero", zero, 1.0)
     assert search.chosen() == ("zero", zero)
+
+
+def known(name, policy, *costs):
+    return _Line(name, "none", policy, np.array(costs))
+
+
+def test_a_policy_that_seldom_fails_is_better_than_one_that_never_works():
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    lqr, net = (dlx.controllers.Constant([float(i)]) for i in range(2))
+    search.best = {}
+    search.enter(known("network", net, *[2e3] * 10))
+    search.enter(known("LQR", lqr, *[20.0] * 9, 3e7))
+    assert search.chosen() == ("LQR", lqr)
+    search.enter(known("network", net, *[20.0] * 9, np.inf))
+    assert search.chosen() == ("LQR", lqr)
+    search.enter(known("network", net, *[20.0] * 10))
+    assert search.chosen() == ("network", net)
 
 
 @pytest.mark.parametrize("better", [0.0, 0.1])
 def test_it_ends_where_the_regulator_is_enough(monkeypatch, better):
     module = sys.modules[PolicySearch.__module__]
-    monkeypatch.setattr(module, "_costs", lambda *_: np.ones(2))
-    monkeypatch.setattr(module, "_costs_of_plan", lambda *_: np.ones(2) - better)
+    monkeypatch.setattr(module, "costs_of", lambda *_: np.ones(2))
+    monkeypatch.setattr(module, "costs_of_plan", lambda *_: np.ones(2) - better)
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
-    search.best |= {"LQR": (dlx.controllers.Zero(1), 1.0)}
+    search.enter(known("LQR", dlx.controllers.Zero(1), 1.0, 1.0))
     first = ("LQR + network", "gradient"), ("network", "evolution")
     search.tried = [dlx.training.Attempt(*each, 0.999, 1.0) for each in first]
     assert search.is_settled() == (not better)
@@ -140,8 +161,9 @@ def test_a_model_without_derivative(system):
 
 
 def test_it_cannot_be_traced():
+    task = env()
     with pytest.raises(ValueError, match="synthesise: .* cannot be called under"):
-        jax.jit(lambda key: synthesise(env(), key=key).seconds)(KEY)
+        jax.jit(lambda key: synthesise(task, key=key).seconds)(KEY)
 
 
 def test_a_cost_that_stays_infinite(monkeypatch):

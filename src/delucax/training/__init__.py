@@ -11,6 +11,7 @@ from ._evolve import evolve as evolve
 from ._fit import fit as fit, Fitted as Fitted
 from ._gradient_estimators import (
     analytic as analytic,
+    ClippedSamples as ClippedSamples,
     EvolutionStrategies as EvolutionStrategies,
     LikelihoodRatio as LikelihoodRatio,
 )

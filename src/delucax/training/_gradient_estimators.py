@@ -11,7 +11,7 @@ import jax.random as jr
 import optax
 from jaxtyping import Array, PyTree
 
-from .._check import check_count, check_key
+from .._check import check_count, check_key, check_positive
 from .._module import check_parameters, parameter, positive
 from .._typing import PRNGKey, Real
 from ._trainable import weights_of
@@ -76,6 +76,81 @@ def gradient_of_weights(
     of = lambda weights: loss(eqx.combine(weights, rest))
     (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)
     return value, gradient
+
+
+class ClippedSamples(eqx.Module):
+    r"""The mean of the gradients of several draws, with those that are far longer than
+    the middle one shortened.
+
+    Over the keys of n samples, of which those count whose gradient `g_i` is finite,
+
+    `g = 1 / n sum_i min(1, c / |g_i|) g_i`, `c = factor * median of |g_i|`.
+
+    A plant that runs away in one episode of thirty has a gradient that is larger than
+    all others together, and points nowhere; or it is not finite, which would end the
+    training. Called as every estimator is, see [`delucax.training.analytic`][], with a
+    loss of a single episode.
+
+    **Arguments:**
+
+    - `samples`: gradients in one estimate, 32 by default.
+    - `factor`: 5 by default. A small one is biased towards what most episodes need.
+
+    **Returns:** from a call, `(value, gradient)`: the mean of what the loss returned
+    for the samples that count, and a pytree like the model with `None` in the place of
+    what is not a weight.
+    Both are NaN if none does.
+
+    **Raises:** `ValueError` if `samples` is below 1, or `factor` is not positive.
+
+    Source: Abadi et al., 2016 (clipping each gradient); Andrew, Thakkar, McMahan and
+    Ramaswamy, 2021 (to a quantile).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import equinox as eqx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        loss = dlx.training.expected_cost(env, batch=1, horizon=50)
+        controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        estimator = eqx.filter_jit(dlx.training.ClippedSamples(8))
+        value, gradient = estimator(loss, controller, jax.random.key(0))
+        gradient.K
+        ```
+    """
+
+    samples: int = eqx.field(static=True, default=32)
+    factor: float = eqx.field(static=True, default=5.0)
+
+    def __post_init__(self):
+        self.samples = check_count(self.samples, "samples", "ClippedSamples")
+        check_positive(self.factor, "factor", "ClippedSamples")
+
+    def __call__(
+        self, loss: Callable[..., Any], model: PyTree, key: PRNGKey
+    ) -> tuple[Any, PyTree]:
+        check_key(key, "ClippedSamples")
+
+        sample = lambda key: analytic(loss, model, key)
+        values, gradients = jax.vmap(sample)(jr.split(key, self.samples))
+        costs = values[0] if isinstance(values, tuple) else values
+        norms = jax.vmap(optax.tree.norm)(gradients)
+        counts = jnp.isfinite(costs) & jnp.isfinite(norms)
+        most = self.factor * jnp.nanmedian(jnp.where(counts, norms, jnp.nan))
+        shares = jnp.where(norms > most, most / norms, 1)
+
+        def mean(samples, shares):
+            axes = (slice(None), *[None] * (samples.ndim - 1))
+            kept = jnp.where(counts[axes], samples, 0)
+            return jnp.sum(shares[axes] * kept, axis=0) / jnp.sum(counts)
+
+        alike = jnp.ones_like(shares)
+        value = jax.tree.map(lambda samples: mean(samples, alike), values)
+        return value, jax.tree.map(lambda samples: mean(samples, shares), gradients)
 
 
 class EvolutionStrategies(eqx.Module):

@@ -15,14 +15,22 @@ from jaxtyping import Array
 from .._controller import AbstractController
 from .._module import get_path
 from .._typing import PRNGKey
-from ..controllers import Constant, local_lqr, local_mpc, LQR, OpenLoop, Zero
+from ..controllers import Constant, local_lqr, local_mpc, LQR, Zero
 from ..disturbances import Zero as NoDisturbance
-from ..environments import Environment, randomise
-from ..planning import ILQR
-from ..simulation import rollout
+from ..environments import Environment
 from ._costs import expected_cost
+from ._episode_costs import (
+    costs_of,
+    costs_of_mpc,
+    costs_of_plan,
+    first_steps,
+    on_plants,
+    tamed,
+    TamedCost,
+)
 from ._evolve import evolve
 from ._fit import fit
+from ._gradient_estimators import ClippedSamples
 from ._imitate import imitate
 from ._structures import LQR_AND_NETWORK, structures
 
@@ -50,6 +58,10 @@ _STEPS, _GENERATIONS = 300, 150
 # First learning rates of a round: the second is for when nothing gains any more.
 _RATE, _FINE_RATE = 2e-2, 2e-3
 _BATCH, _LONGEST = 32, 200
+# Episodes in which each member of a generation is tried.
+_EVALUATIONS = 8
+# What stands for a usual cost that is not known, so large that none is far above it.
+_ANY = 1e30
 # The share of the budget that a trial and a later attempt may take, after its first
 # round, and how many times fewer and longer the trials become.
 _TRIAL, _ATTEMPT, _FEWER = 0.01, 0.03, 3
@@ -85,12 +97,12 @@ class Attempt(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """A policy that one method trains, and its cost."""
+    """A policy that one method trains, and its costs, `None` before the training."""
 
     structure: str
     method: str
     policy: AbstractController
-    cost: float
+    costs: np.ndarray | None = None
 
 
 class PolicySearch:
@@ -111,9 +123,8 @@ class PolicySearch:
         options: Any = dict(desc=_WHERE, bar_format=layout, disable=not progress)
         self.bar = tqdm(total=round(budget), **options)
         # Also what an interrupt leaves before anything has been tried.
-        self.best: dict[str, tuple[AbstractController, float]] = {
-            "zero": (Zero(environment.control_size), np.inf)
-        }
+        zero = Zero(environment.control_size)
+        self.best = {"zero": _Line("zero", "none", zero)}
         self.tried: list[Attempt] = []
         self.lqr: LQR | None = None
         self.steps = min(environment.horizon, _LONGEST)
@@ -122,6 +133,8 @@ class PolicySearch:
         # Seconds over which a gradient is forgotten.
         self.methods = memories | {"gradient": jnp.inf, "evolution": None}
         self.rate = _RATE
+        # The least median cost so far.
+        self.usual = _ANY
         # Of the first round of an attempt, which compiles.
         self.longest = 0.0
 
@@ -162,7 +175,7 @@ class PolicySearch:
                 f"differentiate, got: {str(error).splitlines()[0]} For others use "
                 "delucax.training.evolve."
             ) from error
-        starts, costs, steps = map(np.asarray, _first_steps(env, keys))
+        starts, costs, steps = map(np.asarray, first_steps(env, keys))
         for what, values in (("first state", starts), ("cost of a first state", costs)):
             finite = np.isfinite(values.reshape(_CHOICE, -1)).all(axis=1)
             if not finite.all():
@@ -178,15 +191,14 @@ class PolicySearch:
     def run(self, width: int, depth: int) -> None:
         """Train until the time is up or nothing gains any more."""
         env = self.environment
-        zero, _ = self.best["zero"]
-        self.best["zero"] = zero, self.cost(zero)
+        self.enter(self.best["zero"])
         self.lqr = self.regulator()
         if self.lqr is not None:
-            self.best["LQR"] = self.lqr, self.cost(self.lqr)
+            self.enter(_Line("LQR", "none", self.lqr))
         made = structures(env, self.lqr, width, depth, self.fresh_key())
         pairs = [(name, method) for method in self.methods for name in made]
         pairs = sorted(pairs, key=lambda pair: pair not in _FIRST)
-        lines = [_Line(name, method, made[name], np.inf) for name, method in pairs]
+        lines = [_Line(name, method, made[name]) for name, method in pairs]
         # Successive halving: the better third goes on, for three times as long.
         share = _TRIAL
         while (self.may_train or not self.tried) and len(lines) > 1:
@@ -198,9 +210,10 @@ class PolicySearch:
                 if self.is_settled():
                     return
             left = max(1, round(len(lines) / _FEWER))
-            after = sorted(after, key=lambda line: line.cost)[:left]
-            most = after[0].cost + _CLOSE * abs(after[0].cost)
-            lines = [line for line in after if line.cost <= most]
+            after = sorted(after, key=self.score)[:left]
+            least = self.score(after[0])
+            most = least + _CLOSE * abs(least)
+            lines = [line for line in after if self.score(line) <= most]
             share *= _FEWER
         if lines:
             self.finish(lines[0], made[lines[0].structure])
@@ -221,12 +234,12 @@ class PolicySearch:
         if tried != _FIRST or self.chosen()[0] != "LQR":
             return False
         env, keys = self.environment, self.keys(_CHOICE)[: len(self.comparison)]
-        own = np.mean(_costs(env, self.ranges, self.lqr, keys))
+        own = np.mean(costs_of(env, self.ranges, self.lqr, keys))
         known = isinstance(env.disturbance, NoDisturbance)
         other = np.mean(
-            _costs_of_plan(env, self.ranges, self.lqr, keys)
+            costs_of_plan(env, self.ranges, self.lqr, keys)
             if known
-            else _costs_of_mpc(env, self.ranges, self.lqr, keys)
+            else costs_of_mpc(env, self.ranges, self.lqr, keys)
         )
         return bool(own - other <= _WORTH * abs(own))
 
@@ -242,17 +255,18 @@ class PolicySearch:
             expert = local_mpc(env, self.lqr, throw=False)
             return imitate(env, expert, policy, **options).model
         if method == "evolution":
-            options["sigma"] = (
-                _NEAR if np.isfinite(line.cost) else _WIDTHS[line.structure]
-            )
-            loss = expected_cost(env, batch=8, ranges=self.ranges)
+            is_new = line.costs is None
+            options["sigma"] = _WIDTHS[line.structure] if is_new else _NEAR
+            episode = expected_cost(env, batch=1, ranges=self.ranges)
+            loss = TamedCost(episode, jnp.asarray(self.usual), _EVALUATIONS)
             return evolve(loss, policy, _GENERATIONS, **options).model
         adam = optax.adam(optax.cosine_decay_schedule(self.rate, _STEPS))
         optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
         # An array, so that all compile once.
         decay = jnp.exp(-env.dt / self.methods[method])
-        shape: Any = dict(batch=_BATCH, horizon=self.steps)
+        shape: Any = dict(batch=1, horizon=self.steps)
         loss = expected_cost(env, gradient_decay=decay, ranges=self.ranges, **shape)
+        options["gradient"] = ClippedSamples(_BATCH)
         return fit(loss, policy, optimiser, _STEPS, **options).model
 
     def finish(self, line: _Line, untrained: AbstractController) -> None:
@@ -264,10 +278,9 @@ class PolicySearch:
         while self.may_train:
             method = max(gains, key=lambda method: gains[method])
             after = self.attempt(line._replace(method=method), _ATTEMPT)
-            gain = (line.cost - after.cost) / max(abs(after.cost), 1e-12)
-            # NaN where neither is finite.
-            gains[method] = np.nan_to_num(gain)
-            line = min(line, after, key=lambda line: line.cost)
+            own = self.score(after)
+            gains[method] = (self.score(line) - own) / max(abs(own), 1e-12)
+            line = min(line, after, key=self.score)
             if max(gains.values()) > _GAIN:
                 continue
             gains = fresh.copy()
@@ -275,8 +288,8 @@ class PolicySearch:
                 self.rate = _FINE_RATE
             elif not has_imitated and self.expert_is_better(line.policy):
                 has_imitated, self.rate = True, _RATE
-                clone = line._replace(method="imitation", policy=untrained, cost=np.inf)
-                line = min(line, self.attempt(clone, 0.0), key=lambda line: line.cost)
+                clone = _Line(line.structure, "imitation", untrained)
+                line = min(line, self.attempt(clone, 0.0), key=self.score)
             else:
                 break
 
@@ -285,8 +298,8 @@ class PolicySearch:
         if not self.environment.dynamics.observes_state or self.ranges is not None:
             return False
         keys = self.keys(_CHOICE)[:_COMPARISON]
-        expert = np.mean(_costs_of_mpc(self.environment, None, self.lqr, keys))
-        own = np.mean(_costs(self.environment, None, policy, keys))
+        expert = np.mean(costs_of_mpc(self.environment, None, self.lqr, keys))
+        own = np.mean(costs_of(self.environment, None, policy, keys))
         return bool(own - expert > _WORTH * abs(own))
 
     def attempt(self, line: _Line, share: float) -> _Line:
@@ -295,42 +308,61 @@ class PolicySearch:
         began, compiled, best = self.seconds, None, line
         while compiled is None or self.seconds - compiled < share * self.budget:
             policy = self.trained(best)
-            now = best._replace(policy=policy, cost=self.cost(policy))
+            now = best._replace(policy=policy, costs=self.costs(policy))
             if compiled is None:
                 compiled = self.seconds
                 self.longest = max(self.longest, compiled - began)
             # What changes nothing diverges at once.
-            stays = now.cost == best.cost
-            best = min(best, now, key=lambda line: line.cost)
+            stays = self.score(now) == self.score(best)
+            best = min(best, now, key=self.score)
             if stays or not self.may_train:
                 break
-        name = line.structure
-        if best.cost < self.best.get(name, (None, np.inf))[1]:
-            self.best[name] = best.policy, best.cost
-        seconds = self.seconds - began
-        self.tried.append(Attempt(name, line.method, best.cost, seconds))
-        least = min(cost for _, cost in self.best.values())
+        self.enter(best)
+        name, cost = best.structure, self.mean(best)
+        self.tried.append(Attempt(name, line.method, cost, self.seconds - began))
+        least = min(map(self.mean, self.best.values()))
         self.bar.set_postfix_str(f"cost {least:.5g}, {name}", refresh=False)
         self.bar.update(min(self.seconds, self.bar.total) - self.bar.n)
         return best
 
-    def cost(self, policy: AbstractController) -> float:
-        """The mean cost over the starts on which policies are chosen."""
+    def costs(self, policy: AbstractController) -> np.ndarray:
+        """The costs from the starts on which policies are chosen."""
         keys = self.keys(_CHOICE)
-        costs = np.asarray(_costs(self.environment, self.ranges, policy, keys), float)
-        return float(np.mean(costs)) if np.all(np.isfinite(costs)) else np.inf
+        return np.asarray(costs_of(self.environment, self.ranges, policy, keys), float)
+
+    def enter(self, line: _Line) -> None:
+        """Keep a line if it is the best of its structure, and its median cost if that
+        is the least."""
+        if line.costs is None:
+            line = line._replace(costs=self.costs(line.policy))
+        name = line.structure
+        self.best[name] = min(self.best.get(name, line), line, key=self.score)
+        costs = np.abs(self.best[name].costs)
+        middle = np.median(np.where(np.isfinite(costs), costs, np.inf))
+        if middle > 0:
+            self.usual = min(self.usual, middle)
+
+    def score(self, line: _Line) -> float:
+        """The mean of the tamed costs, by which policies are chosen."""
+        if line.costs is None:
+            return np.inf
+        return float(jnp.mean(tamed(jnp.asarray(line.costs), self.usual)))
+
+    def mean(self, line: _Line) -> float:
+        """The mean cost, infinite where one is not finite."""
+        costs = np.inf if line.costs is None else line.costs
+        return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
 
     def chosen(self) -> tuple[str, AbstractController]:
         """The best policy, or the floor where that is as good."""
-        least = min(cost for _, cost in self.best.values())
-        simple = {
-            name: self.best[name] for name in ("zero", "LQR") if name in self.best
-        }
-        for name, (policy, cost) in simple.items():
-            if cost - least <= _WORTH * abs(least):
-                return name, policy
-        name = min(self.best, key=lambda name: self.best[name][1])
-        return name, self.best[name][0]
+        best = min(self.best.values(), key=self.score)
+        least = self.score(best)
+        for name in ("zero", "LQR"):
+            simple = self.best.get(name, best)
+            if self.score(simple) - least <= _WORTH * abs(least):
+                best = simple
+                break
+        return best.structure, best.policy
 
     @property
     def comparison(self) -> Array:
@@ -341,87 +373,19 @@ class PolicySearch:
         """What is drawn for the plants of the comparison."""
         ranges = self.ranges or {}
         of = lambda plant, key: {path: get_path(plant, path) for path in ranges}
-        drawn = _on_plants(self.environment, ranges, self.comparison, of)
+        drawn = on_plants(self.environment, ranges, self.comparison, of)
         return {path: np.asarray(values) for path, values in drawn.items()}
 
     def compared(self, policy: AbstractController) -> dict[str, np.ndarray]:
         """The costs of the policy and of others, from starts of their own."""
         env, ranges, keys = self.environment, self.ranges, self.comparison
-        floor = {n: self.best[n][0] for n in ("zero", "LQR") if n in self.best}
+        floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
         costs = {
-            name: _costs(env, ranges, one, keys)
+            name: costs_of(env, ranges, one, keys)
             for name, one in {"policy": policy, **floor}.items()
         }
         if env.dynamics.observes_state and self.may_compare:
-            costs["MPC"] = _costs_of_mpc(env, ranges, self.lqr, keys)
+            costs["MPC"] = costs_of_mpc(env, ranges, self.lqr, keys)
         if self.may_compare:
-            costs["plan"] = _costs_of_plan(env, ranges, policy, keys)
+            costs["plan"] = costs_of_plan(env, ranges, policy, keys)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}
-
-
-def _on_plants(
-    environment: Environment, ranges: dict[str, Any] | None, keys: Array, of: Any
-) -> Any:
-    """`of(plant, key)` for each key, the plant being drawn as by `expected_cost`."""
-
-    def one(key):
-        if ranges is None:
-            return of(environment, key)
-        key, plant_key = jr.split(key)
-        return of(randomise(environment, plant_key, ranges), key)
-
-    return jax.vmap(one)(keys)
-
-
-_QUIETLY: Any = dict(keep=(), throw=False)
-
-
-@eqx.filter_jit
-def _costs(environment, ranges, policy, keys):
-    of = lambda plant, key: rollout(plant, policy, key=key, **_QUIETLY).total_cost
-    return _on_plants(environment, ranges, keys, of)
-
-
-@eqx.filter_jit
-def _costs_of_mpc(environment, ranges, lqr, keys):
-    def of(plant, key):
-        mpc = local_mpc(plant, lqr, throw=False)
-        return rollout(plant, mpc, key=key, **_QUIETLY).total_cost
-
-    return _on_plants(environment, ranges, keys, of)
-
-
-@eqx.filter_jit
-def _costs_of_plan(environment, ranges, policy, keys):
-    """Of the best plan with known disturbances that starts from the policy's controls,
-    or of these."""
-
-    def of(plant, key):
-        keep = ("states", "controls", "disturbances")
-        run: Any = rollout(plant, policy, key=key, keep=keep, throw=False)
-        given: Any = dict(w=run.disturbances, bounds=plant.control_bounds, throw=False)
-        x0, planner = run.states[0], ILQR(max_iterations=100)
-        plan = planner(plant.dynamics, plant.cost, x0, run.controls, **given)
-        planned = rollout(plant, OpenLoop(plan.controls), key=key, **_QUIETLY)
-        return jnp.fmin(planned.total_cost, run.total_cost)
-
-    return _on_plants(environment, ranges, keys, of)
-
-
-@eqx.filter_jit
-def _first_steps(environment, keys):
-    """First states, their cost without control, and the states after one step under
-    several controls."""
-    m, bounds = environment.control_size, environment.control_bounds
-    controls = jnp.concatenate([jnp.zeros((1, m)), jr.normal(keys[0], (15, m))])
-    if bounds is not None:
-        low, high = (jnp.nan_to_num(jnp.broadcast_to(e, m)) for e in bounds)
-        controls = jnp.concatenate([controls, low[None], high[None]])
-
-    def one(key):
-        x0 = environment.reset(environment.split_key(key)[0])
-        step = lambda u: environment.step(jnp.zeros(()), x0, u)
-        after = jax.vmap(lambda u: step(u).state)(controls)
-        return x0, step(jnp.zeros(m)).cost, after
-
-    return jax.vmap(one)(keys)

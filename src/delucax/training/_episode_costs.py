@@ -1,0 +1,112 @@
+"""Costs of the episodes that the search for a policy looks at."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._controller import AbstractController
+from .._typing import PRNGKey
+from ..controllers import local_mpc, OpenLoop
+from ..environments import Environment, randomise
+from ..planning import ILQR
+from ..simulation import rollout
+
+
+# Costs count by their logarithm from this multiple of the usual one on.
+_FAR = 20.0
+_QUIETLY: Any = dict(keep=(), throw=False)
+
+
+def tamed(costs: Array, usual: Any) -> Array:
+    """Costs of which those far above the usual one count by their logarithm, and those
+    that are not finite as the largest number.
+
+    Otherwise the one episode in a hundred in which a plant runs away, to a cost of a
+    million, outweighs all others.
+    """
+    far = _FAR * usual
+    costs = jnp.nan_to_num(jnp.where(jnp.isnan(costs), jnp.inf, costs))
+    return jnp.sign(costs) * far * jnp.log1p(jnp.abs(costs) / far)
+
+
+class TamedCost(eqx.Module):
+    """The mean tamed cost of several episodes."""
+
+    episode: Any
+    usual: Array
+    episodes: int = eqx.field(static=True)
+
+    def __call__(self, policy: AbstractController, key: PRNGKey) -> Array:
+        keys = jr.split(key, self.episodes)
+        return jnp.mean(
+            tamed(jax.vmap(lambda key: self.episode(policy, key))(keys), self.usual)
+        )
+
+
+def on_plants(
+    environment: Environment, ranges: dict[str, Any] | None, keys: Array, of: Any
+) -> Any:
+    """`of(plant, key)` for each key, the plant being drawn as by `expected_cost`."""
+
+    def one(key):
+        if ranges is None:
+            return of(environment, key)
+        key, plant_key = jr.split(key)
+        return of(randomise(environment, plant_key, ranges), key)
+
+    return jax.vmap(one)(keys)
+
+
+@eqx.filter_jit
+def costs_of(environment, ranges, policy, keys):
+    of = lambda plant, key: rollout(plant, policy, key=key, **_QUIETLY).total_cost
+    return on_plants(environment, ranges, keys, of)
+
+
+@eqx.filter_jit
+def costs_of_mpc(environment, ranges, lqr, keys):
+    def of(plant, key):
+        mpc = local_mpc(plant, lqr, throw=False)
+        return rollout(plant, mpc, key=key, **_QUIETLY).total_cost
+
+    return on_plants(environment, ranges, keys, of)
+
+
+@eqx.filter_jit
+def costs_of_plan(environment, ranges, policy, keys):
+    """Of the best plan with known disturbances that starts from the policy's controls,
+    or of these."""
+
+    def of(plant, key):
+        keep = ("states", "controls", "disturbances")
+        run: Any = rollout(plant, policy, key=key, keep=keep, throw=False)
+        given: Any = dict(w=run.disturbances, bounds=plant.control_bounds, throw=False)
+        x0, planner = run.states[0], ILQR(max_iterations=100)
+        plan = planner(plant.dynamics, plant.cost, x0, run.controls, **given)
+        planned = rollout(plant, OpenLoop(plan.controls), key=key, **_QUIETLY)
+        return jnp.fmin(planned.total_cost, run.total_cost)
+
+    return on_plants(environment, ranges, keys, of)
+
+
+@eqx.filter_jit
+def first_steps(environment, keys):
+    """First states, their cost without control, and the states after one step under
+    several controls."""
+    m, bounds = environment.control_size, environment.control_bounds
+    controls = jnp.concatenate([jnp.zeros((1, m)), jr.normal(keys[0], (15, m))])
+    if bounds is not None:
+        low, high = (jnp.nan_to_num(jnp.broadcast_to(e, m)) for e in bounds)
+        controls = jnp.concatenate([controls, low[None], high[None]])
+
+    def one(key):
+        x0 = environment.reset(environment.split_key(key)[0])
+        step = lambda u: environment.step(jnp.zeros(()), x0, u)
+        after = jax.vmap(lambda u: step(u).state)(controls)
+        return x0, step(jnp.zeros(m)).cost, after
+
+    return jax.vmap(one)(keys)
