@@ -107,7 +107,7 @@ def corrected(env: Any, with_memory: bool, key: Any) -> Any:
     network = eqx.tree_at(last, network, zero)
     policy = dlx.controllers.Residual(lqr, network, bounds)
     decay = float(np.exp(-env.dt / FORGOTTEN))
-    loss: Any = dict(batch=BATCH, gradient_decay=decay, ranges=RANGES)
+    loss: Any = dict(batch=1, gradient_decay=decay, ranges=RANGES)
     adam = optax.adam(optax.cosine_decay_schedule(5e-3, STEPS))
     return dlx.training.fit(
         dlx.training.expected_cost(env, **loss),
@@ -116,6 +116,7 @@ def corrected(env: Any, with_memory: bool, key: Any) -> Any:
         STEPS,
         key=jr.fold_in(key, 1),
         trainable="correction",
+        gradient=dlx.training.ClippedSamples(BATCH),
         progress=False,
         throw=False,
     ).model
