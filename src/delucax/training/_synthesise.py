@@ -179,7 +179,7 @@ def synthesise(
         costs = search.compared(policy)
     if lost := np.sum(~np.isfinite(costs["policy"])):
         warnings.warn(
-            f"{_WHERE}: no policy was found whose cost is finite from every "
+            f"{_WHERE}: no policy has a cost that is finite from every "
             f"start; that of {structure!r}, which is returned, is not from {lost} of "
             f"{len(costs['policy'])}.",
             stacklevel=2,
