@@ -65,7 +65,7 @@ def task_of(name: str) -> dlx.Environment:
 def policies(env: Any) -> dict[str, Any]:
     """One of each structure, trained."""
     from delucax.training._policy_search import PolicySearch
-    from delucax.training._structures import LQR_AND_NETWORK, structures
+    from delucax.training._structures import structures
 
     key = jr.key(0)
     lqr = PolicySearch(env, None, key, budget=1.0, progress=False).regulator()
@@ -75,8 +75,9 @@ def policies(env: Any) -> dict[str, Any]:
     horizon = min(env.horizon, LONGEST)
     loss = dlx.training.expected_cost(env, batch=8, horizon=horizon, gradient_decay=0.9)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(5e-3))
-    for name, policy in structures(env, lqr, 32, 1, key).items():
-        part = "correction" if name == LQR_AND_NETWORK else None
+    known, family = (structures(env, lqr, f, 32, 1, key) for f in (False, True))
+    for name, policy in (known | family).items():
+        part = "correction" if isinstance(policy, dlx.controllers.Residual) else None
         how: Any = dict(key=key, trainable=part, progress=False, throw=False)
         made[name] = dlx.training.fit(loss, policy, optimiser, STEPS, **how).model
     return made

@@ -3,9 +3,10 @@
 Both sides control the same plant at the same cost. Theirs is stepped by compiled C, and
 is given 20 times the seconds that `training.synthesise` took for that task and seed
 with all its compilation; evaluations are not counted. Their best policy on starts of a
-validation is kept, checked 20 times on the way. Each algorithm has its defaults, and
-where the authors publish settings for Gym's version of the task (rl-baselines3-zoo,
-`hyperparams/`) these too. The networks are small, so that each training has one thread.
+validation is kept, checked 20 times on the way. The settings are those that the authors
+publish for Gym's version of the task (rl-baselines3-zoo, `hyperparams/`), or the
+defaults where there are none. The networks are small, so that each training has one
+thread. With `--at-once 2` both sides share the cores with another case.
 
 All are compared on the same starts, which none was trained or chosen on.
 """
@@ -188,9 +189,8 @@ def costs_of(model: Any, venv: Any, one: Any, starts: np.ndarray) -> np.ndarray:
 
 def methods(task: str) -> list[str]:
     """The rivals of a task."""
-    published = [name for at, name in PUBLISHED if at == task]
-    defaults = [f"{algorithm}, defaults" for algorithm in ("PPO", "SAC")]
-    return defaults + [f"{algorithm}, published" for algorithm in published]
+    setting = lambda name: "published" if (task, name) in PUBLISHED else "defaults"
+    return [f"{algorithm}, {setting(algorithm)}" for algorithm in ("PPO", "SAC")]
 
 
 def rivals(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> pd.DataFrame:
@@ -202,7 +202,7 @@ def rivals(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> pd.DataFram
         for task in names
     ]
     said = lambda row: f"costs {np.mean(row['costs']):.4g}, {row['taken']:.0f} s"
-    own = _cases.run("benchmarks._rivals", STORE, cases, said)
+    own = _cases.run("benchmarks._rivals", STORE, cases, said, at_once)
     cases = [
         {
             "task": row["task"],

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from .._controller import AbstractController
 from .._module import get_path
 from .._typing import PRNGKey
-from ..controllers import Constant, local_lqr, local_mpc, LQR, Zero
+from ..controllers import Constant, local_lqr, local_mpc, LQR, Residual, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
 from ._costs import expected_cost
@@ -32,7 +32,7 @@ from ._evolve import evolve
 from ._fit import fit
 from ._gradient_estimators import ClippedSamples
 from ._imitate import imitate
-from ._structures import LQR_AND_NETWORK, structures
+from ._structures import structures
 
 
 with warnings.catch_warnings():
@@ -42,10 +42,10 @@ with warnings.catch_warnings():
 
 
 _WHERE = "synthesise"
+# After how many trials it is asked whether the LQR is enough.
+_FIRST = 2
 # After which share of the episode a damped gradient is forgotten.
 _MEMORIES = (1 / 30, 1 / 10, 1 / 4)
-# What is tried first where there is an LQR: they tell whether it is enough.
-_FIRST = [(LQR_AND_NETWORK, "gradient"), ("network", "evolution")]
 # Starts on which policies are chosen, and others on which the best is compared: more
 # where each has a plant of its own.
 _CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
@@ -70,8 +70,8 @@ _CLOSE = 0.5
 # A gain below which a method is given up, and one that is worth a network or an
 # expert.
 _GAIN, _WORTH = 1e-3, 5e-3
-# How wide an evolution begins: for each structure, and near the best.
-_WIDTHS, _NEAR = {"network": 1.0, LQR_AND_NETWORK: 0.3, "memory": 0.3}, 0.05
+# How wide an evolution begins: of a network, of others, and near the best.
+_WIDE, _NARROW, _NEAR = 1.0, 0.3, 0.05
 
 
 class Attempt(NamedTuple):
@@ -195,9 +195,13 @@ class PolicySearch:
         self.lqr = self.regulator()
         if self.lqr is not None:
             self.enter(_Line("LQR", "none", self.lqr))
-        made = structures(env, self.lqr, width, depth, self.fresh_key())
+        family = self.ranges is not None
+        made = structures(env, self.lqr, family, width, depth, self.fresh_key())
         pairs = [(name, method) for method in self.methods for name in made]
-        pairs = sorted(pairs, key=lambda pair: pair not in _FIRST)
+        # These tell whether the LQR is enough.
+        first = [("LQR + memory" if family else "LQR + network", "gradient")]
+        first.append(("network", "evolution"))
+        pairs = sorted(pairs, key=lambda pair: pair not in first)
         lines = [_Line(name, method, made[name]) for name, method in pairs]
         # Successive halving: the better third goes on, for three times as long.
         share = _TRIAL
@@ -207,7 +211,7 @@ class PolicySearch:
                 if not self.may_train and self.tried:
                     break
                 after.append(self.attempt(line, share))
-                if self.is_settled():
+                if len(self.tried) == _FIRST and self.is_settled():
                     return
             left = max(1, round(len(lines) / _FEWER))
             after = sorted(after, key=self.score)[:left]
@@ -230,8 +234,7 @@ class PolicySearch:
     def is_settled(self) -> bool:
         """Whether neither training around the LQR nor a search without gradient nor a
         plan is better than the LQR, or MPC where a plan would know the disturbances."""
-        tried = [(attempt.structure, attempt.method) for attempt in self.tried]
-        if tried != _FIRST or self.chosen()[0] != "LQR":
+        if self.chosen()[0] != "LQR":
             return False
         env, keys = self.environment, self.keys(_CHOICE)[: len(self.comparison)]
         own = np.mean(costs_of(env, self.ranges, self.lqr, keys))
@@ -248,15 +251,14 @@ class PolicySearch:
         env, policy, method = self.environment, line.policy, line.method
         options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
         # The LQR inside a policy stays as it is.
-        options["trainable"] = (
-            "correction" if line.structure == LQR_AND_NETWORK else None
-        )
+        is_residual = isinstance(policy, Residual)
+        options["trainable"] = "correction" if is_residual else None
         if method == "imitation":
             expert = local_mpc(env, self.lqr, throw=False)
             return imitate(env, expert, policy, **options).model
         if method == "evolution":
-            is_new = line.costs is None
-            options["sigma"] = _WIDTHS[line.structure] if is_new else _NEAR
+            width = _WIDE if line.structure == "network" else _NARROW
+            options["sigma"] = width if line.costs is None else _NEAR
             episode = expected_cost(env, batch=1, ranges=self.ranges)
             loss = TamedCost(episode, jnp.asarray(self.usual), _EVALUATIONS)
             return evolve(loss, policy, _GENERATIONS, **options).model

@@ -18,14 +18,19 @@ from ..simulation import rollout
 
 # Episodes of each controller that the scales are taken from.
 _EPISODES = 32
-LQR_AND_NETWORK = "LQR + network"
 
 
 def structures(
-    environment: Environment, lqr: LQR | None, width: int, depth: int, key: PRNGKey
+    environment: Environment,
+    lqr: LQR | None,
+    is_family: bool,
+    width: int,
+    depth: int,
+    key: PRNGKey,
 ) -> dict[str, AbstractController]:
-    """Policies to train, by name: a network; one that corrects the LQR; and where the
-    state is not observed one with a memory."""
+    """Policies to train, by name: a network that corrects the LQR, with a memory if the
+    plant is one of a family; a network; where the state is not observed, one with a
+    memory alone."""
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds
     low, high = (jnp.full(m, -jnp.inf), jnp.full(m, jnp.inf))
@@ -46,20 +51,24 @@ def structures(
     ends = jnp.where(bounded, low, -half), jnp.where(bounded, high, half)
 
     size = environment.feature_size
-    if not environment.dynamics.observes_state:
-        options: Any = dict(features=features, bounds=ends, key=plain_key)
-        return {"memory": GRU(size, m, width, **options)}
     network = lambda bounds, key: MLP(
         size, m, width, depth, features=features, bounds=bounds, key=key
     )
+    memory = lambda bounds, key: GRU(
+        size, m, width, features=features, bounds=bounds, key=key
+    )
+    if not environment.dynamics.observes_state:
+        return {"memory": memory(ends, plain_key)}
     made: dict[str, AbstractController] = {}
     if lqr is not None:
         # Its correction is zero at first.
-        correction = network((-half, half), residual_key)
-        last = lambda c: (c.network.layers[-1].weight, c.network.layers[-1].bias)
-        zeros = jax.tree.map(jnp.zeros_like, last(correction))
-        correction = eqx.tree_at(last, correction, zeros)
-        made[LQR_AND_NETWORK] = Residual(lqr, correction, bounds)
+        make: Any = memory if is_family else network
+        correction = make((-half, half), residual_key)
+        last = lambda c: c.readout if is_family else c.network.layers[-1]
+        zero = jax.tree.map(jnp.zeros_like, last(correction))
+        correction = eqx.tree_at(last, correction, zero)
+        name = "LQR + memory" if is_family else "LQR + network"
+        made[name] = Residual(lqr, correction, bounds)
     return made | {"network": network(ends, plain_key)}
 
 

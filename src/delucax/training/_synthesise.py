@@ -36,8 +36,8 @@ class Synthesis(NamedTuple):
     **Attributes:**
 
     - `policy`: the controller that was chosen.
-    - `structure`: what it is: `"zero"`, `"LQR"`, `"network"`, `"LQR + network"` or
-        `"memory"`.
+    - `structure`: what it is: `"zero"`, `"LQR"`, `"network"`, `"memory"`,
+        `"LQR + network"` or `"LQR + memory"`.
     - `costs`: from `"policy"`, `"zero"`, `"LQR"`, `"MPC"` and `"plan"` to the costs of
         episodes from starts that were used for nothing else, the same for each; those
         that do not apply, or that the budget leaves no time for, are left out.
@@ -104,12 +104,13 @@ def synthesise(
     1. The floor: no control, and the LQR of [`delucax.controllers.local_lqr`][] where
         there is one.
     2. Trials: a network that corrects the LQR ([`delucax.controllers.Residual`][]) and
-        a network alone, or a recurrent network where the state is not observed. Each is
-        trained by the gradient of the rollout
-        ([`delucax.training.ClippedSamples`][]), by that gradient damped over a quarter,
-        a tenth and a thirtieth of the episode, and by [`delucax.training.evolve`][],
-        which needs no gradient. If after the first two trials neither they nor a plan
-        are better than the LQR, it ends with the LQR.
+        a network alone. With `ranges` the one that corrects is recurrent, because it
+        can then tell the plant from what it has observed; where the state is not
+        observed, a recurrent network alone is tried. Each is trained by the gradient of
+        the rollout ([`delucax.training.ClippedSamples`][]), by that gradient damped
+        over a quarter, a tenth and a thirtieth of the episode, and by
+        [`delucax.training.evolve`][], which needs no gradient. If after the first two
+        trials neither they nor a plan are better than the LQR, it ends with the LQR.
     3. Refinement: the better third goes on for three times as long, until one is left.
         That one is trained by the methods that still gain, then at a tenth of the
         learning rate. Once none gains, an imitation of MPC
