@@ -170,10 +170,10 @@ class PolicySearch:
         try:
             jax.eval_shape(eqx.filter_grad(loss), held, keys[0])
         except Exception as error:
+            reason, *_ = str(error).splitlines() or [f"{type(error).__name__}."]
             raise ValueError(
                 f"{_WHERE}: environment must have dynamics and a cost that JAX can "
-                f"differentiate, got: {str(error).splitlines()[0]} For others use "
-                "delucax.training.evolve."
+                f"differentiate, got: {reason} For others use delucax.training.evolve."
             ) from error
         starts, costs, steps = map(np.asarray, first_steps(env, keys))
         for what, values in (("first state", starts), ("cost of a first state", costs)):
@@ -208,7 +208,7 @@ class PolicySearch:
         while (self.may_train or not self.tried) and len(lines) > 1:
             after = []
             for line in lines:
-                if not self.may_train and self.tried:
+                if not self.may_train and after:
                     break
                 after.append(self.attempt(line, share))
                 if len(self.tried) == _FIRST and self.is_settled():
@@ -320,10 +320,11 @@ class PolicySearch:
             if stays or not self.may_train:
                 break
         self.enter(best)
-        name, cost = best.structure, self.mean(best)
-        self.tried.append(Attempt(name, line.method, cost, self.seconds - began))
-        least = min(map(self.mean, self.best.values()))
-        self.bar.set_postfix_str(f"cost {least:.5g}, {name}", refresh=False)
+        took = self.seconds - began
+        self.tried.append(Attempt(line.structure, line.method, self.mean(best), took))
+        least = min(self.best.values(), key=self.mean)
+        shown = f"cost {self.mean(least):.5g}, {least.structure}"
+        self.bar.set_postfix_str(shown, refresh=False)
         self.bar.update(min(self.seconds, self.bar.total) - self.bar.n)
         return best
 

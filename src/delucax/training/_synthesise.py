@@ -107,8 +107,8 @@ def synthesise(
         a network alone. With `ranges` the one that corrects is recurrent, because it
         can then tell the plant from what it has observed; where the state is not
         observed, a recurrent network alone is tried. Each is trained by the gradient of
-        the rollout ([`delucax.training.ClippedSamples`][]), by that gradient damped
-        over a quarter, a tenth and a thirtieth of the episode, and by
+        the rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]), by
+        that gradient damped over a quarter, a tenth and a thirtieth of these, and by
         [`delucax.training.evolve`][], which needs no gradient. If after the first two
         trials neither they nor a plan are better than the LQR, it ends with the LQR.
     3. Refinement: the better third goes on for three times as long, until one is left.
@@ -122,6 +122,8 @@ def synthesise(
     **Arguments:**
 
     - `environment`: the environment. Its dynamics and cost must be differentiable.
+        Where a control lacks a bound on either side, a network keeps it within two
+        standard deviations of the LQR's control around zero; within 2 without an LQR.
     - `key`: a random key.
     - `budget`: seconds for all of it with compilation, 75 by default, at least 5. A
         training or comparison that has begun is finished. What is tried depends on the
@@ -170,8 +172,8 @@ def synthesise(
     depth = check_count(depth, "depth", _WHERE)
     check_bool(progress, "progress", _WHERE)
     search = PolicySearch(environment, ranges, key, float(budget), progress)
-    search.check()
     with search.bar:
+        search.check()
         try:
             search.run(width, depth)
         except KeyboardInterrupt:
@@ -180,9 +182,8 @@ def synthesise(
         costs = search.compared(policy)
     if lost := np.sum(~np.isfinite(costs["policy"])):
         warnings.warn(
-            f"{_WHERE}: no policy has a cost that is finite from every "
-            f"start; that of {structure!r}, which is returned, is not from {lost} of "
-            f"{len(costs['policy'])}.",
+            f"{_WHERE}: the cost of {structure!r}, which is returned, is not finite "
+            f"from {lost} of {len(costs['policy'])} starts.",
             stacklevel=2,
         )
     tried, plants = search.tried, search.plants()
