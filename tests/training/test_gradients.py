@@ -247,6 +247,8 @@ def test_samples_that_run_away_are_shortened():
     assert_close(value, 2 * (28 + 1e6) / 8, rtol=1e-6)
     _, slope = ClippedSamples(4)(lambda m, key: m * jnp.nan, start, jr.key(0))
     assert np.isnan(slope)
+    (value, _), _ = ClippedSamples(4)(lambda m, key: [m**2, {}], start, jr.key(0))
+    assert_close(value, 4.0)
 
 
 ESTIMATORS = [

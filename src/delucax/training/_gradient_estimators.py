@@ -82,7 +82,7 @@ class ClippedSamples(eqx.Module):
     r"""The mean of the gradients of several draws, with those that are far longer than
     the middle one shortened.
 
-    Over the keys of n samples, of which those count whose gradient `g_i` is finite,
+    Over the n samples whose cost and gradient `g_i` are finite,
 
     `g = 1 / n sum_i min(1, c / |g_i|) g_i`, `c = factor * median of |g_i|`.
 
@@ -97,9 +97,8 @@ class ClippedSamples(eqx.Module):
     - `factor`: 5 by default. A small one is biased towards what most episodes need.
 
     **Returns:** from a call, `(value, gradient)`: the mean of what the loss returned
-    for the samples that count, and a pytree like the model with `None` in the place of
-    what is not a weight.
-    Both are NaN if none does.
+    for these samples, and a pytree like the model with `None` in the place of what is
+    not a weight. Both are NaN if there is no such sample.
 
     **Raises:** `ValueError` if `samples` is below 1, or `factor` is not positive.
 
@@ -137,7 +136,7 @@ class ClippedSamples(eqx.Module):
 
         sample = lambda key: analytic(loss, model, key)
         values, gradients = jax.vmap(sample)(jr.split(key, self.samples))
-        costs = values[0] if isinstance(values, tuple) else values
+        costs = values[0] if isinstance(values, tuple | list) else values
         norms = jax.vmap(optax.tree.norm)(gradients)
         counts = jnp.isfinite(costs) & jnp.isfinite(norms)
         most = self.factor * jnp.nanmedian(jnp.where(counts, norms, jnp.nan))
