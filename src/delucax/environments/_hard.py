@@ -108,8 +108,8 @@ def cartpole_swing_up(
     `0.1 position^2 + 2 (1 - cos(angle)) + 0.01 (velocity^2 + spin^2) + 0.001 force^2`
     per step. The episode ends, at `exit_cost`, when the cart leaves the track: that is
     more than an episode of hanging costs. `encode` gives the cosine and the sine of the
-    angle in its place. The force is less than the weight of the cart, and the swing-up
-    takes two or three pushes.
+    angle in its place. The force is less than the weight of cart and pole, and the
+    swing-up takes two or three pushes.
 
     **Arguments:**
 

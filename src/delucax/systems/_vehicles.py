@@ -120,7 +120,7 @@ class DriftingCar(AbstractSystem):
     The state is (vx [m/s], vy [m/s], rate [rad/s]), the velocities those of the centre
     of mass along and across the car; the control is (force [N], steering [rad]), the
     force being that of the rear tyre along the car. The derivative of the vector field
-    is continuous.
+    is continuous but where the force takes all of the grip of that tyre.
 
     In a drift the rear tyre slides, and the car turns against its steering. This
     equilibrium is unstable: it holds only with feedback.
