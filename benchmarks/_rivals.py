@@ -30,21 +30,21 @@ SEEDS, BUDGET, TIMES = 3, 15.0, 20
 STARTS, VALIDATION, CHECKS = 32, 16, 20
 TASKS = ("pendulum", "acrobot", "cart-pole")
 OURS = "synthesise"
+PPO_OF_PENDULUM: dict[str, Any] = dict(
+    n_steps=1024,
+    gae_lambda=0.95,
+    gamma=0.9,
+    n_epochs=10,
+    ent_coef=0.0,
+    learning_rate=1e-3,
+    clip_range=0.2,
+    use_sde=True,
+    sde_sample_freq=4,
+)
 # Published for Pendulum-v1, Acrobot-v1 and CartPole-v1. `envs` and `normalised` are
 # those of the training; a rate or a range that is `falling` ends at zero.
 PUBLISHED: dict[tuple[str, str], dict[str, Any]] = {
-    ("pendulum", "PPO"): dict(
-        envs=4,
-        n_steps=1024,
-        gae_lambda=0.95,
-        gamma=0.9,
-        n_epochs=10,
-        ent_coef=0.0,
-        learning_rate=1e-3,
-        clip_range=0.2,
-        use_sde=True,
-        sde_sample_freq=4,
-    ),
+    ("pendulum", "PPO"): dict(envs=4, **PPO_OF_PENDULUM),
     ("pendulum", "SAC"): dict(learning_rate=1e-3),
     ("acrobot", "PPO"): dict(
         envs=16,
@@ -170,7 +170,7 @@ def theirs(
 def costs_of(model: Any, venv: Any, one: Any, starts: np.ndarray) -> np.ndarray:
     """The cost of an episode from each start, all stepped together."""
     plants = [one() for _ in starts]
-    seen = np.stack(
+    observations = np.stack(
         [
             plant.reset(seed=0, options={"state": x0})[0]
             for plant, x0 in zip(plants, starts, strict=True)
@@ -179,9 +179,10 @@ def costs_of(model: Any, venv: Any, one: Any, starts: np.ndarray) -> np.ndarray:
     costs, active = np.zeros(len(starts)), np.ones(len(starts), bool)
     shown = getattr(venv, "normalize_obs", lambda y: y)
     while np.any(active):
-        actions, _ = model.predict(shown(seen), deterministic=True)
+        actions, _ = model.predict(shown(observations), deterministic=True)
         for k in np.flatnonzero(active):
-            seen[k], reward, terminated, truncated, _ = plants[k].step(actions[k])
+            y, reward, terminated, truncated, _ = plants[k].step(actions[k])
+            observations[k] = y
             costs[k] -= float(reward)
             active[k] = not (terminated or truncated)
     return costs

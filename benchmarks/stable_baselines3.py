@@ -19,22 +19,11 @@ import gymnasium
 import delucax
 import delucax.interop.gymnasium  # noqa: F401, tells Gymnasium of our tasks
 from benchmarks._machine import compile_anew, describe, limit_cores
+from benchmarks._rivals import PPO_OF_PENDULUM
 
 
 OUT = Path(__file__).parent / "results" / "stable_baselines3.json"
 OURS, THEIRS = "delucax/Pendulum-v1", "Pendulum-v1"
-# Those that the authors of Stable-Baselines3 found for Pendulum-v1.
-SETTINGS: dict[str, Any] = dict(
-    n_steps=1024,
-    gae_lambda=0.95,
-    gamma=0.9,
-    n_epochs=10,
-    ent_coef=0.0,
-    learning_rate=1e-3,
-    clip_range=0.2,
-    use_sde=True,
-    sde_sample_freq=4,
-)
 
 
 def evaluated(model: Any, id: str, episodes: int) -> dict[str, float]:
@@ -79,7 +68,7 @@ def main() -> None:
         envs.seed(options.seed)
     else:
         envs = make_vec_env(OURS, n_envs=4, seed=options.seed)
-    model = PPO("MlpPolicy", envs, seed=options.seed, device="cpu", **SETTINGS)
+    model = PPO("MlpPolicy", envs, seed=options.seed, device="cpu", **PPO_OF_PENDULUM)
     before = evaluated(model, OURS, options.episodes)
     print(f"before: {before['mean']} +- {before['deviation']}", flush=True)
     start = time.perf_counter()
@@ -93,7 +82,7 @@ def main() -> None:
     content = {
         "machine": describe(),
         "versions": {name: version(name) for name in packages},
-        "settings": SETTINGS,
+        "settings": PPO_OF_PENDULUM,
         "vector": options.vector,
         "seed": options.seed,
         "steps": model.num_timesteps,
