@@ -96,13 +96,13 @@ def ablation(
 
 def _above_best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """How far each is above the best of all searches with its seed."""
-    found = []
+    made = []
     for row in rows:
         same = [r for r in rows if (r["task"], r["seed"]) == (row["task"], row["seed"])]
         costs = {f"{n}, {r['without']}": c for r in same for n, c in r["costs"].items()}
         costs["policy"] = row["costs"]["policy"]
-        found.append(row | {"above": regret(row | {"costs": costs})})
-    return found
+        made.append(row | {"above": regret(row | {"costs": costs})})
+    return made
 
 
 if __name__ == "__main__":

@@ -54,10 +54,10 @@ class Board:
     @functools.cached_property
     def tasks(self) -> dict[str, list[str]]:
         """The tasks that were run, in the groups of the page."""
-        found: dict[str, list[str]] = {name: [] for name in GROUPS}
+        groups: dict[str, list[str]] = {name: [] for name in GROUPS}
         for task in sorted({task for task, method in self.costs if method == "zero"}):
-            found[self._group(task)].append(task)
-        return {name: tasks for name, tasks in found.items() if tasks}
+            groups[self._group(task)].append(task)
+        return {name: tasks for name, tasks in groups.items() if tasks}
 
     @property
     def names(self) -> list[str]:
@@ -126,8 +126,8 @@ class Board:
     def ranked(self, task: str) -> list[tuple[float, str]]:
         """The controllers that suit from the best on, the simplest first where they
         are as good, to a tenth of a percent."""
-        found = [(self.excess(task, m), k, m) for k, m in enumerate(self.methods)]
-        order = sorted((round(e, 3), k, m) for e, k, m in found if e is not None)
+        each = [(self.excess(task, m), k, m) for k, m in enumerate(self.methods)]
+        order = sorted((round(e, 3), k, m) for e, k, m in each if e is not None)
         return [(excess, method) for excess, _, method in order]
 
 
@@ -146,10 +146,10 @@ def board_of(results: Results, synthesised: Iterable[str] = ()) -> Board:
     costs, speeds = {}, {}
     for place, rows in cases.items():
         # A case that failed has no cost, and one that does not suit none either.
-        found = [row.get("trainings") or [row.get("cost")] for row in rows]
-        if any(None in trainings for trainings in found):
+        starts = [row.get("trainings") or [row.get("cost")] for row in rows]
+        if any(None in trainings for trainings in starts):
             continue
-        costs[place] = np.array(found, float).T
+        costs[place] = np.array(starts, float).T
         times = [row["us_per_step"] for row in rows if row["us_per_step"]]
         if times:
             speeds[place] = float(np.median(times))
@@ -157,8 +157,8 @@ def board_of(results: Results, synthesised: Iterable[str] = ()) -> Board:
     for row in map(json.loads, synthesised):
         if "scoreboard" in row:
             own.setdefault(row["task"], []).append(row["scoreboard"])
-    for task, found in own.items():
-        costs[task, OWN] = np.array(found, float)
+    for task, seeds in own.items():
+        costs[task, OWN] = np.array(seeds, float)
     costs = {place: np.where(np.isfinite(c), c, np.inf) for place, c in costs.items()}
     ran = {task for task, method in costs if method == "zero"}
     return Board(costs, speeds, frozenset(filter(is_disturbed, ran)))

@@ -47,12 +47,12 @@ def case(task: str, seed: int) -> dict[str, Any]:
     from delucax.studies._scoreboard import costs_of, task_of
     from delucax.training import synthesise
 
-    found = synthesise(task_of(task), key=jax.random.key(seed), progress=False)
+    made = synthesise(task_of(task), key=jax.random.key(seed), progress=False)
     seconds = time.perf_counter() - began
-    costs = {name: cost.tolist() for name, cost in found.costs.items()}
-    tried = [attempt._asdict() for attempt in found.tried]
-    about = {"structure": found.structure, "seconds": seconds}
-    about["scoreboard"] = costs_of(task, found.policy)
+    costs = {name: cost.tolist() for name, cost in made.costs.items()}
+    tried = [attempt._asdict() for attempt in made.tried]
+    about = {"structure": made.structure, "seconds": seconds}
+    about["scoreboard"] = costs_of(task, made.policy)
     return about | {"costs": costs, "tried": tried}
 
 
@@ -77,12 +77,13 @@ def regret(row: dict[str, Any], of: str = "policy") -> float:
     controller."""
     from delucax.studies._scoreboard import is_disturbed
 
-    costs = {name: np.array(cost, float) for name, cost in row["costs"].items()}
-    finite = {n: np.where(np.isfinite(c), c, np.inf) for n, c in costs.items()}
+    each = {name: np.array(cost, float) for name, cost in row["costs"].items()}
+    costs = {n: np.where(np.isfinite(c), c, np.inf) for n, c in each.items()}
     if is_disturbed(row["task"]):
-        best = min(np.mean(cost) for name, cost in finite.items() if name != "plan")
+        rivals = [c for name, c in costs.items() if not name.startswith("plan")]
+        best = min(map(np.mean, rivals))
     else:
-        best = np.mean(np.min(list(finite.values()), axis=0))
+        best = np.mean(np.min(list(costs.values()), axis=0))
     return float((np.mean(costs[of]) - best) / abs(best))
 
 
@@ -123,19 +124,19 @@ def tasks(
     only: list[str], at_once: int = 1, seeds: int = SEEDS
 ) -> list[dict[str, Any]]:
     """Run what is missing, and print what all reach."""
-    found = table(run(only, seeds, at_once))
-    print(found.to_string(index=False, float_format="%.3g"))
-    for name, group in found.groupby("kind"):
+    reached = table(run(only, seeds, at_once))
+    print(reached.to_string(index=False, float_format="%.3g"))
+    for name, group in reached.groupby("kind"):
         within = WITHIN[str(name)]
         near = group["above best"] <= within
         simple = near & group["policy"].isin(["LQR", "zero"])
         print(f"{name}: {near.sum()} of {len(group)} within {within:.0%}", end="")
         print(f", {simple.sum()} of them by LQR or no control alone")
-    worse = found["worst beside floor"] > AS_GOOD
-    slow = found["seconds"] > SECONDS
-    print(f"a seed is worse than the floor on: {', '.join(found[worse].task) or '-'}")
-    print(f"above {SECONDS:g} s: {', '.join(found[slow].task) or '-'}")
-    return found.to_dict("records")
+    worse = reached["worst beside floor"] > AS_GOOD
+    slow = reached["seconds"] > SECONDS
+    print(f"a seed is worse than the floor on: {', '.join(reached[worse].task) or '-'}")
+    print(f"above {SECONDS:g} s: {', '.join(reached[slow].task) or '-'}")
+    return reached.to_dict("records")
 
 
 if __name__ == "__main__":

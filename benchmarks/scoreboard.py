@@ -70,8 +70,9 @@ def best_table(board: Board) -> str:
     """For each task the best controllers, in a table for narrow screens."""
     body = []
     for task in board.names:
-        zero = board.excess(task, "zero")
-        ranked = [(e, method) for e, method in board.ranked(task) if e < zero][:BEST]
+        ranked = board.ranked(task)
+        (zero,) = (excess for excess, method in ranked if method == "zero")
+        ranked = [(e, method) for e, method in ranked if e < zero][:BEST]
         named = [f"{short(method)} {percent(excess)}" for excess, method in ranked]
         body.append([f"`{task}`", ", ".join(named) or "none better than zero control"])
     return _markdown(["task", "best controllers"], body, 2)
@@ -107,9 +108,9 @@ def how_often(board: Board) -> str:
     """On how many tasks each method is how near."""
     body = []
     for method in board.methods:
-        found = [e for t in board.names if (e := board.excess(t, method)) is not None]
-        counts = [sum(e <= limit for e in found) for limit in (0.01, NEAR, 0.25)]
-        row = [short(method), len(found), *counts, percent(float(np.median(found)))]
+        each = [e for t in board.names if (e := board.excess(t, method)) is not None]
+        counts = [sum(e <= limit for e in each) for limit in (0.01, NEAR, 0.25)]
+        row = [short(method), len(each), *counts, percent(float(np.median(each)))]
         body.append([*map(str, row)])
     near = [f"within {limit}%" for limit in (1, round(100 * NEAR), 25)]
     return _markdown(["", "tasks", *near, "median"], body, 1)
@@ -131,10 +132,10 @@ def _by_task(
     the plan and the best known at its end."""
     body = []
     for task in board.names:
-        found = [of(task, method) for method in methods]
-        if all(value is None for value in found):
+        values = [of(task, method) for method in methods]
+        if all(value is None for value in values):
             continue
-        row = [f"`{task}`", *map(show, found)]
+        row = [f"`{task}`", *map(show, values)]
         if best:
             row += [_plan(board, task), _number(board.best(task))]
         body.append(row)
@@ -204,18 +205,16 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     keep_programs()
     begin = time.perf_counter()
-    if options.table:
-        results = Results.read(STORE)
-    else:
-        results = experiments.run(
+    if not options.table:
+        experiments.run(
             scoreboard,
             store=STORE,
             workers=WORKERS,
             select=options.k,
             fresh=options.fresh,
         )
-        # With what was stored before.
-        results = Results.read(STORE)
+    # With what was stored before.
+    results = Results.read(STORE)
     for row in {row["case"]: row for row in results.failed}.values():
         print(f"FAILED {row['case']}: {row['error'].splitlines()[0]}", file=sys.stderr)
     board = stored(results)
