@@ -69,5 +69,5 @@ def _row(module: str, case: Row) -> Row | str:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         return (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-    found = json.loads(done.stdout.splitlines()[-1])
-    return case | found | {"machine": describe()}
+    given = json.loads(done.stdout.splitlines()[-1])
+    return case | given | {"machine": describe()}

@@ -89,19 +89,19 @@ def case(task: str, precision: str) -> dict[str, Any]:
     env = task_of(task)
     x0 = jax.vmap(env.reset)(jr.split(jr.key(2**20), STARTS))
     moved = jnp.nextafter(x0, jnp.full_like(x0, jnp.inf))
-    found = {}
+    made = {}
     for name, policy in policies(env).items():
         with tempfile.TemporaryDirectory() as folder:
             size = env.dynamics.observation_size
             dlx.export.c(policy, folder, name="law", example=jnp.zeros(size))
             in_c = dlx.export.load(folder)
         cost = total(env, policy, x0)
-        found[name] = {
+        made[name] = {
             "cost": cost / STARTS,
             "difference": off(total(env, in_c, x0), cost),
             "rounding": off(total(env, policy, moved), cost),
         }
-    return {"structures": found}
+    return {"structures": made}
 
 
 def total(env: Any, policy: Any, starts: Any) -> float:
@@ -111,12 +111,12 @@ def total(env: Any, policy: Any, starts: Any) -> float:
     return float(np.sum(np.asarray(runs, float)))
 
 
-def off(found: float, expected: float) -> float:
+def off(cost: float, expected: float) -> float:
     """Their difference, relative to the expected one."""
-    return 0.0 if found == expected else abs(found - expected) / abs(expected)
+    return 0.0 if cost == expected else abs(cost - expected) / abs(expected)
 
 
-def exported(only: list[str]) -> pd.DataFrame:
+def exported(only: list[str], at_once: int = 1) -> pd.DataFrame:
     """Run what is missing, and print what all reach."""
     cases = [
         {"task": task, "precision": precision}
@@ -128,11 +128,11 @@ def exported(only: list[str]) -> pd.DataFrame:
         each = row["structures"].items()
         return ", ".join(f"{name} {s['difference']:.1e}" for name, s in each)
 
-    rows = _cases.run("benchmarks._exported_policies", STORE, cases, said)
+    rows = _cases.run("benchmarks._exported_policies", STORE, cases, said, at_once)
     table = pd.DataFrame(
-        {"task": row["task"], "precision": row["precision"], "structure": name} | found
+        {"task": row["task"], "precision": row["precision"], "structure": name} | of
         for row in rows
-        for name, found in row["structures"].items()
+        for name, of in row["structures"].items()
     )
     print(table.to_string(index=False, float_format="%.2g"))
     for precision, group in table.groupby("precision"):

@@ -125,25 +125,25 @@ def corrected(env: Any, with_memory: bool, key: Any) -> Any:
 def case(law: str, seed: int) -> dict[str, Any]:
     """What one law does on all pairs, in this process."""
     began, env, key = time.perf_counter(), cartpole(), jr.key(seed)
-    found: dict[str, Any] = {}
+    about: dict[str, Any] = {}
     if law == "synthesise":
         made = dlx.training.synthesise(env, key=key, ranges=RANGES, progress=False)
         policy, table = made.policy, made.to_pandas()
-        found["structure"] = made.structure
-        found["report"] = table.to_dict("index")
-        found["tried"] = [attempt._asdict() for attempt in made.tried]
+        about["structure"] = made.structure
+        about["report"] = table.to_dict("index")
+        about["tried"] = [attempt._asdict() for attempt in made.tried]
     elif law in TRAINED:
         policy = corrected(env, law == "memory", key)
+    elif law == "LQR":
+        policy = dlx.controllers.local_lqr(env)
     else:
-        policy = {"zero": dlx.controllers.Zero(1)}.get(law)
+        policy = dlx.controllers.Zero(1)
     seconds = time.perf_counter() - began
     of_each = {"LQR of each plant": own_lqr, "MPC of each plant": own_mpc}
-    if law == "LQR":
-        policy = dlx.controllers.local_lqr(env)
     failed, costs = tested(env, of_each.get(law, lambda plant: policy))
     failed = "".join(str(int(one)) for one in np.asarray(failed))
     middle = float(np.median(np.asarray(costs)))
-    return found | {"seconds": seconds, "failed": failed, "median cost": middle}
+    return about | {"seconds": seconds, "failed": failed, "median cost": middle}
 
 
 def failures(row: dict[str, Any]) -> np.ndarray:
@@ -151,7 +151,7 @@ def failures(row: dict[str, Any]) -> np.ndarray:
     return np.array([int(one) for one in row["failed"]])
 
 
-def family(seeds: int = SEEDS) -> pd.DataFrame:
+def family(at_once: int = 1, seeds: int = SEEDS) -> pd.DataFrame:
     """Run what is missing, and print what all reach."""
     cases = [{"law": law, "seed": 0} for law in LAWS]
     cases += [{"law": law, "seed": s} for s in range(seeds) for law in TRAINED]
@@ -159,7 +159,7 @@ def family(seeds: int = SEEDS) -> pd.DataFrame:
     def said(row):
         return f"{np.mean(failures(row)):.1%} fail, in {row['seconds']:.0f} s"
 
-    rows = _cases.run("benchmarks._family", STORE, cases, said)
+    rows = _cases.run("benchmarks._family", STORE, cases, said, at_once)
     by_law = {law: [row for row in rows if row["law"] == law] for law in LAWS + TRAINED}
     mpc = failures(by_law["MPC of each plant"][0])
     made = []

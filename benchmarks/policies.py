@@ -123,8 +123,8 @@ def by_ppo(env, keys, steps, width=32, depth=1, rate=3e-3, discount=0.95, epochs
     optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule))
     make = lambda key: actor_critic(env, width, depth, key=key)
     models = eqx.filter_vmap(make)(keys)
-    found = fit(ppo, models, optimiser, count, key=keys, **QUIETLY)
-    return found.model.policy.base, batch * horizon * (rounds + 1)
+    fitted = fit(ppo, models, optimiser, count, key=keys, **QUIETLY)
+    return fitted.model.policy.base, batch * horizon * (rounds + 1)
 
 
 def by_shac(env, keys, steps, batch=16, window=10, rate=1e-2):
@@ -136,9 +136,9 @@ def by_shac(env, keys, steps, batch=16, window=10, rate=1e-2):
     schedule = optax.linear_schedule(rate, rate / 10, count)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
     models = eqx.filter_vmap(lambda key: actor_critic(env, 32, 1, key=key))(keys)
-    found = fit(shac, models, optimiser, count, key=keys, **QUIETLY)
+    fitted = fit(shac, models, optimiser, count, key=keys, **QUIETLY)
     used = batch * horizon * (count + (count - 1) // 10 + 2)
-    return found.model.policy.base, used
+    return fitted.model.policy.base, used
 
 
 def by_gradient(env, keys, steps, batch=8, horizon=100, rate=1e-2):
@@ -150,8 +150,8 @@ def by_gradient(env, keys, steps, batch=8, horizon=100, rate=1e-2):
     optimiser = optax.adam(optax.cosine_decay_schedule(rate, count))
     make = lambda key: dlx.controllers.mlp_policy(env, width=32, depth=1, key=key)
     models = eqx.filter_vmap(make)(keys)
-    found = fit(loss, models, optimiser, count, key=keys, **QUIETLY)
-    return found.model, batch * horizon * count
+    fitted = fit(loss, models, optimiser, count, key=keys, **QUIETLY)
+    return fitted.model, batch * horizon * count
 
 
 METHODS = {"PPO": by_ppo, "SHAC": by_shac, "analytic": by_gradient}
@@ -174,7 +174,7 @@ TUNED_AT = 160_000
 
 def tuning(options: argparse.Namespace) -> dict[str, Any]:
     """The cost of each setting, and the best one of each method."""
-    env, found = dlx.make("pendulum"), {}
+    env, made = dlx.make("pendulum"), {}
     keys = jr.split(jr.key(FIRST_SEED + 2), 2 if options.small else 5)
     for name, train in METHODS.items():
         rows = []
@@ -184,13 +184,13 @@ def tuning(options: argparse.Namespace) -> dict[str, Any]:
             cost = np.asarray(evaluated(env, policies)[1])
             rows.append(setting | {"cost": middle(np.where(cost < 1e9, cost, 1e9))})
             print(f"  {name}: {rows[-1]}", flush=True)
-        found[name] = rows
-    return found
+        made[name] = rows
+    return made
 
 
-def best(found: dict[str, Any], name: str) -> dict[str, Any]:
+def best(tuned: dict[str, Any], name: str) -> dict[str, Any]:
     """The setting that was best."""
-    costs = [row["cost"] for row in found[name]]
+    costs = [row["cost"] for row in tuned[name]]
     return SPACE[name][int(np.argmin(costs))]
 
 
@@ -203,14 +203,14 @@ def swing_up(options: argparse.Namespace) -> dict[str, Any]:
     """The analytic gradient and PPO on ten seeds: at least 95 of 100 starts."""
     env = dlx.make("pendulum")
     seeds = 2 if options.small else 10
-    found, taken = [], []
+    models, taken = [], []
     for seed in range(seeds):
         begin = time.perf_counter()
         key = jr.key(FIRST_SEED + seed)
         model = train_swing_up(env, key=key, progress=False).model
-        found.append(jax.block_until_ready(model))
+        models.append(jax.block_until_ready(model))
         taken.append(time.perf_counter() - begin)
-    held = [int(held_by(env, jax.tree.map(one_more, m))[0]) for m in found]
+    held = [int(held_by(env, jax.tree.map(one_more, m))[0]) for m in models]
     # The first one compiles.
     rows = [
         {
@@ -292,11 +292,11 @@ def draw(rows: list[dict[str, Any]]) -> None:
     plt.rcParams["svg.hashsalt"] = "delucax"
     figure, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
     table = pd.DataFrame(rows)
-    for name, found in table[table["budget"] > 0].groupby("method", sort=False):
-        off = [found["cost, IQM"] - found["low"], found["high"] - found["cost, IQM"]]
+    for name, group in table[table["budget"] > 0].groupby("method", sort=False):
+        off = [group["cost, IQM"] - group["low"], group["high"] - group["cost, IQM"]]
         ax.errorbar(
-            found["steps"],
-            found["cost, IQM"],
+            group["steps"],
+            group["cost, IQM"],
             off,
             fmt="o-",
             ms=3,
@@ -328,37 +328,37 @@ def main() -> None:
     row_by_row = {
         "tasks": lambda: tasks(options.task, options.at_once, **seeds),
         "ablation": lambda: ablation(options.task, options.at_once, **seeds),
-        "family": lambda: family(**seeds),
+        "family": lambda: family(options.at_once, **seeds),
         "rivals": lambda: rivals(options.task, options.at_once, **seeds),
-        "export": lambda: exported(options.task),
+        "export": lambda: exported(options.task, options.at_once),
     }
     for part in options.part or PARTS:
         print(f"\n== {part}", flush=True)
         if part in row_by_row:
             row_by_row[part]()
             continue
-        found = runs[part](options)
+        result = runs[part](options)
         if options.small:
             continue
         if part != "learning":
-            updated(RESULTS, lambda old, p=part, f=found: about | {p: f})
+            updated(RESULTS, lambda old, p=part, r=result: about | {p: r})
             continue
         content = updated(
-            RESULTS, lambda old, f=found: about | {"learning": both(old, f)}
+            RESULTS, lambda old, r=result: about | {"learning": both(old, r)}
         )
         draw(content["learning"]["rows"])
 
 
-def both(content: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """What was found, with the budgets that were run before."""
-    ran = {row["budget"] for row in found["rows"]}
+def both(content: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """The new rows, with the budgets that were run before."""
+    ran = {row["budget"] for row in new["rows"]}
     old = [
         row
         for row in content.get("learning", {}).get("rows", [])
         if row["budget"] not in ran
     ]
-    rows = sorted([*old, *found["rows"]], key=lambda row: row["budget"])
-    return found | {"rows": rows}
+    rows = sorted([*old, *new["rows"]], key=lambda row: row["budget"])
+    return new | {"rows": rows}
 
 
 if __name__ == "__main__":
