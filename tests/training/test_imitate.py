@@ -58,6 +58,17 @@ def test_later_rounds_are_on_the_states_of_the_policy():
     assert two.model.push < one.model.push
 
 
+def test_steps_without_a_finite_control_do_not_count():
+    class Lost(dlx.AbstractController):
+        def __call__(self, t, y, state):
+            return jnp.where(t > 10 * env().dt, jnp.nan, -y[:1]), state
+
+    policy = dlx.controllers.Linear(jnp.zeros((1, 2)))
+    options = dict(rounds=2, episodes=4, steps=100, progress=False)
+    fitted = imitate(env(), Lost(), policy, key=KEY, **options)
+    assert fitted.model.K[0, 0] > 0.1
+
+
 @pytest.mark.parametrize(
     ("policy", "options", "match"),
     [

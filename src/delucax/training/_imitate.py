@@ -34,7 +34,6 @@ class _Likeness(eqx.Module):
 
         times, observations, controls, weights = batch
         distances = jax.vmap(distance)(times, observations, controls)
-        # A step that does not count may hold NaN.
         distances = jnp.where(weights > 0, distances, 0)
         return jnp.sum(distances) / jnp.maximum(jnp.sum(weights), 1)
 
@@ -129,7 +128,12 @@ def imitate(
         run_key, fit_key = jr.split(jr.fold_in(key, k))
         keys = jr.split(run_key, episodes)
         driver = policy if k else expert
-        new = jax.device_get(_watched(environment, driver, expert, keys, horizon))
+        *new, counts = jax.device_get(
+            _watched(environment, driver, expert, keys, horizon)
+        )
+        # A step that does not count may hold NaN, and so would the gradient: 0 times
+        # NaN is NaN.
+        new = [*(np.where(counts > 0, r.T, 0).T for r in new), counts]
         pairs = zip(rows or new, new, strict=True)
         rows = new if rows is None else [np.concatenate(pair) for pair in pairs]
         if loss is None:
