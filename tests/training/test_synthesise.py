@@ -12,7 +12,9 @@ from helpers import once
 
 import delucax as dlx
 from delucax.training import synthesise
+from delucax.training._episode_costs import tamed
 from delucax.training._policy_search import _Line, PolicySearch
+from delucax.training._structures import structures
 
 
 KEY = jax.random.key(0)
@@ -102,6 +104,36 @@ def test_a_policy_that_seldom_fails_is_better_than_one_that_never_works():
     assert search.chosen() == ("network", net)
 
 
+def test_a_reward_is_a_large_usual_cost():
+    """Of a mountain car: zero control costs nothing, and a little effort little."""
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    for name, cost in ("zero", 0.0), ("LQR", 1e-5), ("network", -97.0):
+        search.enter(known(name, dlx.controllers.Zero(1), cost, cost))
+    assert search.usual == 97.0
+    # The largest number is not too large for a small cost.
+    assert np.isfinite(tamed(jnp.array([1.0, jnp.inf]), 1e-3)).all()
+
+
+def test_each_kind_of_plant_gets_its_structures():
+    class Position(dlx.systems.DoubleIntegrator):
+        def observe(self, t, x):
+            return x[:1]
+
+    lqr = dlx.controllers.local_lqr(env())
+    names = lambda env, *given: set(structures(env, *given, 4, 1, KEY))
+    assert names(env(), lqr, False) == {"LQR + network", "network"}
+    assert names(env(), lqr, True) == {"LQR + memory", "network"}
+    assert names(env(), None, True) == {"memory", "network"}
+    hidden = dlx.Environment(dlx.Discretized(Position(), dt=0.1), env().cost)
+    assert names(hidden, None, False) == {"memory"}
+
+
+def test_a_range_reaches_from_a_bound_on_one_side():
+    task = dataclasses.replace(env(), control_bounds=(jnp.array(5.0), jnp.inf))
+    low, high = structures(task, None, False, 4, 1, KEY)["network"].bounds
+    assert low == 5 and 5 < high < jnp.inf
+
+
 @pytest.mark.parametrize("better", [0.0, 0.1])
 def test_it_ends_where_the_regulator_is_enough(monkeypatch, better):
     module = sys.modules[PolicySearch.__module__]
@@ -110,6 +142,9 @@ def test_it_ends_where_the_regulator_is_enough(monkeypatch, better):
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     search.enter(known("LQR", dlx.controllers.Zero(1), 1.0, 1.0))
     assert search.is_settled() == (not better)
+    # Nor is it where the LQR fails and something else does not.
+    monkeypatch.setattr(module, "costs_of", lambda *_: np.array([1.0, np.inf]))
+    assert not search.is_settled()
     search.enter(known("network", dlx.controllers.Zero(1), 0.9, 0.9))
     assert not search.is_settled()
 

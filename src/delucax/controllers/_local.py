@@ -154,7 +154,7 @@ def local_mpc(
 
     **Returns:** a [`delucax.controllers.MPC`][].
 
-    **Raises:** `ValueError` if the state is not observed, and as
+    **Raises:** `ValueError` if the observation has not the size of the state, and as
     [`delucax.controllers.MPC`][] does.
 
     !!! example

@@ -24,7 +24,8 @@ class Residual(AbstractController):
     Both are told the control that was applied in all.
     [`delucax.training.fit`][] trains the correction alone by `trainable="correction"`.
 
-    **Raises:** `ValueError` if one of the two is not a controller, or bounds cross.
+    **Raises:** `ValueError` if one of the two is not a controller, bounds cross, or in
+    a call the two controls differ in size.
 
     Source: Johannink et al., 2019; Silver, Allen, Tenenbaum and Kaelbling, 2018
     (residual policy learning).
@@ -63,6 +64,11 @@ class Residual(AbstractController):
         if self.bounds is not None:
             u = clip(u, *self.bounds)
         change, correction_state = self.correction(t, y, correction_state)
+        if change.shape != u.shape:
+            raise ValueError(
+                "Residual: base and correction must give controls of one size, got "
+                f"shapes {u.shape} and {change.shape}."
+            )
         return (u + change).astype(y.dtype), (base_state, correction_state)
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:

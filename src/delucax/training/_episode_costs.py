@@ -30,7 +30,9 @@ def tamed(costs: Array, usual: Any) -> Array:
     """
     far = _FAR * usual
     costs = jnp.nan_to_num(jnp.where(jnp.isnan(costs), jnp.inf, costs))
-    return jnp.sign(costs) * far * jnp.log1p(jnp.abs(costs) / far)
+    # The ratio of the largest number to a small cost overflows.
+    ratio = jnp.nan_to_num(jnp.abs(costs) / far)
+    return jnp.sign(costs) * far * jnp.log1p(ratio)
 
 
 class TamedCost(eqx.Module):

@@ -84,7 +84,8 @@ class ClippedSamples(eqx.Module):
 
     Over the n samples whose cost and gradient `g_i` are finite,
 
-    `g = 1 / n sum_i min(1, c / |g_i|) g_i`, `c = factor * median of |g_i|`.
+    `g = 1 / n sum_i min(1, c / |g_i|) g_i`, `c = factor * median of |g_i|`
+    (of those that are not zero, if most are).
 
     A plant that runs away in one episode of thirty has a gradient that is larger than
     all others together, and points nowhere; or it is not finite, which would end the
@@ -139,7 +140,10 @@ class ClippedSamples(eqx.Module):
         costs = values[0] if isinstance(values, tuple | list) else values
         norms = jax.vmap(optax.tree.norm)(gradients)
         counts = jnp.isfinite(costs) & jnp.isfinite(norms)
-        most = self.factor * jnp.nanmedian(jnp.where(counts, norms, jnp.nan))
+        # Where most are zero, such as those of episodes that have ended, of the rest.
+        middle = lambda kept: jnp.nanmedian(jnp.where(kept, norms, jnp.nan))
+        usual = middle(counts)
+        most = self.factor * jnp.where(usual > 0, usual, middle(counts & (norms > 0)))
         shares = jnp.where(norms > most, most / norms, 1)
 
         def mean(samples, shares):

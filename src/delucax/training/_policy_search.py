@@ -105,6 +105,13 @@ class _Line(NamedTuple):
     costs: np.ndarray | None = None
 
 
+def _is_better(other: Any, own: Any) -> bool:
+    """Whether a mean cost is so much less than another that it is worth the change."""
+    if not np.isfinite(own):
+        return bool(np.isfinite(other))
+    return bool(own - other > _WORTH * abs(own))
+
+
 class PolicySearch:
     """The best policy so far of each structure, and what was tried, within a time."""
 
@@ -129,12 +136,13 @@ class PolicySearch:
         self.lqr: LQR | None = None
         self.steps = min(environment.horizon, _LONGEST)
         lasting = self.steps * float(environment.dt)
-        memories = {f"gradient, {lasting * m:.2g} s": lasting * m for m in _MEMORIES}
-        # Seconds over which a gradient is forgotten.
-        self.methods = memories | {"gradient": jnp.inf, "evolution": None}
+        unit, times = environment.dynamics.time_unit, [lasting * m for m in _MEMORIES]
+        # The time over which a gradient is forgotten.
+        damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
+        self.methods = damped | {"gradient": jnp.inf, "evolution": None}
         self.rate = _RATE
-        # The least median cost so far.
-        self.usual = _ANY
+        # The least median cost so far, and its size.
+        self.least, self.usual = np.inf, _ANY
         # Of the first round of an attempt, which compiles.
         self.longest = 0.0
 
@@ -244,15 +252,14 @@ class PolicySearch:
             if known
             else costs_of_mpc(env, self.ranges, self.lqr, keys)
         )
-        return bool(own - other <= _WORTH * abs(own))
+        return bool(np.isfinite(own)) and not _is_better(other, own)
 
     def trained(self, line: _Line) -> AbstractController:
         """The policy of a line after a round of its method."""
         env, policy, method = self.environment, line.policy, line.method
         options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
-        # The LQR inside a policy stays as it is.
-        is_residual = isinstance(policy, Residual)
-        options["trainable"] = "correction" if is_residual else None
+        if isinstance(policy, Residual):
+            options["trainable"] = "correction"  # the LQR stays as it is
         if method == "imitation":
             expert = local_mpc(env, self.lqr, throw=False)
             return imitate(env, expert, policy, **options).model
@@ -302,7 +309,7 @@ class PolicySearch:
         keys = self.keys(_CHOICE)[:_COMPARISON]
         expert = np.mean(costs_of_mpc(self.environment, None, self.lqr, keys))
         own = np.mean(costs_of(self.environment, None, policy, keys))
-        return bool(own - expert > _WORTH * abs(own))
+        return _is_better(expert, own)
 
     def attempt(self, line: _Line, share: float) -> _Line:
         """The line after rounds of its method, for a share of the budget after the
@@ -340,10 +347,11 @@ class PolicySearch:
             line = line._replace(costs=self.costs(line.policy))
         name = line.structure
         self.best[name] = min(self.best.get(name, line), line, key=self.score)
-        costs = np.abs(self.best[name].costs)
-        middle = np.median(np.where(np.isfinite(costs), costs, np.inf))
-        if middle > 0:
-            self.usual = min(self.usual, middle)
+        costs = self.best[name].costs
+        middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
+        # With its sign: a reward, such as that for an arrival, is a large usual cost.
+        if middle != 0 and middle < self.least:
+            self.least, self.usual = middle, abs(middle)
 
     def score(self, line: _Line) -> float:
         """The mean of the tamed costs, by which policies are chosen."""
@@ -383,10 +391,8 @@ class PolicySearch:
         """The costs of the policy and of others, from starts of their own."""
         env, ranges, keys = self.environment, self.ranges, self.comparison
         floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
-        costs = {
-            name: costs_of(env, ranges, one, keys)
-            for name, one in {"policy": policy, **floor}.items()
-        }
+        laws = {"policy": policy, **floor}
+        costs = {name: costs_of(env, ranges, law, keys) for name, law in laws.items()}
         if env.dynamics.observes_state and self.may_compare:
             costs["MPC"] = costs_of_mpc(env, ranges, self.lqr, keys)
         if self.may_compare:

@@ -28,9 +28,9 @@ def structures(
     depth: int,
     key: PRNGKey,
 ) -> dict[str, AbstractController]:
-    """Policies to train, by name: a network that corrects the LQR, with a memory if the
-    plant is one of a family; a network; where the state is not observed, one with a
-    memory alone."""
+    """Policies to train, by name: a network that corrects the LQR; and a network. Of a
+    family of plants the first has a memory, also without an LQR; where the state is
+    not observed there is one with a memory alone."""
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds
     low, high = (jnp.full(m, -jnp.inf), jnp.full(m, jnp.inf))
@@ -48,7 +48,13 @@ def structures(
     # Where a control has no bounds, its range is that of the LQR, or of order one.
     reach = np.ones(m) if lqr is None else _spread(np.asarray(visits[1][1]), 1e-3)
     half = jnp.where(bounded, (high - low) / 2, 2 * reach)
-    ends = jnp.where(bounded, low, -half), jnp.where(bounded, high, half)
+    # From a bound on one side the range goes to the other.
+    below = jnp.where(jnp.isfinite(high), high - 2 * half, -half)
+    above = jnp.where(jnp.isfinite(low), low + 2 * half, half)
+    ends = (
+        jnp.where(jnp.isfinite(low), low, below),
+        jnp.where(jnp.isfinite(high), high, above),
+    )
 
     size = environment.feature_size
     network = lambda bounds, key: MLP(
@@ -69,6 +75,8 @@ def structures(
         correction = eqx.tree_at(last, correction, zero)
         name = "LQR + memory" if is_family else "LQR + network"
         made[name] = Residual(lqr, correction, bounds)
+    elif is_family:
+        made["memory"] = memory(ends, residual_key)
     return made | {"network": network(ends, plain_key)}
 
 
