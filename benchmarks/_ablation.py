@@ -71,9 +71,7 @@ def case(task: str, without: str, seed: int) -> dict[str, Any]:
     return {"structure": structure, "costs": costs, "seconds": seconds}
 
 
-def ablation(
-    only: list[str], at_once: int = 1, seeds: int = SEEDS
-) -> list[dict[str, Any]]:
+def ablation(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
     """Run what is missing; a row for each task, a column for each part left out."""
     cases = [
         {"task": task, "without": without, "seed": seed}
@@ -91,7 +89,7 @@ def ablation(
     table = table[[name for name in WITHOUT if name in table]]
     print("Above the best known of each start, median of the seeds")
     print(table.to_string(float_format="{:+.1%}".format))
-    return table.reset_index().to_dict("records")
+    return {"seeds": seeds, "rows": table.reset_index().to_dict("records")}
 
 
 def _above_best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

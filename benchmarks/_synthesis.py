@@ -120,23 +120,25 @@ def kind(task: str) -> str:
     return "events" if task_of(task).dynamics.event_names else "usual"
 
 
-def tasks(
-    only: list[str], at_once: int = 1, seeds: int = SEEDS
-) -> list[dict[str, Any]]:
+def tasks(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
     """Run what is missing, and print what all reach."""
     reached = table(run(only, seeds, at_once))
     print(reached.to_string(index=False, float_format="%.3g"))
+    summary = []
     for name, group in reached.groupby("kind"):
         within = WITHIN[str(name)]
         near = group["above best"] <= within
         simple = near & group["policy"].isin(["LQR", "zero"])
+        counts = {"tasks": len(group), "near": near.sum(), "by LQR": simple.sum()}
+        summary.append({"kind": name} | {k: int(v) for k, v in counts.items()})
         print(f"{name}: {near.sum()} of {len(group)} within {within:.0%}", end="")
         print(f", {simple.sum()} of them by LQR or no control alone")
     worse = reached["worst beside floor"] > AS_GOOD
     slow = reached["seconds"] > SECONDS
     print(f"a seed is worse than the floor on: {', '.join(reached[worse].task) or '-'}")
     print(f"above {SECONDS:g} s: {', '.join(reached[slow].task) or '-'}")
-    return reached.to_dict("records")
+    about = {"worse than the floor": int(worse.sum()), "summary": summary}
+    return about | {"rows": reached.to_dict("records")}
 
 
 if __name__ == "__main__":

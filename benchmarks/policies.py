@@ -335,7 +335,10 @@ def main() -> None:
     for part in options.part or PARTS:
         print(f"\n== {part}", flush=True)
         if part in row_by_row:
-            row_by_row[part]()
+            reached = row_by_row[part]()
+            # A selection is not what the pages tell of.
+            if not options.task and options.seeds is None:
+                updated(RESULTS, lambda old, p=part, r=reached: about | {p: r})
             continue
         result = runs[part](options)
         if options.small:

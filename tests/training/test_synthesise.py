@@ -12,8 +12,9 @@ from helpers import once
 
 import delucax as dlx
 from delucax.training import synthesise
+from delucax.training._attempt import Line
 from delucax.training._episode_costs import tamed
-from delucax.training._policy_search import _Line, PolicySearch
+from delucax.training._policy_search import PolicySearch
 from delucax.training._structures import structures
 
 
@@ -88,7 +89,7 @@ def test_a_network_where_the_regulator_is_worse():
 
 
 def known(name, policy, *costs):
-    return _Line(name, "none", policy, np.array(costs))
+    return Line(name, "none", policy, np.array(costs))
 
 
 def test_a_policy_that_seldom_fails_is_better_than_one_that_never_works():

@@ -2,6 +2,7 @@
 
 from . import sysid as sysid
 from ._actor_critic import actor_critic as actor_critic, ActorCritic as ActorCritic
+from ._attempt import Attempt as Attempt
 from ._costs import (
     expected_cost as expected_cost,
     scored_cost as scored_cost,
@@ -16,7 +17,6 @@ from ._gradient_estimators import (
     LikelihoodRatio as LikelihoodRatio,
 )
 from ._imitate import imitate as imitate
-from ._policy_search import Attempt as Attempt
 from ._ppo import PPO as PPO
 from ._record import History as History
 from ._shac import SHAC as SHAC

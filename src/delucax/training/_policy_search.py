@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from .._typing import PRNGKey
 from ..controllers import Constant, local_lqr, local_mpc, LQR, Residual, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
+from ._attempt import Attempt, Line
 from ._costs import expected_cost
 from ._episode_costs import (
     costs_of,
@@ -51,7 +52,7 @@ _MEMORIES = (1 / 30, 1 / 10, 1 / 4)
 _CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
-# How far a comparison may overrun it, if it takes as long as the longest compilation.
+# How far a comparison may overrun it, if it takes as long as the longest step before.
 _OVERRUN = 1.1
 # Steps of a round, and generations of one of evolution.
 _STEPS, _GENERATIONS = 300, 150
@@ -72,37 +73,6 @@ _CLOSE = 0.5
 _GAIN, _WORTH = 1e-3, 5e-3
 # How wide an evolution begins: of a network, of others, and near the best.
 _WIDE, _NARROW, _NEAR = 1.0, 0.3, 0.05
-
-
-class Attempt(NamedTuple):
-    """One training that was tried.
-
-    **Attributes:** `structure` of the policy; `method`; `cost`, the mean over the
-    starts on which policies are chosen; `seconds`, with compilation.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-
-        attempt = dlx.training.Attempt("network", "evolution", 12.5, 3.0)
-        attempt.method, attempt.cost
-        ```
-    """
-
-    structure: str
-    method: str
-    cost: float
-    seconds: float
-
-
-class _Line(NamedTuple):
-    """A policy that one method trains, and its costs, `None` before the training."""
-
-    structure: str
-    method: str
-    policy: AbstractController
-    costs: np.ndarray | None = None
 
 
 def _is_better(other: Any, own: Any) -> bool:
@@ -131,7 +101,7 @@ class PolicySearch:
         self.bar = tqdm(total=round(budget), **options)
         # Also what an interrupt leaves before anything has been tried.
         zero = Zero(environment.control_size)
-        self.best = {"zero": _Line("zero", "none", zero)}
+        self.best = {"zero": Line("zero", "none", zero)}
         self.tried: list[Attempt] = []
         self.lqr: LQR | None = None
         self.steps = min(environment.horizon, _LONGEST)
@@ -143,7 +113,7 @@ class PolicySearch:
         self.rate = _RATE
         # The least median cost so far, and its size.
         self.least, self.usual = np.inf, _ANY
-        # Of the first round of an attempt, which compiles.
+        # Of the first round of an attempt, which compiles, or of a comparison.
         self.longest = 0.0
 
     @property
@@ -202,7 +172,7 @@ class PolicySearch:
         self.enter(self.best["zero"])
         self.lqr = self.regulator()
         if self.lqr is not None:
-            self.enter(_Line("LQR", "none", self.lqr))
+            self.enter(Line("LQR", "none", self.lqr))
         family = self.ranges is not None
         made = structures(env, self.lqr, family, width, depth, self.fresh_key())
         pairs = [(name, method) for method in self.methods for name in made]
@@ -210,7 +180,7 @@ class PolicySearch:
         first = [("LQR + memory" if family else "LQR + network", "gradient")]
         first.append(("network", "evolution"))
         pairs = sorted(pairs, key=lambda pair: pair not in first)
-        lines = [_Line(name, method, made[name]) for name, method in pairs]
+        lines = [Line(name, method, made[name]) for name, method in pairs]
         # Successive halving: the better third goes on, for three times as long.
         share = _TRIAL
         while (self.may_train or not self.tried) and len(lines) > 1:
@@ -254,7 +224,7 @@ class PolicySearch:
         )
         return bool(np.isfinite(own)) and not _is_better(other, own)
 
-    def trained(self, line: _Line) -> AbstractController:
+    def trained(self, line: Line) -> AbstractController:
         """The policy of a line after a round of its method."""
         env, policy, method = self.environment, line.policy, line.method
         options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
@@ -278,7 +248,7 @@ class PolicySearch:
         options["gradient"] = ClippedSamples(_BATCH)
         return fit(loss, policy, optimiser, _STEPS, **options).model
 
-    def finish(self, line: _Line, untrained: AbstractController) -> None:
+    def finish(self, line: Line, untrained: AbstractController) -> None:
         """Train the last line on by the method that gained most when it was last used,
         until none gains; then more slowly, and from what imitates MPC if that is
         better."""
@@ -297,7 +267,7 @@ class PolicySearch:
                 self.rate = _FINE_RATE
             elif not has_imitated and self.expert_is_better(line.policy):
                 has_imitated, self.rate = True, _RATE
-                clone = _Line(line.structure, "imitation", untrained)
+                clone = Line(line.structure, "imitation", untrained)
                 line = min(line, self.attempt(clone, 0.0), key=self.score)
             else:
                 break
@@ -311,7 +281,7 @@ class PolicySearch:
         own = np.mean(costs_of(self.environment, None, policy, keys))
         return _is_better(expert, own)
 
-    def attempt(self, line: _Line, share: float) -> _Line:
+    def attempt(self, line: Line, share: float) -> Line:
         """The line after rounds of its method, for a share of the budget after the
         first, which compiles."""
         began, compiled, best = self.seconds, None, line
@@ -340,7 +310,7 @@ class PolicySearch:
         keys = self.keys(_CHOICE)
         return np.asarray(costs_of(self.environment, self.ranges, policy, keys), float)
 
-    def enter(self, line: _Line) -> None:
+    def enter(self, line: Line) -> None:
         """Keep a line if it is the best of its structure, and its median cost if that
         is the least."""
         if line.costs is None:
@@ -353,13 +323,13 @@ class PolicySearch:
         if middle != 0 and middle < self.least:
             self.least, self.usual = middle, abs(middle)
 
-    def score(self, line: _Line) -> float:
+    def score(self, line: Line) -> float:
         """The mean of the tamed costs, by which policies are chosen."""
         if line.costs is None:
             return np.inf
         return float(jnp.mean(tamed(jnp.asarray(line.costs), self.usual)))
 
-    def mean(self, line: _Line) -> float:
+    def mean(self, line: Line) -> float:
         """The mean cost, infinite where one is not finite."""
         costs = np.inf if line.costs is None else line.costs
         return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
@@ -393,8 +363,14 @@ class PolicySearch:
         floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
         laws = {"policy": policy, **floor}
         costs = {name: costs_of(env, ranges, law, keys) for name, law in laws.items()}
-        if env.dynamics.observes_state and self.may_compare:
-            costs["MPC"] = costs_of_mpc(env, ranges, self.lqr, keys)
-        if self.may_compare:
-            costs["plan"] = costs_of_plan(env, ranges, policy, keys)
+        rivals: dict[str, Any] = {}
+        if env.dynamics.observes_state:
+            rivals["MPC"] = costs_of_mpc, self.lqr
+        rivals["plan"] = costs_of_plan, policy
+        for name, (costs_of_rival, given) in rivals.items():
+            if self.may_compare:
+                began = self.seconds
+                costs[name] = np.asarray(costs_of_rival(env, ranges, given, keys))
+                # The next may take as long.
+                self.longest = max(self.longest, self.seconds - began)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}

@@ -18,7 +18,8 @@ from .._controller import AbstractController
 from .._extras import extra
 from .._typing import PRNGKey
 from ..environments import Environment
-from ._policy_search import Attempt, PolicySearch
+from ._attempt import Attempt
+from ._policy_search import PolicySearch
 
 
 if TYPE_CHECKING:
