@@ -214,15 +214,24 @@ class PolicySearch:
         plan is better than the LQR, or MPC where a plan would know the disturbances."""
         if self.chosen()[0] != "LQR":
             return False
-        env, keys = self.environment, self.keys(_CHOICE)[: len(self.comparison)]
-        own = np.mean(costs_of(env, self.ranges, self.lqr, keys))
-        known = isinstance(env.disturbance, NoDisturbance)
-        other = np.mean(
-            costs_of_plan(env, self.ranges, self.lqr, keys)
-            if known
-            else costs_of_mpc(env, self.ranges, self.lqr, keys)
-        )
+        keys = self.keys(_CHOICE)[: len(self.comparison)]
+        own = np.mean(costs_of(self.environment, self.ranges, self.lqr, keys))
+        known = isinstance(self.environment.disturbance, NoDisturbance)
+        other = np.mean(self.costs_of_rival("plan" if known else "MPC", self.lqr, keys))
         return bool(np.isfinite(own)) and not _is_better(other, own)
+
+    def costs_of_rival(self, name: str, policy: Any, keys: Array) -> np.ndarray:
+        """Those of MPC, or of a plan that starts from the controls of a policy."""
+        began = self.seconds
+        given = self.environment, self.ranges
+        costs = np.asarray(
+            costs_of_mpc(*given, self.lqr, keys)
+            if name == "MPC"
+            else costs_of_plan(*given, policy, keys)
+        )
+        # The next may take as long.
+        self.longest = max(self.longest, self.seconds - began)
+        return costs
 
     def trained(self, line: Line) -> AbstractController:
         """The policy of a line after a round of its method."""
@@ -277,7 +286,7 @@ class PolicySearch:
         if not self.environment.dynamics.observes_state or self.ranges is not None:
             return False
         keys = self.keys(_CHOICE)[:_COMPARISON]
-        expert = np.mean(costs_of_mpc(self.environment, None, self.lqr, keys))
+        expert = np.mean(self.costs_of_rival("MPC", policy, keys))
         own = np.mean(costs_of(self.environment, None, policy, keys))
         return _is_better(expert, own)
 
@@ -363,14 +372,7 @@ class PolicySearch:
         floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
         laws = {"policy": policy, **floor}
         costs = {name: costs_of(env, ranges, law, keys) for name, law in laws.items()}
-        rivals: dict[str, Any] = {}
-        if env.dynamics.observes_state:
-            rivals["MPC"] = costs_of_mpc, self.lqr
-        rivals["plan"] = costs_of_plan, policy
-        for name, (costs_of_rival, given) in rivals.items():
+        for name in ("MPC", "plan") if env.dynamics.observes_state else ("plan",):
             if self.may_compare:
-                began = self.seconds
-                costs[name] = np.asarray(costs_of_rival(env, ranges, given, keys))
-                # The next may take as long.
-                self.longest = max(self.longest, self.seconds - began)
+                costs[name] = self.costs_of_rival(name, policy, keys)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}
