@@ -53,7 +53,7 @@ _CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
 # How far a comparison may overrun it, if it takes as long as the longest step before.
-_OVERRUN = 1.1
+_OVERRUN, _MPC = 1.1, 2
 # Steps of a round, and generations of one of evolution.
 _STEPS, _GENERATIONS = 300, 150
 # First learning rates of a round: the second is for when nothing gains any more.
@@ -126,10 +126,11 @@ class PolicySearch:
         """Whether there is time to train."""
         return self.seconds < _TRAINING * self.budget
 
-    @property
-    def may_compare(self) -> bool:
+    def may_compare(self, name: str) -> bool:
         """Whether there is time to compare with one more controller."""
-        return self.seconds + self.longest < _OVERRUN * self.budget
+        # MPC is a plan at each step, and compiles for longer than a training.
+        likely = self.longest * (_MPC if name == "MPC" else 1)
+        return self.seconds + likely < _OVERRUN * self.budget
 
     def keys(self, count: int) -> Array:
         """Keys of that many episodes, others for each count."""
@@ -373,6 +374,6 @@ class PolicySearch:
         laws = {"policy": policy, **floor}
         costs = {name: costs_of(env, ranges, law, keys) for name, law in laws.items()}
         for name in ("MPC", "plan") if env.dynamics.observes_state else ("plan",):
-            if self.may_compare:
+            if self.may_compare(name):
                 costs[name] = self.costs_of_rival(name, policy, keys)
         return {name: np.asarray(cost, float) for name, cost in costs.items()}
