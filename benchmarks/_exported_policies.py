@@ -35,6 +35,8 @@ TASKS = (
     "mountain_car",
     "balloon_lung",
 )
+FAMILIES = ("pendulum", "cartpole_linear")
+"""Tasks of which the structure for a family of plants is exported too."""
 PRECISIONS = ("float64", "float32")
 WITHOUT_GRADIENT = ("mountain_car",)
 """Tasks whose cost has no gradient to speak of: evolution trains their policies."""
@@ -64,7 +66,7 @@ def task_of(name: str) -> dlx.Environment:
     return dataclasses.replace(dlx.make("pendulum"), **change)
 
 
-def policies(env: Any, by_evolution: bool) -> dict[str, Any]:
+def policies(env: Any, task: str) -> dict[str, Any]:
     """One of each structure, trained."""
     from delucax.training._policy_search import PolicySearch
     from delucax.training._structures import structures
@@ -77,11 +79,13 @@ def policies(env: Any, by_evolution: bool) -> dict[str, Any]:
     horizon = min(env.horizon, LONGEST)
     loss = dlx.training.expected_cost(env, batch=8, horizon=horizon, gradient_decay=0.9)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(5e-3))
-    known, family = (structures(env, lqr, f, 32, 1, key) for f in (False, True))
-    for name, policy in (known | family).items():
+    untrained = structures(env, lqr, False, 32, 1, key)
+    if task in FAMILIES:
+        untrained |= structures(env, lqr, True, 32, 1, key)
+    for name, policy in untrained.items():
         part = "correction" if isinstance(policy, dlx.controllers.Residual) else None
         how: Any = dict(key=key, trainable=part, progress=False, throw=False)
-        if by_evolution:
+        if task in WITHOUT_GRADIENT:
             loss = dlx.training.expected_cost(env, batch=2)
             trained = dlx.training.evolve(loss, policy, STEPS, **how)
         else:
@@ -97,7 +101,7 @@ def case(task: str, precision: str) -> dict[str, Any]:
     x0 = jax.vmap(env.reset)(jr.split(jr.key(2**20), STARTS))
     moved = jnp.nextafter(x0, jnp.full_like(x0, jnp.inf))
     made = {}
-    for name, policy in policies(env, task in WITHOUT_GRADIENT).items():
+    for name, policy in policies(env, task).items():
         with tempfile.TemporaryDirectory() as folder:
             size = env.dynamics.observation_size
             dlx.export.c(policy, folder, name="law", example=jnp.zeros(size))
