@@ -47,9 +47,9 @@ def draw(board: Board, path: Path) -> None:
     rows = sum(len(tasks) + 1 for tasks in groups.values())
     style = {"font.size": 7, "svg.fonttype": "path", "svg.hashsalt": "delucax"}
     with rc_context(style):
-        figure = Figure(figsize=(8.3, 0.185 * rows + 1.35))
+        figure = Figure(figsize=(8.5, 0.185 * rows + 1.35))
         height = figure.get_figheight()
-        axes = figure.add_axes((0.17, 0.45 / height, 0.825, 0.185 * rows / height))
+        axes = figure.add_axes((0.166, 0.45 / height, 0.805, 0.185 * rows / height))
         axes.set(xlim=(0, len(methods)), ylim=(rows, 0))
         axes.axis("off")
         place = 0

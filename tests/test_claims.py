@@ -523,10 +523,11 @@ def test_scoreboard(monkeypatch):
     mpc = [e for task in tasks if (e := board.excess(task, "MPC")) is not None]
     assert sum(e <= 0.05 for e in mpc) > len(mpc) / 2
     for task in ("cartpole", "compass_gait"):
-        assert board.excess(task, "MPC") > 0.5 > 5 * board.excess(task, "CEM")
-        assert 0.1 > board.excess(task, "MPPI")
+        floor = board.excess(task, "zero")
+        assert board.excess(task, "MPC") >= floor
+        assert max(board.excess(task, name) for name in ("CEM", "MPPI")) < floor / 2
     for task in ("mountain_car", "mountain_car_discrete"):
-        assert board.excess(task, of(task)[0]) > 0.5
+        assert board.excess(task, of(task)[0]) > 0.4
 
 
 def test_the_score_of_the_scoreboard(monkeypatch):
