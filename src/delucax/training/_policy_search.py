@@ -52,7 +52,8 @@ _MEMORIES = (1 / 30, 1 / 10, 1 / 4)
 _CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
 # The share of the budget for training; the rest is for the comparison.
 _TRAINING = 0.7
-# How far a comparison may overrun it, if it takes as long as the longest step before.
+# How far a comparison may overrun it, if it takes as long as the longest step before,
+# and MPC that many times as long.
 _OVERRUN, _MPC = 1.1, 2
 # Steps of a round, and generations of one of evolution.
 _STEPS, _GENERATIONS = 300, 150

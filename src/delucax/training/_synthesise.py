@@ -123,8 +123,9 @@ def synthesise(
     **Arguments:**
 
     - `environment`: the environment. Its dynamics and cost must be differentiable.
-        Where a control lacks a bound on either side, a network keeps it within two
-        standard deviations of the LQR's control around zero; within 2 without an LQR.
+        Where a control has no bounds, a network keeps it within two standard deviations
+        of the LQR's control around zero, or within 2 without an LQR; where it has one
+        bound, in a range of that size from it.
     - `key`: a random key.
     - `budget`: seconds for all of it with compilation, 75 by default, at least 5. A
         training or comparison that has begun is finished. What is tried depends on the
