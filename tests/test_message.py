@@ -21,7 +21,7 @@ DOORS = {
     "x0": lambda value: dlx.open_loop(PLANT, value, jnp.zeros((3, 1))),
     "controls": lambda value: dlx.open_loop(PLANT, jnp.zeros(2), value),
     "Q": lambda value: QUADRATIC(value, np.eye(1)),
-    "states": lambda value: dlx.training.sysid.linear(value, jnp.zeros((3, 1))),
+    "outputs": lambda value: dlx.training.sysid.Record(value, jnp.zeros(3), dt=1.0),
     "length": lambda value: dlx.systems.Pendulum(length=value),
     "dt": lambda value: dlx.Discretized(dlx.systems.Pendulum(), value),
     r"x \(the state\)": lambda value: dlx.linearize(PLANT, x=value, u=[0.0]),

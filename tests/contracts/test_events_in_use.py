@@ -31,7 +31,8 @@ def test_restitution_and_gravity_are_identified():
     controls = 2 * jax.random.normal(jax.random.key(0), (16, 1))
     states = dlx.open_loop(ball(restitution=0.7, gravity=9.0), START, controls)
     names = ["system.restitution", "system.gravity"]
-    found = sysid.physical(ball(), states, controls, names, window=8)
+    record = sysid.Record(states, controls, dt=ball().dt)
+    found = sysid.physical(ball(), record, names, window=8)
     assert_close(found.model.system.restitution, 0.7, rtol=1e-8)
     assert_close(found.model.system.gravity, 9.0, rtol=1e-8)
 

@@ -37,6 +37,10 @@ BOTH = "system.length", "system.mass"
 open_loop = eqx.filter_jit(dlx.open_loop)
 
 
+def record(outputs, controls, dt=0.05):
+    return sysid.Record(outputs, controls, dt=dt)
+
+
 def recorded(seed=0, noise=0.01, damping=0.0):
     """20 s of a pendulum under a new torque every 0.25 s, at 40 dB."""
     controls = 3 * np.repeat(np.random.default_rng(3).normal(size=(80, 1)), 5, 0)
@@ -59,7 +63,7 @@ def test_length_and_mass_within_one_percent():
     inside = 0
     for seed in range(10):
         states, controls, std = recorded(seed)
-        found = sysid.physical(GUESS, states, controls, BOTH)
+        found = sysid.physical(GUESS, record(states, controls), BOTH)
         assert found.names == BOTH
         truth = np.array([TRUE["length"], TRUE["mass"]])
         assert np.all(np.abs(found.estimate / truth - 1) < 0.01)
@@ -76,22 +80,22 @@ def test_residuals_of_a_wrong_model_are_said_to_be_correlated():
     paths, friction = BOTH, 0.3
     for seed in range(3):
         states, controls, _ = recorded(seed, damping=friction)
-        missing = sysid.physical(GUESS, states, controls, paths)
+        missing = sysid.physical(GUESS, record(states, controls), paths)
         assert missing.correlation > 8
         assert "correlated from step to step" in repr(missing)
         guess = dlx.replace(GUESS, {"system.damping": friction})
-        found = sysid.physical(guess, states, controls, paths)
+        found = sysid.physical(guess, record(states, controls), paths)
         assert found.correlation < 4
         assert "correlated" not in repr(found)
     # Where the noise is said to be larger than all that remains nothing is known.
-    loud = sysid.physical(GUESS, states, controls, paths, noise=10.0)
+    loud = sysid.physical(GUESS, record(states, controls), paths, noise=10.0)
     assert loud.correlation == 0
 
 
 def test_direction_that_is_not_identifiable_is_reported():
     states, controls, _ = recorded()
     paths = ("system.gravity", "system.length", "system.mass")
-    found = sysid.physical(GUESS, states, controls, paths, throw=False)
+    found = sysid.physical(GUESS, record(states, controls), paths, throw=False)
     assert found.result == dlx.RESULTS.unexciting
     assert found.identifiable.tolist() == [False, True, True]
     # g and l together, and m against the square of l.
@@ -103,14 +107,14 @@ def test_direction_that_is_not_identifiable_is_reported():
     inertia = TRUE["mass"] * TRUE["length"] ** 2
     assert_close(system.mass * system.length**2, inertia, rtol=0.02)
     with pytest.raises(Exception, match="is not identifiable"):
-        sysid.physical(GUESS, states, controls, paths)
+        sysid.physical(GUESS, record(states, controls), paths)
 
 
 def test_data_that_say_nothing_say_so():
     controls = np.zeros((400, 1))  # as many as are recorded: compiled once
     still = np.tile([np.pi, 0.0], (401, 1))
     paths = BOTH
-    found = sysid.physical(GUESS, still, controls, paths, throw=False)
+    found = sysid.physical(GUESS, record(still, controls), paths, throw=False)
     assert found.result == dlx.RESULTS.unexciting
     assert not np.any(found.identifiable)
     assert np.all(np.isfinite(found.estimate))
@@ -123,23 +127,23 @@ def test_data_that_say_nothing_say_so():
 
 def test_too_little_data_say_so():
     states, controls, _ = recorded()
-    few = dict(states=states[:3], controls=controls[:2], throw=False)
-    found = sysid.linear(**few)
+    few = record(states[:3], controls[:2])
+    found = sysid.linear(few, throw=False)
     assert found.result == dlx.RESULTS.unexciting
     assert not np.all(found.identifiable) and np.all(np.isfinite(found.estimate))
     assert found.x0 is None
     with pytest.raises(Exception, match="is not identifiable"):
-        sysid.linear(states[:3], controls[:2])
+        sysid.linear(few)
 
 
 def test_linear_models():
     rng = np.random.default_rng(0)
     controls, w = rng.normal(size=(400, 1)), 0.1 * rng.normal(size=(400, 2))
-    found = sysid.linear(of_linear(controls, 0 * w), controls, dt=0.1)
+    found = sysid.linear(record(of_linear(controls, 0 * w), controls))
     assert_close(found.model.A, A, atol=1e-12)
     assert_close(found.model.B, B, atol=1e-12)
     noisy = of_linear(controls, w)
-    found = sysid.linear(noisy, controls, dt=0.1)
+    found = sysid.linear(record(noisy, controls))
     truth = np.concatenate([A, B], axis=1)
     # The textbook's covariance, to all digits.
     rows = np.concatenate([noisy[:-1], controls], axis=1)
@@ -147,10 +151,10 @@ def test_linear_models():
     assert_close(found.std, found.noise[:, None] * np.sqrt(np.diag(cov)), rtol=1e-9)
     assert np.all(np.abs(found.estimate - truth) < 4 * found.std)
     assert_close(found.noise, 0.1, rtol=0.15)
-    shifted = sysid.linear(noisy + 3.0, controls, affine=True)
+    shifted = sysid.linear(record(noisy + 3.0, controls), affine=True)
     assert_close(shifted.model.A, found.model.A, atol=0.02)
     feedback = noisy[:-1] @ np.array([[0.3], [-0.2]])
-    closed = sysid.linear(noisy, feedback, throw=False)
+    closed = sysid.linear(record(noisy, feedback), throw=False)
     assert closed.result == dlx.RESULTS.unexciting
     assert closed.identifiable.tolist() == [False, True, True]
 
@@ -160,11 +164,12 @@ def test_level_of_the_intervals():
     controls = rng.normal(size=(60, 1))
     states = of_linear(controls, 0.1 * rng.normal(size=(60, 2)))
     back = dict(outputs_back=1, controls_back=1)
-    angles, torques, _ = recorded()
+    swung = record(*recorded()[:2])
+    small = record(states, controls)
     fits = (
-        lambda level: sysid.linear(states, controls, level=level),
-        lambda level: sysid.arx(states, controls, **back, level=level),
-        lambda level: sysid.physical(GUESS, angles, torques, BOTH, level=level),
+        lambda level: sysid.linear(small, level=level),
+        lambda level: sysid.arx(small, **back, level=level),
+        lambda level: sysid.physical(GUESS, swung, BOTH, level=level),
     )
     for fitted in fits:
         half, most = fitted(0.5), fitted(0.95)
@@ -179,7 +184,8 @@ def test_level_of_the_intervals():
 def test_arx_is_the_dynamics_that_it_came_from():
     controls = np.random.default_rng(0).normal(size=(200, 1))
     outputs = of_linear(controls, np.zeros((200, 2)))[:, :1]
-    found = sysid.arx(outputs, controls, outputs_back=2, controls_back=1, delay=2)
+    past = dict(outputs_back=2, controls_back=1, delay=2)
+    found = sysid.arx(record(outputs, controls), **past)
     assert_close(found.estimate, [[1.7, -0.72, 0.1]], atol=1e-10)
     A_, B_, C_ = (np.asarray(M) for M in (found.model.A, found.model.B, found.model.C))
     x, again = np.array([outputs[2, 0], outputs[1, 0], controls[1, 0]]), []
@@ -193,7 +199,7 @@ def test_neural_fits_predict():
     states, controls, _ = recorded(noise=1e-3)
     spread = np.std(states, axis=0)
     loss = sysid.PredictionError(scale=spread)
-    data = sysid.windows(states, controls, 3, dt=0.05)
+    data = sysid.windows(record(states, controls), 3)
     assert data[1].shape == (398, 4, 2)
     options = dict(width=8, depth=1, dt=0.05, key=jr.key(0))
     step = np.std(np.diff(states, axis=0), axis=0)
@@ -207,12 +213,13 @@ def test_neural_fits_predict():
 
 def test_neural_options():
     states, controls = np.arange(22.0).reshape(11, 2), np.zeros((10, 1))
-    times, some, inputs = sysid.windows(states, controls, 3, dt=0.5, stride=4)
+    run = record(states, controls, 0.5)
+    times, some, inputs = sysid.windows(run, 3, stride=4)
     assert_close(times, [0.0, 2.0])
     assert_close(some, np.stack([states[:4], states[4:8]]))
     assert inputs.shape == (2, 3, 1)
     with user_error(match="stride must be a whole number of at least 1"):
-        sysid.windows(states, controls, 3, stride=0)
+        sysid.windows(run, 3, stride=0)
     net = sysid.NeuralDynamics(2, 1, 8, 1, activation=jax.nn.relu, key=jr.key(0))
     first, last = net.network.layers
     z = np.array([1.0, -2.0, 0.5])
@@ -259,11 +266,11 @@ def reacted(seed=0):
 @given(st.floats(-10, 20), st.sampled_from([(0.6, 1.5), (1.4, 1.3), (0.7, 0.6)]))
 @settings(max_examples=6, deadline=None)
 def test_units_of_a_parameter_do_not_matter(power, off):
-    states, controls = reacted()
-    found = sysid.physical(reactor(*off, unit=10.0**power), states, controls, RATES)
+    run = record(*reacted())
+    found = sysid.physical(reactor(*off, unit=10.0**power), run, RATES)
     assert found.result == dlx.RESULTS.successful
     estimate = np.asarray(found.estimate) * np.array([1, 10.0**power])
-    plain = sysid.physical(reactor(), states, controls, RATES)
+    plain = sysid.physical(reactor(), run, RATES)
     assert_close(estimate, plain.estimate, rtol=1e-4)
     relative = [np.asarray(f.std) / np.asarray(f.estimate) for f in (found, plain)]
     assert_close(*relative, rtol=1e-3)
@@ -272,7 +279,7 @@ def test_units_of_a_parameter_do_not_matter(power, off):
 
 
 def test_a_fit_that_did_not_converge_gives_no_intervals():
-    states, controls = reacted()
+    run = record(*reacted())
     # Twelve times the rate: the integrator diverges at once.
     hot = dict(dynamics=reactor(E=0.9), parameters=RATES)
     hurried = dict(dynamics=reactor(0.6, 1.5), parameters=RATES, max_steps=1)
@@ -280,7 +287,7 @@ def test_a_fit_that_did_not_converge_gives_no_intervals():
         (hot, dlx.RESULTS.diverged),
         (hurried, dlx.RESULTS.not_converged),
     ):
-        case = case | dict(observations=states, controls=controls)
+        case = case | dict(record=run)
         found = sysid.physical(**case, throw=False)
         assert found.result == result
         for uncertain in (found.std, found.low, found.high, found.spread):
@@ -294,11 +301,13 @@ def test_a_fit_that_did_not_converge_gives_no_intervals():
 
 def test_the_start_of_each_run_is_returned():
     states, controls, std = recorded()
-    both = np.stack([states[:41], states[40:81]]), controls[:80].reshape(2, 40, 1)
+    run = record(states, controls)
+    both = [run[:41], run[40:81], run[80:100]]
     # With the true mass the residuals are not correlated, and one attempt will do.
     guess = pendulum(mass=TRUE["mass"])
-    found = sysid.physical(guess, *both, "system.length")
-    assert_close(found.x0, both[0][:, 0], atol=3 * float(std.max()))
+    found = sysid.physical(guess, both, "system.length")
+    firsts = np.stack([one.outputs[0] for one in both])
+    assert_close(found.x0, firsts, atol=3 * float(std.max()))
 
 
 @pytest.mark.parametrize("off, paths", [((0.6, 1.5), RATES), ((1, 1, 1.3), "system.E")])
@@ -306,41 +315,39 @@ def test_intervals_of_a_reactor_cover_the_truth(off, paths):
     truth = np.array([2.092, 7.2e10] if paths == RATES else [8750.0])
     inside = []
     for seed in range(60):
-        found = sysid.physical(reactor(*off), *reacted(seed), paths)
+        found = sysid.physical(reactor(*off), record(*reacted(seed)), paths)
         inside += list((found.low < truth) & (truth < found.high))
     # Of 60 intervals of 95%, fewer than 51 has a chance below 0.1%.
     assert np.mean(inside) >= 51 / 60
 
 
 def test_bad_input():
-    states, controls = jnp.zeros((11, 2)), jnp.zeros((10, 1))
-    with user_error(match="states must have one step more than controls"):
-        sysid.linear(states[:-1], controls)
-    with user_error(match="must be finite"):
-        sysid.linear(states.at[0, 0].set(jnp.nan), controls)
-    with user_error(match="steps must be at most the 10 of a run, got 11"):
-        sysid.windows(states, controls, 11)
+    states, controls = np.random.default_rng(0).normal(size=(11, 2)), np.zeros((10, 1))
+    run = record(states, controls)
+    with user_error(match="steps must be at most the 10 of a record, got 11"):
+        sysid.windows(run, 11)
     with user_error(match="more than the 12 steps that are looked back on"):
-        sysid.arx(states, controls, outputs_back=12, controls_back=1)
-    with user_error(match="observations and controls must have 2 and 1 entries"):
-        sysid.physical(GUESS, states[:, :1], controls, "system.mass")
+        sysid.arx(run, outputs_back=12, controls_back=1)
+    with user_error(match="2 outputs and 1 controls, as the dynamics have, got 1"):
+        sysid.physical(GUESS, record(states[:, :1], controls), "system.mass")
     with user_error(match="trainable"):
-        sysid.physical(GUESS, states, controls, "system.colour")
+        sysid.physical(GUESS, run, "system.colour")
+    with user_error(match="record must be a delucax.training.sysid.Record or a list"):
+        sysid.linear(states)
 
 
 def test_few_programs_are_compiled():
     """Each fit is a few programs, and another limit of steps compiles none of them."""
     states, controls, _ = recorded()
+    few, two = record(states[:82], controls[:81]), record(states[:2], controls[:1])
     jax.clear_caches()
     with counted_programs() as events:
-        sysid.linear(states[:82], controls[:81], throw=False)
+        sysid.linear(few, throw=False)
     assert 0 < len(events) <= 16
     # Two observations are four numbers, two of which tell where it starts: they do not
     # tell two parameters.
     options = dict(window=9, noise=0.01, throw=False)
-    fit = lambda **more: sysid.physical(
-        GUESS, states[:2], controls[:1], BOTH, **options, **more
-    )
+    fit = lambda **more: sysid.physical(GUESS, two, BOTH, **options, **more)
     with counted_programs() as events:
         found = fit(max_steps=20)
     assert 0 < len(events) <= 24

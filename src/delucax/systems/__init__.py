@@ -12,6 +12,11 @@ from ._general import (
     system as system,
 )
 from ._hybrid_base import AbstractHybridSystem as AbstractHybridSystem
+from ._wrappers import (
+    AbstractSystemWrapper as AbstractSystemWrapper,
+    Calibrated as Calibrated,
+    Corrected as Corrected,
+)
 
 
 if TYPE_CHECKING:

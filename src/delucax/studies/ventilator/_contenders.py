@@ -21,7 +21,7 @@ from ...costs import Tracking
 from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
-from ...training.sysid import arx
+from ...training.sysid import arx, Record
 from ._stages import ABORT, NOISE, Size, Stages, TRAIN_PIPS
 
 
@@ -263,11 +263,12 @@ def online_learners(
     newton = online_newton()
 
     def learner(breaths: lung.Breaths, pid: LeakyPID) -> OutputFeedback:
-        outputs, controls = breaths.pressure[..., None], breaths.u_in[:, :-1, None]
         dt: Any = breaths.dt
+        measured = zip(breaths.pressure, breaths.u_in, strict=True)
+        records = [Record(pressure, u_in, dt=dt) for pressure, u_in in measured]
         # A model to predict with: each of its numbers need not be known.
         lags: Any = dict(outputs_back=2, controls_back=4, delay=delay + 1)
-        identified = arx(outputs, controls, dt=dt, throw=False, **lags).model
+        identified = arx(records, throw=False, **lags).model
         model = LinearDynamics(identified.A, identified.B, dt=dt)
         gains = pid.kp, pid.ki, pid.kd
         base = LeakyPID(*gains, dt=dt, reference=waveform, output=0)

@@ -8,3 +8,4 @@ from ._neural import (
     windows as windows,
 )
 from ._physical import physical as physical
+from ._record import Record as Record

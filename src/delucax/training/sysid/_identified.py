@@ -71,7 +71,9 @@ class Identified(eqx.Module):
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         states = dlx.open_loop(true, [0.0, 0.0], controls)
-        fit = dlx.training.sysid.linear(states, controls)
+        fit = dlx.training.sysid.linear(
+            dlx.training.sysid.Record(states, controls, dt=1.0)
+        )
         print(fit.report())
         ```
     """

@@ -10,25 +10,22 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._check import check_bool, check_count, check_finite, check_step
+from ..._check import check_bool, check_count
 from ..._host import host_unless_traced, xp
-from ..._message import shortened
-from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import LinearDynamics
 from ._identified import Certainty, checked, Identified, quantile
+from ._record import grouped, Record, Records, uniform_records
 
 
 def linear(
-    states: Any,
-    controls: Any,
+    record: Records,
     *,
-    dt: Any = 1.0,
     affine: bool = False,
     level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
-    r"""Linear dynamics by least squares on the steps of a recorded run,
+    r"""Linear dynamics by least squares on the steps of a record of the state,
 
     `min over A, B, c of sum_k |x_{k+1} - A x_k - B u_k - c|^2`.
 
@@ -37,9 +34,8 @@ def linear(
 
     **Arguments:**
 
-    - `states`: shape `(T + 1, n)`, or runs of it, `(runs, T + 1, n)`.
-    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
-    - `dt`: the step, 1 by default.
+    - `record`: a [`delucax.training.sysid.Record`][], whose outputs are the states, or
+        a list of them; uniform in time.
     - `affine`: whether to estimate a constant c too; false by default.
     - `level`: of the confidence intervals, 0.95 by default.
     - `throw`: raise if the data do not tell all entries (default); if false, look at
@@ -49,8 +45,7 @@ def linear(
     [`delucax.LinearDynamics`][], and row i of its `estimate` holds the entries of A, B
     and c for the state i.
 
-    **Raises:** `ValueError` on arrays of the wrong shape or kind; an error at run time
-    as `throw` says.
+    **Raises:** `ValueError` if `record` is none; an error at run time as `throw` says.
 
     !!! example
 
@@ -61,37 +56,33 @@ def linear(
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         states = dlx.open_loop(true, [0.0, 0.0], controls)
-        fit = dlx.training.sysid.linear(states, controls)
+        record = dlx.training.sysid.Record(states, controls, dt=1.0)
+        fit = dlx.training.sysid.linear(record)
         fit.model.A, fit.model.B, fit.std
         ```
     """
     where = "sysid.linear"
-    states, controls = runs_of(states, controls, "states", where)
-    check_step(dt, where)
+    records = uniform_records(record, where)
     affine = check_bool(affine, "affine", where)
     reach = quantile(level, where)
-    n, m = states.shape[2], controls.shape[2]
+    n, m = records[0].outputs.shape[1], records[0].controls.shape[1]
     names = [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(m)]
-    regressors = [states[:, :-1], controls]
-    if affine:
-        names.append("1")
-        regressors.append(jnp.ones((*controls.shape[:2], 1), controls.dtype))
+    names += ["1"] if affine else []
+    lags = (1,), (1,)
 
     def matrices_of(estimate):
         matrices = dict(A=estimate[:, :n], B=estimate[:, n : n + m])
         return matrices | (dict(x_next=estimate[:, -1]) if affine else {})
 
-    return _fitted(matrices_of, names, regressors, states[:, 1:], dt, reach, throw)
+    return _fitted(matrices_of, names, records, lags, affine, reach, throw)
 
 
 def arx(
-    outputs: Any,
-    controls: Any,
+    record: Records,
     *,
     outputs_back: int,
     controls_back: int,
     delay: int = 1,
-    dt: Any = 1.0,
     level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
@@ -104,13 +95,11 @@ def arx(
 
     **Arguments:**
 
-    - `outputs`: shape `(T + 1, p)`, or runs of it, `(runs, T + 1, p)`; `outputs[k + 1]`
-        is the first that `controls[k]` may move.
-    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
+    - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
+        time; `outputs[k + 1]` is the first that `controls[k]` may move.
     - `outputs_back`: a, the outputs looked back on.
     - `controls_back`: b, the controls looked back on.
     - `delay`: steps from a control to its first effect, 1 by default.
-    - `dt`: the step, 1 by default.
     - `level`: of the confidence intervals, 0.95 by default.
     - `throw`: raise if the data do not tell all entries (default); if false, look at
         `result`.
@@ -119,8 +108,8 @@ def arx(
     the entries of `A_1, ..., A_a, B_0, ..., B_{b-1}` for the output i. The state of the
     model at step k is `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`.
 
-    **Raises:** `ValueError` on arrays of the wrong shape or kind, counts below 1, or
-    fewer steps than are looked back on; an error at run time as `throw` says.
+    **Raises:** `ValueError` if `record` is none, on counts below 1, or fewer steps than
+    are looked back on; an error at run time as `throw` says.
 
     Source: Ljung, 1999.
 
@@ -134,70 +123,64 @@ def arx(
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         angles = dlx.open_loop(true, [0.0, 0.0], controls)[:, :1]
         back = dict(outputs_back=2, controls_back=2)
-        fit = dlx.training.sysid.arx(angles, controls, **back, throw=False)
+        record = dlx.training.sysid.Record(angles, controls, dt=1.0)
+        fit = dlx.training.sysid.arx(record, **back, throw=False)
         fit.estimate
         ```
     """
     where = "sysid.arx"
-    outputs, controls = runs_of(outputs, controls, "outputs", where)
+    records = uniform_records(record, where)
     a = check_count(outputs_back, "outputs_back", where)
     b = check_count(controls_back, "controls_back", where)
     delay = check_count(delay, "delay", where)
-    check_step(dt, where)
     reach = quantile(level, where)
-    p, m, steps = outputs.shape[2], controls.shape[2], controls.shape[1]
-    # The first k whose whole past is recorded: y_{k-a}, and u_{k-delay-b+1}.
+    p, m = records[0].outputs.shape[1], records[0].controls.shape[1]
+    # Output k is made of outputs k - i and of controls k - delay - j.
+    lags = range(1, a + 1), range(delay, delay + b)
     first = max(a, b + delay - 1)
-    if steps < first:
+    if (steps := min(map(len, records)) - 1) < first:
         raise ValueError(
-            f"{where}: outputs must have more than the {first} steps that are looked "
+            f"{where}: record must have more than the {first} steps that are looked "
             f"back on, got {steps}."
         )
-    # Output k is made of outputs k - i and of controls k - delay - j.
-    back = [outputs[:, first - i : steps + 1 - i] for i in range(1, a + 1)]
-    lags = range(delay, delay + b)
-    back += [controls[:, first - lag : steps + 1 - lag] for lag in lags]
-    names = [f"y{i}(k-{lag})" for lag in range(1, a + 1) for i in range(p)]
-    names += [f"u{i}(k-{lag})" for lag in lags for i in range(m)]
+    names = [f"y{i}(k-{lag})" for lag in lags[0] for i in range(p)]
+    names += [f"u{i}(k-{lag})" for lag in lags[1] for i in range(m)]
     matrices_of = lambda estimate: _realised(estimate, p, m, a, b, delay)
-    return _fitted(matrices_of, names, back, outputs[:, first:], dt, reach, throw)
+    return _fitted(matrices_of, names, records, lags, False, reach, throw)
 
 
-def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
-    """Both as arrays with an axis of runs in front; raises if they do not fit."""
-    outputs, controls = as_float_array(outputs), as_float_array(controls)
-    for what, array in ((name, outputs), ("controls", controls)):
-        if not eqx.is_inexact_array(array) or array.ndim not in (2, 3):
-            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(array)
-            raise ValueError(
-                f"{where}: {what} must have shape (steps, size) or (runs, steps, "
-                f"size), got {got}."
-            )
-        check_finite(array, what, where)
-    steps = controls.shape[-2]
-    if steps < 1 or outputs.shape[:-1] != (*controls.shape[:-2], steps + 1):
-        raise ValueError(
-            f"{where}: {name} must have one step more than controls, got shapes "
-            f"{outputs.shape} and {controls.shape}."
-        )
-    if outputs.ndim == 2:
-        outputs, controls = outputs[None], controls[None]
-    dtype = jnp.result_type(outputs, controls)
-    return outputs.astype(dtype), controls.astype(dtype)
+@eqx.filter_jit
+def _regressors(
+    groups: list[Record], lags: tuple[Any, Any], affine: bool
+) -> tuple[Float[Array, "rows p"], Float[Array, "rows outputs"]]:
+    """`(regressors, targets)`: for each output whose whole past is recorded, the
+    outputs and the controls at these lags."""
+    first = max(*lags[0], *lags[1])
+
+    def of(record):
+        y, count = record.outputs, len(record)
+        signals = zip((y, record.controls), lags, strict=True)
+        past = [a[first - k : count - k] for a, own in signals for k in own]
+        past += [jnp.ones((count - first, 1), y.dtype)] * affine
+        return jnp.concatenate(past, axis=1), y[first:]
+
+    parts = [jax.vmap(of)(group) for group in groups]
+    flat = lambda arrays: [array.reshape(-1, array.shape[2]) for array in arrays]
+    regressors, targets = (
+        jnp.concatenate(flat(arrays)) for arrays in zip(*parts, strict=True)
+    )
+    return regressors, targets
 
 
 @jax.jit
 def _least_squares(
-    parts: list[Float[Array, "runs steps _"]],
-    targets: Float[Array, "runs steps outputs"],
+    regressors: Float[Array, "rows p"],
+    targets: Float[Array, "rows outputs"],
     reach: Array,
 ) -> tuple[dict[str, Array], Certainty]:
     """The estimate of each output with its interval, and what the data tell of the
     output with the largest relative noise."""
-    regressors = jnp.concatenate(parts, axis=2)
-    regressors = regressors.reshape(-1, regressors.shape[2])
     rows, p = regressors.shape
-    targets = targets.reshape(rows, -1)
     # In units of the regressors' size, so that the rank does not depend on units.
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
@@ -232,17 +215,19 @@ def _least_squares(
 def _fitted(
     matrices_of: Callable[[Any], dict[str, Any]],
     names: list[str],
-    regressors: list[Array],
-    targets: Float[Array, "runs steps outputs"],
-    dt: Any,
+    records: list[Record],
+    lags: tuple[Any, Any],
+    affine: bool,
     reach: Array,
     throw: bool,
 ) -> Identified:
-    """The linear model of `targets` by `regressors`, each with a row per step."""
-    of_outputs, certainty = _least_squares(regressors, targets, reach)
+    """The linear model of the outputs by outputs and controls at these lags."""
+    lags = tuple(lags[0]), tuple(lags[1])
+    rows = _regressors(grouped(records), lags, affine)
+    of_outputs, certainty = _least_squares(*rows, reach)
     matrices = host_unless_traced(matrices_of)(of_outputs["estimate"])
     fit = Identified(
-        model=LinearDynamics(dt=dt, **matrices),
+        model=LinearDynamics(dt=records[0].dt, **matrices),
         names=tuple(names),
         **of_outputs,
         **certainty._asdict(),

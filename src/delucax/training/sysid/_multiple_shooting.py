@@ -8,27 +8,25 @@ import jax.flatten_util
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..._results import choose, Result, RESULTS
 from .._trainable import Assembly
 from ._identified import Certainty
+from ._sampled import Sampling
+from ._windows import Windows
 
 
 _NEAR = 0.05
 """The standard deviations from the minimum within which a fit has converged."""
 
 
-class Windows(NamedTuple):
-    """Recorded data cut into windows, and the scale of each output."""
+class Prior(NamedTuple):
+    """A normal distribution of the unconstrained values, before anything is measured.
+    An infinite deviation says nothing."""
 
-    begins: Int[Array, " windows"]
-    controls: Float[Array, "windows steps m"]
-    observations: Float[Array, "windows points y"]
-    counts: Bool[Array, "windows points"]
-    noise: Float[Array, " y"]
-    floor: Float[Array, " y"]
+    mean: dict[str, Array]
+    std: dict[str, Array]
 
 
 class _Point(NamedTuple):
@@ -55,67 +53,44 @@ class Solution(NamedTuple):
 
 
 @eqx.filter_jit
-def cut_into_windows(
-    guesses: Float[Array, "runs points n"],
-    observations: Float[Array, "runs points y"],
-    controls: Float[Array, "runs steps m"],
-    window: int,
-    noise: Float[Array, " y"] | None,
-) -> tuple[Float[Array, "windows n"], Windows]:
-    """`(starts, windows)`, the noise of which is by default the spread of each
-    output, and may then be no less than the rounding of a whole window."""
-    runs, steps, _ = controls.shape
-    n, size = guesses.shape[2], observations.shape[2]
-    count = steps // window
-    stop = count * window
-    starts = guesses[:, :stop:window].reshape(runs * count, n)
-    inputs = controls[:, :stop].reshape(runs * count, window, -1)
-    begins = np.arange(count) * window
-    index = begins[:, None] + np.arange(window + 1)
-    observed = observations[:, index].reshape(runs * count, window + 1, size)
-    # The observation where a window ends and the next begins counts once.
-    counts = np.ones((count, window + 1), bool)
-    counts[:-1, -1] = False
-    begins, counts = np.tile(begins, runs), np.tile(counts, (runs, 1))
-    # An output that never moves has a spread of rounding.
-    spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
-    moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
-    spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
-    floor = 1e3 * float(jnp.finfo(spread.dtype).eps) * spread
-    if noise is not None:
-        spread, floor = noise, jnp.zeros_like(noise)
-    data = inputs, observed, jnp.asarray(counts), spread, floor
-    return starts, Windows(jnp.asarray(begins), *data)
-
-
-@eqx.filter_jit
 def solve(
     assembly: Assembly,
     values: dict[str, Array],
     starts: Float[Array, "windows n"],
     data: Windows,
+    sampling: Sampling,
     max_steps: Int[Array, ""],
+    prior: Prior | None = None,
+    estimates_starts: bool = True,
 ) -> Solution:
-    """The parameters and the state at the beginning of each window that fit best."""
+    """The parameters and the state at the beginning of each window that fit best, or
+    the parameters alone."""
     flat, unravel = jax.flatten_util.ravel_pytree(values)
     p = flat.size
     dtype = data.observations.dtype
 
     def window(theta, x, data):
-        begin, controls, observed, counts = data
+        times, rows, observed, counts = data
         model = assembly(unravel(theta))
-        times = (begin + jnp.arange(controls.shape[0] + 1)) * model.dt
+        if not estimates_starts:
+            x = lax.stop_gradient(x)
+        advance = sampling(model)
 
         def step(x, inputs):
-            t, u = inputs
-            x_next, _ = model.advance(t, x, u, None)
-            return x_next.astype(x.dtype), x
+            t, row = inputs
+            return advance(t, x, row).astype(x.dtype), x
 
-        last, states = lax.scan(step, x, (times[:-1], controls))
+        last, states = lax.scan(step, x, (times[:-1], rows))
         states = jnp.concatenate([states, last[None]])
         residuals = (observed - jax.vmap(model.observe)(times, states)) / noise
         residuals = jnp.where(counts[:, None], residuals, 0).ravel().astype(dtype)
         return residuals, residuals
+
+    # Its rows are residuals too, (theta - mean) / std.
+    pull, centre = jnp.zeros(p, dtype), flat
+    if prior is not None:
+        pull = 1 / jax.flatten_util.ravel_pytree(prior.std)[0]
+        centre = jax.flatten_util.ravel_pytree(prior.mean)[0]
 
     *recorded, noise, floor = data
     noise = jnp.maximum(noise, floor)
@@ -125,8 +100,14 @@ def solve(
 
     def linearised(theta, starts):
         slopes, residuals = sensitivity(theta, starts, tuple(recorded))
-        cost = jnp.sum(residuals**2)
+        cost = jnp.sum(residuals**2) + jnp.sum((pull * (theta - centre)) ** 2)
         return _Point(theta, starts, *slopes, residuals=residuals, cost=cost)
+
+    def prior_rows(theta, unit):
+        if prior is None:
+            return jnp.zeros((0, p + 1), dtype)
+        residual = pull * (theta - centre)
+        return jnp.concatenate([jnp.diag(pull / unit), residual[:, None]], axis=1)
 
     rows = data.observations[0].size
     windows, n = starts.shape
@@ -135,16 +116,18 @@ def solve(
     # Any point is better than the first, so that it is linearised in the loop too, and
     # the sensitivities are compiled once.
     start = _Point(flat, starts, *slopes, zeros(windows, rows), zeros() + jnp.inf)
-    best, count = _levenberg_marquardt(linearised, start, max_steps)
+    best, count = _levenberg_marquardt(linearised, prior_rows, start, max_steps)
 
     eps = jnp.finfo(dtype).eps
     theta, starts, cost = best.theta, best.starts, best.cost
     by_theta, by_start, _, units = _scaled(best, (zeros(p), zeros(*starts.shape)))
     # What the states at the beginnings could explain as well tells nothing.
-    _, on_starts, _, on_theta, by_theta = _projected(by_theta, by_start, eps)
+    known = prior_rows(theta, units[0])
+    _, on_starts, _, on_theta, by_theta = _projected(by_theta, by_start, known, eps)
     size = data.observations.shape[2]
     # Degrees of freedom: what is observed less what is estimated.
-    free = jnp.maximum(jnp.sum(data.counts) * size - p - starts.size, 1)
+    unknown = p + (starts.size if estimates_starts else 0)
+    free = jnp.maximum(jnp.sum(data.counts) * size - unknown, 1)
     sigma = jnp.sqrt(jnp.sum(best.residuals**2) / free)
     residuals = best.residuals.reshape(data.observations.shape)
     # sqrt(N) r, about standard normal if the residuals are white (Ljung, 1999).
@@ -172,7 +155,7 @@ def solve(
 
 
 def _levenberg_marquardt(
-    linearised: Any, start: _Point, max_steps: Int[Array, ""]
+    linearised: Any, prior_rows: Any, start: _Point, max_steps: Int[Array, ""]
 ) -> tuple[_Point, Array]:
     """`(the best point, the number of points tried)`.
 
@@ -198,7 +181,9 @@ def _levenberg_marquardt(
         damping = jnp.where(better | at_minimum, damping / 8, damping * 4)
         damping = jnp.clip(damping, 1e-10, 1e10)
         by_theta, by_start, largest, units = _scaled(best, largest)
-        R_x, on_starts, R, on_theta, _ = _projected(by_theta, by_start, damping)
+        known = prior_rows(best.theta, units[0])
+        projected = _projected(by_theta, by_start, known, damping)
+        R_x, on_starts, R, on_theta, _ = projected
         step = jsl.solve_triangular(R, on_theta)
         # Back substitution: once the step of theta is known, each window has its own.
         right = on_starts[..., p] - on_starts[..., :p] @ step
@@ -243,12 +228,15 @@ def _scaled(point: _Point, largest: Any) -> tuple[Array, Array, Any, Any]:
     return jnp.concatenate(columns, axis=2), by_start, largest, units
 
 
-def _projected(by_theta: Array, by_start: Array, damping: Any) -> tuple[Array, ...]:
-    """Eliminate the states at the beginnings of the windows, then the parameters."""
+def _projected(
+    by_theta: Array, by_start: Array, known: Array, damping: Any
+) -> tuple[Array, ...]:
+    """Eliminate the states at the beginnings of the windows, then the parameters, of
+    which something is `known`, a row for each."""
     p = by_theta.shape[2] - 1
     eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
     R_x, on_starts, left = eliminate(by_start, by_theta, damping)
-    left = left.reshape(-1, p + 1)
+    left = jnp.concatenate([left.reshape(-1, p + 1), known])
     R, on_theta, _ = _eliminate(left[:, :p], left[:, p:], damping)
     return R_x, on_starts, R, on_theta[:, 0], left
 

@@ -16,14 +16,13 @@ from ..._check import (
     check_count,
     check_instance,
     check_positive,
-    check_step,
 )
 from ..._check_models import state_network
 from ..._module import parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
-from ._linear import runs_of
+from ._record import grouped, Record, Records, uniform_records
 
 
 class NeuralDynamics(AbstractDynamics):
@@ -118,23 +117,21 @@ class NeuralDynamics(AbstractDynamics):
 
 
 def windows(
-    states: Any, controls: Any, steps: int, *, dt: Any = 1.0, stride: int = 1
+    record: Records, steps: int, *, stride: int = 1
 ) -> tuple[Array, Array, Array]:
-    """Stretches of recorded runs: the data of a multi-step fit.
+    """Stretches of records of the state: the data of a multi-step fit.
 
     **Arguments:**
 
-    - `states`: shape `(T + 1, n)`, or runs of it, `(runs, T + 1, n)`.
-    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
+    - `record`: a [`delucax.training.sysid.Record`][], whose outputs are the states, or
+        a list of them; uniform in time.
     - `steps`: of a stretch; 1 for a one-step fit.
-    - `dt`: the step, 1 by default.
     - `stride`: steps between the beginnings of two stretches, 1 by default.
 
     **Returns:** `(times, states, controls)` of shapes `(N,)`, `(N, steps + 1, n)` and
     `(N, steps, m)`, for `data=` of [`delucax.training.fit`][].
 
-    **Raises:** `ValueError` on arrays of the wrong shape or kind, or if the runs are
-    shorter than a stretch.
+    **Raises:** `ValueError` if `record` is none, or shorter than a stretch.
 
     !!! example
 
@@ -143,32 +140,30 @@ def windows(
         import jax.numpy as jnp
 
         states, controls = jnp.zeros((101, 2)), jnp.zeros((100, 1))
-        data = dlx.training.sysid.windows(states, controls, 10, dt=0.05)
+        record = dlx.training.sysid.Record(states, controls, dt=0.05)
+        data = dlx.training.sysid.windows(record, 10)
         data[1].shape
         ```
     """
     where = "sysid.windows"
-    states, controls = runs_of(states, controls, "states", where)
+    records = uniform_records(record, where)
     steps = check_count(steps, "steps", where)
     stride = check_count(stride, "stride", where)
-    check_step(dt, where)
-    check_at_most(steps, controls.shape[1], "steps", where, "of a run")
-    return _cut(states, controls, steps, stride, jnp.asarray(dt, float))
+    check_at_most(steps, min(map(len, records)) - 1, "steps", where, "of a record")
+    return _cut(grouped(records), steps, stride)
 
 
 @eqx.filter_jit
-def _cut(
-    states: Array, controls: Array, steps: int, stride: int, dt: Array
-) -> tuple[Array, Array, Array]:
-    runs, total = controls.shape[:2]
-    begins = np.arange(0, total - steps + 1, stride)
-    inside = begins[:, None] + np.arange(steps + 1)
-    count = runs * len(begins)
-    return (
-        jnp.tile((jnp.asarray(begins) * dt).astype(states.dtype), runs),
-        states[:, inside].reshape(count, steps + 1, -1),
-        controls[:, inside[:, :-1]].reshape(count, steps, -1),
-    )
+def _cut(groups: list[Record], steps: int, stride: int) -> tuple[Array, Array, Array]:
+    parts = []
+    for group in groups:
+        begins = np.arange(0, group.times.shape[1] - steps, stride)
+        inside = begins[:, None] + np.arange(steps + 1)
+        taken = group.times[:, begins], group.outputs[:, inside]
+        taken += (group.controls[:, inside[:, :-1]],)
+        parts.append([array.reshape(-1, *array.shape[2:]) for array in taken])
+    times, states, controls = (jnp.concatenate(p) for p in zip(*parts, strict=True))
+    return times, states, controls
 
 
 class PredictionError(eqx.Module):
@@ -198,6 +193,7 @@ class PredictionError(eqx.Module):
         true = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         controls = jax.random.normal(key, (100, 1))
         states = dlx.open_loop(true, [3.0, 0.0], controls)
+        record = dlx.training.sysid.Record(states, controls, dt=0.05)
         field = dlx.systems.NeuralSystem(2, 1, width=8, depth=1, key=key)
         fitted = dlx.training.fit(
             dlx.training.sysid.PredictionError(),
@@ -205,7 +201,7 @@ class PredictionError(eqx.Module):
             optax.adam(1e-2),
             steps=20,
             key=key,
-            data=dlx.training.sysid.windows(states, controls, 5, dt=0.05),
+            data=dlx.training.sysid.windows(record, 5),
             batch_size=32,
         )
         fitted.model.system

@@ -5,32 +5,35 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.flatten_util
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import (
-    as_vector,
+    check_at_most,
     check_bool,
     check_count,
+    check_finite,
     check_instance,
     check_positive,
     is_concrete,
 )
 from ..._module import as_float_array
 from ..._results import RESULTS
-from ...dynamics import AbstractDynamics, open_loop
+from ...dynamics import AbstractDynamics
 from .._trainable import Assembly, partition_trainable
 from ._identified import Certainty, checked, CORRELATED, Identified, quantile
-from ._linear import runs_of
 from ._multiple_shooting import (
-    cut_into_windows,
     flat_constrained,
     per_relative_change,
     relative_unit,
     Solution,
     solve,
 )
+from ._record import Record, Records, records_of
+from ._sampled import Sampling, sampling_of
+from ._windows import begins_of, cut_into_windows
 
 
 _SHORT_WINDOW = 2
@@ -39,12 +42,12 @@ _SHORT_WINDOW = 2
 
 def physical(
     dynamics: AbstractDynamics,
-    observations: Any,
-    controls: Any,
+    record: Records,
     parameters: Any,
     *,
     x0: Any = None,
-    window: int = 20,
+    window: int | None = 20,
+    burn_in: int = 0,
     noise: Any = None,
     level: Any = 0.95,
     max_steps: int = 100,
@@ -72,17 +75,22 @@ def physical(
 
     **Arguments:**
 
-    - `dynamics`: with the parameters at a first guess.
-    - `observations`: shape `(T + 1, p)`, or runs of it, `(runs, T + 1, p)`.
-    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
+    - `dynamics`: with the parameters at a first guess. Their own step and controls that
+        are held fit any dynamics; other steps, and controls that are interpolated, a
+        [`delucax.Discretized`][] system, whose step is then taken over each step of the
+        record.
+    - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: what is estimated: a path such as `"system.length"`, several, or a
         dictionary from path to constraint, as `trainable` of
         [`delucax.training.fit`][].
-    - `x0`: a guess of the first state, shape `(n,)`, from which those of the windows
-        are simulated; by default the windows begin with what is observed there, which
-        must then be the state.
-    - `window`: steps of a window, 20 by default; all T if there are fewer. An
-        incomplete last window is left out.
+    - `x0`: a guess of the first state, shape `(n,)`, or one for each record, from which
+        those of the windows are simulated; by default the windows begin with what is
+        observed there, which must then be the state.
+    - `window`: steps of a window, 20 by default; all of the record if it has fewer or
+        for `None`, which is the output-error method.
+    - `burn_in`: samples at the beginning of each window that do not count. If there are
+        any then the states there are not estimated, but stay as they are guessed. 0
+        by default.
     - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
         default that of the residuals of a first fit.
     - `level`: of the confidence intervals, 0.95 by default.
@@ -92,9 +100,9 @@ def physical(
 
     **Returns:** [`delucax.training.sysid.Identified`][]; its `model` is the dynamics
     with the estimated parameters, its directions are those of relative changes, and its
-    `x0` is the estimated state at the beginning of the run, or of each run.
+    `x0` is the estimated state at the beginning of the record, or of each.
 
-    **Raises:** `ValueError` on arrays of the wrong shape or kind, or if there is no
+    **Raises:** `ValueError` on arguments of the wrong shape or kind, or if there is no
     such parameter; an error at run time as `throw` says.
 
     Source: Bock, 1983 (multiple shooting); Moré, 1978 (scaling); Ljung, 1999.
@@ -111,23 +119,26 @@ def physical(
         states = dlx.open_loop(true, [3.0, 0.0], controls)
         guess = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         fit = dlx.training.sysid.physical
-        fitted = fit(guess, states, controls, "system.length", window=20)
+        record = dlx.training.sysid.Record(states, controls, dt=0.05)
+        fitted = fit(guess, record, "system.length", window=20)
         fitted.estimate, fitted.low, fitted.high
         ```
     """
     where = "sysid.physical"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
-    is_batch = jnp.ndim(as_float_array(controls)) == 3
-    observations, controls = runs_of(observations, controls, "observations", where)
+    records = records_of(record, where)
     size, n = dynamics.observation_size, dynamics.state_size
-    if observations.shape[2] != size or controls.shape[2] != dynamics.control_size:
+    sizes = tuple(getattr(records[0], k).shape[1] for k in ("outputs", "controls"))
+    if sizes != (size, dynamics.control_size):
         raise ValueError(
-            f"{where}: observations and controls must have {size} and "
-            f"{dynamics.control_size} entries per step, got shapes "
-            f"{observations.shape} and {controls.shape}."
+            f"{where}: record must have {size} outputs and {dynamics.control_size} "
+            f"controls, as the dynamics have, got {sizes[0]} and {sizes[1]}."
         )
-    runs, steps = controls.shape[:2]
-    window = min(check_count(window, "window", where), steps)
+    longest = max(len(record) for record in records) - 1
+    whole = longest if window is None else check_count(window, "window", where)
+    window = min(whole, longest)
+    burn_in = check_count(burn_in, "burn_in", where, least=0)
+    check_at_most(burn_in, window, "burn_in", where, "of a window")
     # An array, so that another limit does not compile again.
     most: Any = np.asarray(check_count(max_steps, "max_steps", where))
     reach = quantile(level, where)
@@ -135,12 +146,12 @@ def physical(
     if noise is not None:
         check_positive(noise, "noise", where)
         noise = jnp.broadcast_to(as_float_array(noise), (size,))
+    sampling, groups, rows = sampling_of(dynamics, records, where)
     if x0 is not None:
-        x0 = as_vector(x0, n, "x0", where)
-        guesses = jax.vmap(lambda u: open_loop(dynamics, x0, u))(controls)
-        guesses = guesses.astype(observations.dtype)
+        firsts = _first_states(x0, groups, n, where)
+        guesses = _simulated(dynamics, sampling, firsts, groups, rows)
     elif size == n:
-        guesses = observations
+        guesses = [group.outputs for group in groups]
     else:
         raise ValueError(
             f"{where}: x0 must be given where the state (of size {n}) is not what is "
@@ -153,24 +164,30 @@ def physical(
         for index in np.ndindex(value.shape)
     ]
 
+    estimates_starts = burn_in == 0
+
     def fit(values, window):
-        given = guesses, observations, controls
-        starts, data = cut_into_windows(*given, window, noise)
+        given = guesses, groups, rows
+        starts, data = cut_into_windows(*given, window, burn_in, noise)
+        options: Any = dict(estimates_starts=estimates_starts)
         # First in units of the spread of each output; then from there in units of the
         # residuals that are left, which weighs outputs of unlike noise as they deserve.
-        solution = solve(assembly, values, starts, data, most)
+        solution = solve(assembly, values, starts, data, sampling, most, **options)
         if noise is not None:
             return solution
         data = data._replace(noise=solution.noise)
-        return solve(assembly, solution.values, solution.starts, data, most)
+        values, starts = solution.values, solution.starts
+        return solve(assembly, values, starts, data, sampling, most, **options)
 
-    count = steps // window
-    unknown = len(names) + runs * count * n
-    few = size * runs * (count * window + 1) <= unknown
+    # Where the windows of each record are among all of them.
+    counts = [len(begins_of(g, window)) for g in groups for _ in g.outputs]
+    at = np.cumsum([0, *counts])
+    unknown = len(names) + n * at[-1] * estimates_starts
+    few = bool(size * sum(map(len, records)) <= unknown)
     solution = fit(values, window)
     # A second attempt, if it is known now that the first did not converge, or that its
     # residuals are correlated from step to step, as the noise is not.
-    retries = x0 is None and not few and window > _SHORT_WINDOW
+    retries = x0 is None and not few and window > _SHORT_WINDOW and not burn_in
     if retries and is_concrete(solution.correlation):
         failed = solution.result != RESULTS.successful
         # On short windows nothing grows, so that a worse guess does, and there are
@@ -180,7 +197,8 @@ def physical(
             less = np.prod(again.noise) < np.prod(solution.noise)
             if again.result == RESULTS.successful and (failed or less):
                 solution = again
-    low, high, known, starts = _intervals(assembly, solution, reach, few, runs)
+    summary = _intervals(assembly, solution, reach, few, at[:-1])
+    low, high, known, starts = summary
     fitted = Identified(
         model=assembly(solution.values),
         names=tuple(names),
@@ -190,7 +208,7 @@ def physical(
         **known._asdict(),
         noise=solution.noise,
         correlation=solution.correlation,
-        x0=starts if is_batch else starts[0],
+        x0=starts[0] if isinstance(record, Record) else starts,
         # With too few data the iteration need not converge: `checked` then reports that
         # the parameters are not identifiable.
         result=RESULTS.successful if few else solution.result,
@@ -200,11 +218,11 @@ def physical(
 
 @eqx.filter_jit
 def _intervals(
-    assembly: Assembly, solution: Solution, reach: Array, few: bool, runs: int
+    assembly: Assembly, solution: Solution, reach: Array, few: bool, firsts: Any
 ) -> tuple[Array, Array, Certainty, Array]:
-    """The ends of the intervals, the certainty of the estimate, and the state at the
-    beginning of each run."""
-    certainty, starts = solution.certainty, solution.starts
+    """The ends of the intervals, the certainty of the estimate, and the states at the
+    beginnings of these windows."""
+    certainty = solution.certainty
     std = certainty.std
     known = certainty._replace(
         std=std * jnp.abs(relative_unit(solution.estimate)),
@@ -213,8 +231,48 @@ def _intervals(
     below, above = (
         _ends(assembly, solution.values, d) for d in (-reach * std, reach * std)
     )
-    first = starts.reshape(runs, -1, starts.shape[1])[:, 0]
-    return jnp.minimum(below, above), jnp.maximum(below, above), known, first
+    low, high = jnp.minimum(below, above), jnp.maximum(below, above)
+    return low, high, known, solution.starts[firsts]
+
+
+def _first_states(
+    x0: Any, groups: list[Record], n: int, where: str
+) -> list[Float[Array, "_ n"]]:
+    """A guess of the first state of each record."""
+    sizes = [len(group.outputs) for group in groups]
+    x0, count = as_float_array(x0), sum(sizes)
+    if x0.shape not in ((n,), (count, n)):
+        raise ValueError(
+            f"{where}: x0 must have shape ({n},), or ({count}, {n}) with one for each "
+            f"record, got {x0.shape}."
+        )
+    check_finite(x0, "x0", where)
+    x0 = jnp.broadcast_to(x0, (count, n)).astype(groups[0].outputs.dtype)
+    return jnp.split(x0, np.cumsum(sizes)[:-1])
+
+
+@eqx.filter_jit
+def _simulated(
+    dynamics: AbstractDynamics,
+    sampling: Sampling,
+    firsts: list[Float[Array, "_ n"]],
+    groups: list[Record],
+    rows: list[Any],
+) -> list[Float[Array, "_ _ n"]]:
+    """The states by a guess of the dynamics; held where they run away."""
+    advance = sampling(dynamics)
+
+    def step(x, inputs):
+        x_next = advance(inputs[0], x, inputs[1]).astype(x.dtype)
+        x_next = jnp.where(jnp.all(jnp.isfinite(x_next)), x_next, x)
+        return x_next, x_next
+
+    def of(x0, times, rows):
+        _, states = lax.scan(step, x0, (times[:-1], rows))
+        return jnp.concatenate([x0[None], states])
+
+    times = [group.times for group in groups]
+    return [jax.vmap(of)(*one) for one in zip(firsts, times, rows, strict=True)]
 
 
 def _ends(

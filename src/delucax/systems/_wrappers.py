@@ -1,0 +1,218 @@
+"""Systems around another system."""
+
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import as_entries, check_instance
+from .._check_models import state_network
+from .._module import parameter, positive, weight
+from .._typing import Control, Disturbance, Observation, PRNGKey, State, Time
+from ._base import AbstractSystem
+from ._hybrid_base import AbstractHybridSystem
+
+
+def _forwarded(name: str) -> Any:
+    """A property of the wrapped system."""
+    return property(
+        lambda self: getattr(self.system, name), doc="That of the wrapped system."
+    )
+
+
+class AbstractSystemWrapper(AbstractSystem):
+    """A system around another, in a field `system`, to which everything is forwarded
+    that a subclass does not override.
+
+    A subclass writes `vector_field`. A system with events has no such wrapper.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from jaxtyping import Array
+
+        class Heavier(dlx.systems.AbstractSystemWrapper):
+            system: dlx.AbstractSystem
+            factor: Array = dlx.parameter(2.0)
+
+            def vector_field(self, t, x, u, w):
+                return self.system.vector_field(t, x, u / self.factor, w)
+
+        heavier = Heavier(dlx.systems.Pendulum())
+        heavier.vector_field(0.0, jnp.ones(2), jnp.ones(1), None)
+        ```
+    """
+
+    if TYPE_CHECKING:  # as in AbstractPlant
+        system: ClassVar[Any]
+    else:
+        system: eqx.AbstractVar[AbstractSystem]
+
+    def __check_init__(self):
+        where = type(self).__name__
+        check_instance(self.system, AbstractSystem, "system", where)
+        if isinstance(self.system, AbstractHybridSystem):
+            raise ValueError(
+                f"{where}: system must have no events, got "
+                f"{type(self.system).__name__}."
+            )
+
+    state_names = _forwarded("state_names")
+    control_names = _forwarded("control_names")
+    disturbance_names = _forwarded("disturbance_names")
+    disturbance_size = _forwarded("disturbance_size")
+    noise = _forwarded("noise")
+    angle_names = _forwarded("angle_names")
+    state_units = _forwarded("state_units")
+    control_units = _forwarded("control_units")
+    time_unit = _forwarded("time_unit")
+    projects_state = _forwarded("projects_state")
+
+    def observe(self, t: Time, x: State) -> Observation:
+        return self.system.observe(t, x)
+
+    def project(self, x: State) -> State:
+        return self.system.project(x)
+
+    def difference(self, x: State, x_ref: State) -> State:
+        return self.system.difference(x, x_ref)
+
+    def equilibrium(self) -> tuple[State, Control]:
+        return self.system.equilibrium()
+
+    def diffusion(self, t: Time, x: State, u: Control) -> Array | None:
+        return self.system.diffusion(t, x, u)
+
+
+class Calibrated(AbstractSystemWrapper):
+    """A system whose actuator and sensor have a scale and an offset,
+
+    `dx/dt = f(t, x, control_scale * u + control_offset, w)` and
+    `y = output_scale * h(t, x) + output_offset`,
+
+    such as a pump driven by a voltage and a level read in volts. All four may be
+    estimated by [`delucax.training.sysid.physical`][].
+
+    **Arguments:**
+
+    - `system`: what is driven and read.
+    - `control_scale`, `control_offset`: a number or shape `(m,)`; 1 and 0 by default.
+    - `output_scale`, `output_offset`: a number or shape `(p,)`; 1 and 0 by default.
+
+    **Raises:** `ValueError` on other shapes, or if `system` has events.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        tank = dlx.systems.Calibrated(
+            dlx.systems.MassSpringDamper(), control_scale=2.0, output_offset=0.1
+        )
+        tank.observe(0.0, jnp.zeros(2))
+        ```
+    """
+
+    system: AbstractSystem
+    control_scale: Float[Array, "..."] = parameter(1.0)
+    control_offset: Float[Array, "..."] = parameter(0.0)
+    output_scale: Float[Array, "..."] = parameter(1.0)
+    output_offset: Float[Array, "..."] = parameter(0.0)
+
+    def __check_init__(self):
+        sizes = dict(control=self.control_size, output=self.observation_size)
+        for what, size in sizes.items():
+            for name in (f"{what}_scale", f"{what}_offset"):
+                as_entries(getattr(self, name), size, name, "Calibrated")
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        u = self.control_scale * u + self.control_offset
+        return self.system.vector_field(t, x, u, w)
+
+    def observe(self, t: Time, x: State) -> Observation:
+        return self.output_scale * self.system.observe(t, x) + self.output_offset
+
+
+class Corrected(AbstractSystemWrapper):
+    """A system with a network for what its equations leave out,
+
+    `dx/dt = f(t, x, u, w) + size * network((x - x_mean) / x_scale,
+    (u - u_mean) / u_scale)`.
+
+    The last layer of the network is zero at first, so that it begins as the system
+    itself. [`delucax.training.sysid.grey_box`][] fits both together.
+
+    **Arguments:**
+
+    - `system`: the known part.
+    - `width`, `depth`: of the network, 16 and 1 by default.
+    - `size`: the size of the correction of each state's derivative, shape `(n,)` or a
+        number; zero for a derivative that is known, such as that of a position. 1 by
+        default.
+    - `x_mean`, `x_scale`: shape `(n,)` or a number; 0 and 1 by default.
+    - `u_mean`, `u_scale`: shape `(m,)` or a number; 0 and 1 by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
+
+    **Raises:** `ValueError` on other shapes, a scale that is not positive, or if
+    `system` has events.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        spring = dlx.systems.MassSpringDamper()
+        key = jax.random.key(0)
+        grey = dlx.systems.Corrected(spring, width=8, size=[0.0, 1.0], key=key)
+        grey.vector_field(0.0, jnp.ones(2), jnp.zeros(1), None)
+        ```
+    """
+
+    system: AbstractSystem
+    network: eqx.nn.MLP = weight()
+    size: Float[Array, "..."] = parameter(1.0)
+    x_mean: Float[Array, "..."] = parameter(0.0)
+    x_scale: Float[Array, "..."] = parameter(1.0, constraint=positive)
+    u_mean: Float[Array, "..."] = parameter(0.0)
+    u_scale: Float[Array, "..."] = parameter(1.0, constraint=positive)
+
+    def __init__(
+        self,
+        system: AbstractSystem,
+        width: int = 16,
+        depth: int = 1,
+        *,
+        size: Any = 1.0,
+        x_mean: Any = 0.0,
+        x_scale: Any = 1.0,
+        u_mean: Any = 0.0,
+        u_scale: Any = 1.0,
+        key: PRNGKey,
+    ):
+        check_instance(system, AbstractSystem, "system", "Corrected")
+        names = system.state_names, system.control_names
+        *_, network = state_network(*names, width, depth, jnp.tanh, key, "Corrected")
+        last = lambda network: (network.layers[-1].weight, network.layers[-1].bias)
+        zeros = tuple(jnp.zeros_like(leaf) for leaf in last(network))
+        self.system, self.network = system, eqx.tree_at(last, network, zeros)
+        self.size, self.x_mean, self.x_scale = size, x_mean, x_scale
+        self.u_mean, self.u_scale = u_mean, u_scale
+
+    def __check_init__(self):
+        n, m = self.state_size, self.control_size
+        sizes = dict(size=n, x_mean=n, x_scale=n, u_mean=m, u_scale=m)
+        for name, entries in sizes.items():
+            as_entries(getattr(self, name), entries, name, "Corrected")
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        z = (x - self.x_mean) / self.x_scale, (u - self.u_mean) / self.u_scale
+        slope = self.system.vector_field(t, x, u, w)
+        return slope + self.size * self.network(jnp.concatenate(z))

@@ -1,0 +1,139 @@
+"""Measured records, and output-error fits to them."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, once, user_error
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+import delucax as dlx
+from delucax.training import sysid
+
+
+RNG = np.random.default_rng(0)
+TIMES = np.cumsum(RNG.uniform(0.05, 0.15, 60))
+SIGNAL = np.sin(2 * TIMES) + 0.3 * np.sin(5 * TIMES + 1)
+
+
+class Spring(dlx.AbstractSystem):
+    """A cubic spring of which only the position is measured."""
+
+    state_names, control_names = ("x", "v"), ("f",)
+    stiffness: jax.Array = dlx.parameter(4.0, constraint=dlx.positive)
+    damping: jax.Array = dlx.parameter(0.4, constraint=dlx.positive)
+    cubic: jax.Array = dlx.parameter(1.0)
+
+    def vector_field(self, t, x, u, w):
+        force = self.stiffness * x[0] + self.cubic * x[0] ** 3 + self.damping * x[1]
+        return jnp.stack([x[1], u[0] - force])
+
+    def observe(self, t, x):
+        return x[:1]
+
+
+def spring(**constants):
+    return dlx.Discretized(Spring(**constants), 0.1, diffrax.Tsit5(), substeps=2)
+
+
+def between(hold):
+    """The signal as a function of time, by another library."""
+    return {
+        "zero": lambda t: SIGNAL[np.searchsorted(TIMES, t, "right") - 1],
+        "linear": lambda t: np.interp(t, TIMES, SIGNAL),
+        "cubic": CubicSpline(TIMES, SIGNAL, bc_type="natural"),
+    }[hold]
+
+
+def simulated(hold):
+    """The positions by SciPy, from sample to sample."""
+    u, states = between(hold), [np.array([0.3, -0.2])]
+
+    def field(t, x, k):
+        f = SIGNAL[k] if hold == "zero" else u(t)
+        return [x[1], f - 4.0 * x[0] - x[0] ** 3 - 0.4 * x[1]]
+
+    for k in range(len(TIMES) - 1):
+        span, exact = (TIMES[k], TIMES[k + 1]), dict(rtol=1e-10, atol=1e-12)
+        states.append(solve_ivp(field, span, states[-1], args=(k,), **exact).y[:, -1])
+    return np.stack(states)[:, :1]
+
+
+@needs_x64
+@pytest.mark.parametrize("hold", ["zero", "linear", "cubic"])
+def test_a_fit_to_uneven_samples_and_any_hold(hold):
+    record = sysid.Record(simulated(hold), SIGNAL, times=TIMES, hold=hold)
+    assert not record.is_uniform and len(record[10:30]) == 20
+    for k, share in ((3, 0.4), (40, 0.8)):
+        h = np.diff(TIMES)[k]
+        value = share ** np.arange(4)[: record.coefficients().shape[1]]
+        at = between(hold)(TIMES[k] + share * h)
+        assert_close(value @ record.coefficients()[k, :, 0], at, atol=1e-12)
+    guess = spring(stiffness=3.0, damping=0.6, cubic=0.5)
+    names = [f"system.{name}" for name in ("cubic", "damping", "stiffness")]
+    # The velocity is hidden: output error over the whole record, from a guess of it.
+    fitted = sysid.physical(guess, record, names, x0=[0.3, 0.0], window=None)
+    assert_close(fitted.estimate, [1.0, 0.4, 4.0], rtol=1e-5)
+    assert_close(fitted.x0, [0.3, -0.2], atol=1e-5)
+
+
+@needs_x64
+def test_an_uneven_last_window_and_a_burn_in():
+    record = sysid.Record(simulated("linear"), SIGNAL, times=TIMES, hold="linear")
+    names = ["system.damping", "system.stiffness"]
+    given = dict(x0=[0.3, -0.2])
+    whole = sysid.physical(spring(), record, names, window=59, **given)
+    cut = sysid.physical(spring(), record, names, window=25, **given)
+    assert_close(cut.estimate, whole.estimate, rtol=1e-5)
+    # From a wrong start that is not estimated, what comes first does not count.
+    wrong = sysid.physical(
+        spring(), record, names, x0=[0.3, 0.0], window=None, burn_in=35, throw=False
+    )
+    assert_close(wrong.x0, [0.3, 0.0])
+    assert np.max(np.abs(wrong.estimate / whole.estimate - 1)) < 0.2
+
+
+@once
+def test_bad_records():
+    y, u = RNG.normal(size=(20, 2)), RNG.normal(size=20)
+    record = lambda y=y, u=u, **how: sysid.Record(y, u, **({"dt": 0.1} | how))
+    gap, still = y.copy(), y.copy()
+    gap[7, 1], still[:, 0] = np.nan, 3.0
+    times = np.arange(20.0)
+    for make, match in (
+        (lambda: record(gap), "outputs must be finite, got nan in row 7, column 1"),
+        (lambda: record(still), "column 0 of outputs is 3 in all 20 rows"),
+        (lambda: record(u=u[:-2]), "as many rows as outputs or one row less"),
+        (lambda: record(u=u[:-1], hold="linear"), r"as many rows as outputs, got"),
+        (lambda: record(times=times), "one of dt and times"),
+        (lambda: record(dt=0.0), "dt must be"),
+        (lambda: record(hold="first"), "hold must be"),
+        (lambda: record(dt=None, times=times[:5]), r"times must have shape \(20,\)"),
+        (lambda: record()[3:4], "must leave 2 samples or more of 20"),
+        (lambda: record()[::2], "a slice of neighbouring samples"),
+    ):
+        with user_error(match=match):
+            make()
+    for row, time, what in ((5, 4.0, "5 repeats 4"), (9, 2.0, "9 is before 8")):
+        wrong = times.copy()
+        wrong[row] = time
+        with user_error(match=f"times must increase, but .* in row {what}"):
+            record(dt=None, times=wrong)
+    with user_error(match="samples must be uniform in time, those of record"):
+        sysid.linear(record(dt=None, times=times**1.5))
+    with user_error(match="must be a delucax.Discretized system without events"):
+        plant = dlx.LinearDynamics(np.eye(2), np.ones((2, 1)))
+        sysid.physical(plant, record(), "A")
+
+
+@once
+def test_a_record_is_a_pytree():
+    record = sysid.Record(np.ones((5, 1)), np.arange(5.0), dt=0.1)
+    doubled = eqx.filter_jit(lambda r: jax.tree.map(lambda a: 2 * a, r))(record)
+    assert_close(doubled.controls[:, 0], 2 * np.arange(5.0))
+    first, second = record.split(0.6)
+    assert (len(first), len(second)) == (3, 2)
+    assert_close(second.times, [0.3, 0.4], rtol=1e-6)
