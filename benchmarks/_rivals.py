@@ -27,7 +27,7 @@ from benchmarks._family import cartpole
 
 
 STORE = _cases.RESULTS / "rivals.jsonl"
-SEEDS, BUDGET, TIMES = 3, 60.0, 20
+SEEDS, BUDGET, TIMES = 3, 30.0, 20
 STARTS, VALIDATION, CHECKS = 32, 16, 20
 TASKS = ("pendulum", "acrobot", "cart-pole")
 OURS = "synthesise"

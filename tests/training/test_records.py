@@ -137,3 +137,35 @@ def test_a_record_is_a_pytree():
     first, second = record.split(0.6)
     assert (len(first), len(second)) == (3, 2)
     assert_close(second.times, [0.3, 0.4], rtol=1e-6)
+
+
+@needs_x64
+def test_validation():
+    clean = simulated("linear")
+    noisy = clean + 0.01 * RNG.normal(size=clean.shape)
+    record = sysid.Record(noisy, SIGNAL, times=TIMES, hold="linear")
+    true = sysid.validate(spring(), record, x0=[0.0, 0.0], start=15, ahead=5, lags=8)
+    # The start is estimated, so that nothing but the noise is left.
+    errors = noisy - true.simulated[0]
+    assert_close(true.rmse, np.sqrt(np.mean(errors[15:] ** 2)), rtol=1e-12)
+    assert_close(true.rmse, 0.01, rtol=0.3)
+    assert np.all(np.abs(true.ahead / 0.01 - 1) < 0.5) and len(true.ahead) == 5
+    spread = np.std(noisy[15:])
+    assert_close(true.fit, 100 * (1 - true.rmse / spread), rtol=1e-10)
+    # The correlations by their definition.
+    e = errors[15:, 0] - np.mean(errors[15:, 0])
+    u = SIGNAL[15:] - np.mean(SIGNAL[15:])
+    each = np.array([e[k:] @ e[: len(e) - k] for k in range(1, 9)]) / (e @ e)
+    assert_close(true.autocorrelation[:, 0], each, atol=1e-10)
+    both = e[3:] @ u[:-3] / np.sqrt((e @ e) * (u @ u))
+    assert_close(true.cross_correlation[3, 0, 0], both, atol=1e-10)
+    assert true.p_value > 0.01
+    wrong = sysid.validate(spring(cubic=0.0), record, x0=[0.3, 0.0])
+    assert wrong.p_value < 1e-6 and wrong.rmse > 3 * true.rmse
+    assert "fit, %" in repr(wrong)
+    # Records together count as one.
+    two = [record[:30], record[30:]]
+    parts = sysid.validate(spring(), two, x0=[0.0, 0.0], start=8, lags=5)
+    assert [len(run) for run in parts.simulated] == [30, 30]
+    with user_error(match="must have more than the 70 samples of start and ahead"):
+        sysid.validate(spring(), record, x0=[0.0, 0.0], start=50)

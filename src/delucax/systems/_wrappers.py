@@ -124,7 +124,10 @@ class Calibrated(AbstractSystemWrapper):
     output_offset: Float[Array, "..."] = parameter(0.0)
 
     def __check_init__(self):
-        sizes = dict(control=self.control_size, output=self.observation_size)
+        # The other way round a wrong shape would fail in `observe`.
+        super().__check_init__()
+        system = self.system
+        sizes = dict(control=system.control_size, output=system.observation_size)
         for what, size in sizes.items():
             for name in (f"{what}_scale", f"{what}_offset"):
                 as_entries(getattr(self, name), size, name, "Calibrated")
@@ -207,6 +210,7 @@ class Corrected(AbstractSystemWrapper):
         self.u_mean, self.u_scale = u_mean, u_scale
 
     def __check_init__(self):
+        super().__check_init__()
         n, m = self.state_size, self.control_size
         sizes = dict(size=n, x_mean=n, x_scale=n, u_mean=m, u_scale=m)
         for name, entries in sizes.items():

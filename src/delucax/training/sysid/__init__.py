@@ -1,5 +1,6 @@
 """System identification: models of the dynamics from recorded data."""
 
+from ._grey_box import grey_box as grey_box, GreyBox as GreyBox
 from ._identified import Identified as Identified
 from ._linear import arx as arx, linear as linear
 from ._neural import (
@@ -9,3 +10,5 @@ from ._neural import (
 )
 from ._physical import physical as physical
 from ._record import Record as Record
+from ._tables import from_frame as from_frame, read_csv as read_csv
+from ._validate import validate as validate, Validation as Validation

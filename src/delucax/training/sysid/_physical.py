@@ -5,7 +5,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.flatten_util
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,7 +13,6 @@ from ..._check import (
     check_at_most,
     check_bool,
     check_count,
-    check_finite,
     check_instance,
     check_positive,
     is_concrete,
@@ -32,7 +30,8 @@ from ._multiple_shooting import (
     solve,
 )
 from ._record import Record, Records, records_of
-from ._sampled import Sampling, sampling_of
+from ._sampled import sampling_of
+from ._starts import guessed_starts, simulated_records
 from ._windows import begins_of, cut_into_windows
 
 
@@ -147,16 +146,11 @@ def physical(
         check_positive(noise, "noise", where)
         noise = jnp.broadcast_to(as_float_array(noise), (size,))
     sampling, groups, rows = sampling_of(dynamics, records, where)
-    if x0 is not None:
-        firsts = _first_states(x0, groups, n, where)
-        guesses = _simulated(dynamics, sampling, firsts, groups, rows)
-    elif size == n:
+    if x0 is None and size == n:
         guesses = [group.outputs for group in groups]
     else:
-        raise ValueError(
-            f"{where}: x0 must be given where the state (of size {n}) is not what is "
-            f"observed (of size {size})."
-        )
+        firsts = guessed_starts(dynamics, x0, groups, where)
+        guesses = simulated_records(dynamics, sampling, firsts, groups, rows)
     assembly, values = partition_trainable(dynamics, parameters, where)
     names = [
         path + (f"[{','.join(map(str, index))}]" if index else "")
@@ -233,46 +227,6 @@ def _intervals(
     )
     low, high = jnp.minimum(below, above), jnp.maximum(below, above)
     return low, high, known, solution.starts[firsts]
-
-
-def _first_states(
-    x0: Any, groups: list[Record], n: int, where: str
-) -> list[Float[Array, "_ n"]]:
-    """A guess of the first state of each record."""
-    sizes = [len(group.outputs) for group in groups]
-    x0, count = as_float_array(x0), sum(sizes)
-    if x0.shape not in ((n,), (count, n)):
-        raise ValueError(
-            f"{where}: x0 must have shape ({n},), or ({count}, {n}) with one for each "
-            f"record, got {x0.shape}."
-        )
-    check_finite(x0, "x0", where)
-    x0 = jnp.broadcast_to(x0, (count, n)).astype(groups[0].outputs.dtype)
-    return jnp.split(x0, np.cumsum(sizes)[:-1])
-
-
-@eqx.filter_jit
-def _simulated(
-    dynamics: AbstractDynamics,
-    sampling: Sampling,
-    firsts: list[Float[Array, "_ n"]],
-    groups: list[Record],
-    rows: list[Any],
-) -> list[Float[Array, "_ _ n"]]:
-    """The states by a guess of the dynamics; held where they run away."""
-    advance = sampling(dynamics)
-
-    def step(x, inputs):
-        x_next = advance(inputs[0], x, inputs[1]).astype(x.dtype)
-        x_next = jnp.where(jnp.all(jnp.isfinite(x_next)), x_next, x)
-        return x_next, x_next
-
-    def of(x0, times, rows):
-        _, states = lax.scan(step, x0, (times[:-1], rows))
-        return jnp.concatenate([x0[None], states])
-
-    times = [group.times for group in groups]
-    return [jax.vmap(of)(*one) for one in zip(firsts, times, rows, strict=True)]
 
 
 def _ends(

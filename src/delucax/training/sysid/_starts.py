@@ -1,0 +1,96 @@
+"""The states from which a model runs along measurements."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._check import check_finite
+from ..._module import as_float_array
+from ...dynamics import AbstractDynamics
+from .._trainable import Assembly
+from ._multiple_shooting import Solution, solve
+from ._record import Record
+from ._sampled import Sampling
+from ._windows import Windows
+
+
+# Enough for a handful of numbers; a start that needs more is far off.
+_MAX_STEPS = 30
+
+
+def guessed_starts(
+    dynamics: AbstractDynamics, x0: Any, groups: list[Record], where: str
+) -> list[Float[Array, "_ n"]]:
+    """A guess of the first state of each record: what is given, or observed."""
+    n, sizes = dynamics.state_size, [len(group.outputs) for group in groups]
+    if x0 is None:
+        if groups[0].outputs.shape[2] == n:
+            return [group.outputs[:, 0] for group in groups]
+        raise ValueError(
+            f"{where}: x0 must be given where the state (of size {n}) is not what is "
+            f"observed (of size {groups[0].outputs.shape[2]})."
+        )
+    x0, count = as_float_array(x0), sum(sizes)
+    if x0.shape not in ((n,), (count, n)):
+        raise ValueError(
+            f"{where}: x0 must have shape ({n},), or ({count}, {n}) with one for each "
+            f"record, got {x0.shape}."
+        )
+    check_finite(x0, "x0", where)
+    x0 = jnp.broadcast_to(x0, (count, n)).astype(groups[0].outputs.dtype)
+    return jnp.split(x0, np.cumsum(sizes)[:-1])
+
+
+def simulated(
+    dynamics: AbstractDynamics, sampling: Sampling, x0: Array, times: Array, rows: Array
+) -> Float[Array, "samples n"]:
+    """The states that the rows lead to; held where they run away."""
+    advance = sampling(dynamics)
+
+    def step(x, inputs):
+        x_next = advance(inputs[0], x, inputs[1]).astype(x.dtype)
+        x_next = jnp.where(jnp.all(jnp.isfinite(x_next)), x_next, x)
+        return x_next, x_next
+
+    _, states = lax.scan(step, x0, (times[:-1], rows))
+    return jnp.concatenate([x0[None], states])
+
+
+@eqx.filter_jit
+def simulated_records(
+    dynamics: AbstractDynamics,
+    sampling: Sampling,
+    firsts: list[Float[Array, "_ n"]],
+    groups: list[Record],
+    rows: list[Float[Array, "_ _ row"]],
+) -> list[Float[Array, "_ _ n"]]:
+    """The states of each record, from its first."""
+    run = lambda x0, times, rows: simulated(dynamics, sampling, x0, times, rows)
+    times = [group.times for group in groups]
+    return [jax.vmap(run)(*one) for one in zip(firsts, times, rows, strict=True)]
+
+
+def estimated_starts(
+    dynamics: AbstractDynamics,
+    sampling: Sampling,
+    guesses: Float[Array, "windows n"],
+    times: Float[Array, "windows points"],
+    rows: Float[Array, "windows steps row"],
+    outputs: Float[Array, "windows points y"],
+) -> Solution:
+    """The states at which windows begin, by least squares on their outputs."""
+    # In units of their spread, so that none outweighs the others.
+    spread = jnp.std(outputs, axis=(0, 1))
+    spread = jnp.where(spread > 0, spread, 1).astype(outputs.dtype)
+    counts = jnp.ones(times.shape, bool)
+    data = Windows(times, rows, outputs, counts, spread, 0 * spread)
+    nothing = {"": jnp.zeros(1, outputs.dtype)}
+    most: Any = np.asarray(_MAX_STEPS)
+    leaves, structure = jax.tree.flatten(dynamics)
+    known = Assembly(leaves, structure, holes=(), constraints={})
+    return solve(known, nothing, guesses, data, sampling, most)
