@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._check import check_finite
+from .._check import check_finite, is_concrete
 from .._message import shortened
 from .._module import AbstractConstraint, get_path, marked_leaves, path_string
 
@@ -76,7 +76,10 @@ def partition_trainable(
                 constraint = other
         value = strip_weak_type(leaf)
         if constraint is not None:
-            if not np.all(constraint.holds(leaf)):
+            # What is known is checked also while something else is traced.
+            with jax.ensure_compile_time_eval():
+                holds = not is_concrete(leaf) or bool(np.all(constraint.holds(leaf)))
+            if not holds:
                 raise ValueError(f"{where}: {name} must be {constraint}, got {leaf}.")
             constraints[path] = constraint
             value = constraint.unconstrain(value)

@@ -31,12 +31,16 @@ from ._multiple_shooting import (
 )
 from ._record import Record, Records, records_of
 from ._sampled import sampling_of
-from ._starts import guessed_starts, simulated_records
+from ._starts import guessed_starts, simulated_records, stitched
 from ._windows import begins_of, cut_into_windows
 
 
-_SHORT_WINDOW = 2
-"""The window of the second attempt, short to keep a bad guess from diverging."""
+_PASSES, _LESS = 4, 0.8
+"""The most fits in units of the residuals of the one before, and the share that is no
+other noise."""
+_SHORT, _HIDDEN = 2, 8
+"""The first window of the second attempt, short to keep a bad guess from diverging:
+where the state is observed, and where it is not."""
 
 
 def physical(
@@ -65,9 +69,9 @@ def physical(
     together. Constrained parameters are estimated in the unconstrained space, as in
     [`delucax.training.fit`][], and their intervals are within the valid set.
 
-    Where the states are observed, and the fit does not converge or its residuals are
-    correlated from step to step, it starts once more, from a fit on windows of two
-    steps. It has converged where no step of the linear
+    Where the fit does not converge, or its residuals are correlated from step to step,
+    it starts once more, from a fit on shorter windows: of two steps, or of eight and
+    then some more where states are hidden. It has converged where no step of the linear
     model is longer than a twentieth of what the noise makes the estimate vary; if it
     has not, `result` says so, and there are no intervals. A better first guess, a
     shorter window or smaller steps of the integrator may help then.
@@ -160,37 +164,50 @@ def physical(
 
     estimates_starts = burn_in == 0
 
-    def fit(values, window):
+    def fit(values, guesses, window):
         given = guesses, groups, rows
         starts, data = cut_into_windows(*given, window, burn_in, noise)
         options: Any = dict(estimates_starts=estimates_starts)
         # First in units of the spread of each output; then from there in units of the
         # residuals that are left, which weighs outputs of unlike noise as they deserve.
         solution = solve(assembly, values, starts, data, sampling, most, **options)
-        if noise is not None:
-            return solution
-        data = data._replace(noise=solution.noise)
-        values, starts = solution.values, solution.starts
-        return solve(assembly, values, starts, data, sampling, most, **options)
+        for _ in range(_PASSES if noise is None else 0):
+            before, data = solution, data._replace(noise=solution.noise)
+            given = solution.values, solution.starts, data, sampling, most
+            solution = solve(assembly, *given, **options)
+            # The minimum may be another one in these units, with other residuals.
+            known = is_concrete(solution.noise)
+            if not known or np.all(solution.noise > _LESS * before.noise):
+                break
+        return solution
 
     # Where the windows of each record are among all of them.
     counts = [len(begins_of(g, window)) for g in groups for _ in g.outputs]
     at = np.cumsum([0, *counts])
     unknown = len(names) + n * at[-1] * estimates_starts
     few = bool(size * sum(map(len, records)) <= unknown)
-    solution = fit(values, window)
+    solution = fit(values, guesses, window)
     # A second attempt, if it is known now that the first did not converge, or that its
     # residuals are correlated from step to step, as the noise is not.
-    retries = x0 is None and not few and window > _SHORT_WINDOW and not burn_in
-    if retries and is_concrete(solution.correlation):
+    is_observed = x0 is None and size == n
+    rungs = [] if few or not estimates_starts else _rungs(window, is_observed)
+    if rungs and is_concrete(solution.correlation):
         failed = solution.result != RESULTS.successful
         # On short windows nothing grows, so that a worse guess does, and there are
         # fewer minima that are not the least.
         if failed or float(solution.correlation) > CORRELATED:
-            again = fit(fit(values, _SHORT_WINDOW).values, window)
-            less = np.prod(again.noise) < np.prod(solution.noise)
-            if again.result == RESULTS.successful and (failed or less):
-                solution = again
+            again, states = values, guesses
+            for rung in rungs:
+                short = fit(again, states, rung)
+                again = short.values
+                if not is_observed:
+                    model = assembly(again)
+                    given = sampling, short.starts, groups, rows, rung
+                    states = stitched(model, *given)
+            last = fit(again, states, window)
+            less = np.prod(last.noise) < np.prod(solution.noise)
+            if last.result == RESULTS.successful and (failed or less):
+                solution = last
     summary = _intervals(assembly, solution, reach, few, at[:-1])
     low, high, known, starts = summary
     fitted = Identified(
@@ -208,6 +225,15 @@ def physical(
         result=RESULTS.successful if few else solution.result,
     )
     return checked(fitted, throw)
+
+
+def _rungs(window: int, is_observed: bool) -> list[int]:
+    """The windows of the second attempt before the last one."""
+    if is_observed:
+        return [_SHORT] if window > _SHORT else []
+    # Hidden states are carried from each to the next, which may be some times as long.
+    between = round(np.sqrt(_HIDDEN * window))
+    return [rung for rung in (_HIDDEN, between) if 2 * rung <= window]
 
 
 @eqx.filter_jit

@@ -16,7 +16,7 @@ from .._trainable import Assembly
 from ._multiple_shooting import Solution, solve
 from ._record import Record
 from ._sampled import Sampling
-from ._windows import Windows
+from ._windows import begins_of, Windows
 
 
 # Enough for a handful of numbers; a start that needs more is far off.
@@ -73,6 +73,35 @@ def simulated_records(
     run = lambda x0, times, rows: simulated(dynamics, sampling, x0, times, rows)
     times = [group.times for group in groups]
     return [jax.vmap(run)(*one) for one in zip(firsts, times, rows, strict=True)]
+
+
+@eqx.filter_jit
+def stitched(
+    dynamics: AbstractDynamics,
+    sampling: Sampling,
+    starts: Float[Array, "windows n"],
+    groups: list[Record],
+    rows: list[Float[Array, "_ _ row"]],
+    window: int,
+) -> list[Float[Array, "_ _ n"]]:
+    """The states of each record, window by window from their estimated starts."""
+    run = lambda x0, times, rows: simulated(dynamics, sampling, x0, times, rows)
+    parts, count = [], 0
+    for group, own in zip(groups, rows, strict=True):
+        begins, steps = begins_of(group, window), group.times.shape[1] - 1
+        inside = np.minimum(begins[:, None] + np.arange(window + 1), steps)
+        of_step = np.minimum(inside[:, :-1], steps - 1)
+        runs = len(group.outputs)
+        firsts = starts[count : count + runs * len(begins)]
+        count += len(firsts)
+        flat = lambda array: array.reshape(-1, *array.shape[2:])
+        states = jax.vmap(run)(
+            firsts, flat(group.times[:, inside]), flat(own[:, of_step])
+        )
+        states = states.reshape(runs, len(begins), window + 1, -1)
+        at = np.minimum(np.arange(steps + 1) // window, len(begins) - 1)
+        parts.append(states[:, at, np.arange(steps + 1) - window * at])
+    return parts
 
 
 def estimated_starts(

@@ -1,0 +1,1 @@
+"""Public identification problems: the plants, the data and the fits."""

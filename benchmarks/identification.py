@@ -1,0 +1,139 @@
+"""`python -m benchmarks.identification`: identification, graded by public data.
+
+`--data DIR` names a folder with `cascaded_tanks/dataBenchmark.csv`,
+`silverbox/SNLS80mV.csv.gz` and `deluca_lung/arrays.npz`; the page
+`docs/identification_exam.md`, which this command writes, says where they are from. The
+parts:
+
+- `tanks`, `silverbox`, `bouc_wen`: a linear model, physics, and physics with a network
+  of ten seeds, fitted to the estimation half alone, and scored as
+  `nonlinear_benchmarks` scores: the root of the mean squared error of the free run on
+  the test, after the first 50 samples, from which the state is estimated. Bouc-Wen
+  needs no file;
+- `coverage`: how often intervals of 95% hold the truth, on 1,000 simulated records of
+  three plants;
+- `lung`: controllers in the simulator that was published with Deluca.
+
+A part whose file is not there is left out. All is in double precision.
+"""
+
+import argparse
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import _cases
+from benchmarks._identified.case import DATA
+from benchmarks._identified.page import page
+from benchmarks._machine import describe, limit_cores
+from benchmarks._results import updated
+
+
+STORE = _cases.RESULTS / "identified.jsonl"
+RESULTS = _cases.RESULTS / "identification.json"
+SEEDS = 10
+PROBLEMS = ("tanks", "silverbox", "bouc_wen")
+PARTS = (*PROBLEMS, "coverage", "lung")
+SECONDS = 180
+"""A fit may take these, with compilation."""
+
+
+def problem(name: str, data: Path, seeds: int) -> dict[str, Any] | None:
+    """The errors of each method on each test."""
+    module: Any = importlib.import_module(f"benchmarks._identified.{name}")
+    file = getattr(module, "FILE", None)
+    if file and not (data / file).exists():
+        print(f"  {data / file} is not there, and {name} is left out")
+        return None
+    cases = [{"problem": name, "method": "linear", "seed": 0}]
+    cases += [{"problem": name, "method": "grey box", "seed": k} for k in range(seeds)]
+    os.environ[DATA] = str(data)
+    rows = _cases.run("benchmarks._identified.case", STORE, cases, _said)
+    tables: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        for method, errors in row["errors"].items():
+            for part, error in errors.items():
+                tables.setdefault(method, {}).setdefault(part, []).append(error)
+    made = [
+        {"method": method, "seeds": len(next(iter(parts.values())))}
+        | {part: _summary(values) for part, values in parts.items()}
+        for method, parts in tables.items()
+    ]
+    seconds = [row["seconds"] for row in rows]
+    slowest = max(seconds)
+    grey = tables.get("grey box", {})
+    for part, limit in module.LIMITS.items():
+        median = float(np.median(grey[part]))
+        verdict = "met" if median <= limit else "NOT met"
+        print(f"  {name}, {part}: {median:.4g} {module.UNIT} ({limit:g}): {verdict}")
+    print(f"  longest fit: {slowest:.0f} s ({SECONDS})")
+    about = {"unit": module.UNIT, "limits": module.LIMITS, "rows": made}
+    return about | {"longest fit, s": slowest, "failed": len(cases) - len(rows)}
+
+
+def _said(row: dict[str, Any]) -> str:
+    parts = next(reversed(row["errors"].values()))
+    errors = ", ".join(f"{part} {error:.4g}" for part, error in parts.items())
+    return f"{errors}; {row['seconds']:.0f} s"
+
+
+def _summary(values: list[float]) -> dict[str, float]:
+    low, middle, high = np.quantile(values, [0, 0.5, 1])
+    return {"median": float(middle), "least": float(low), "most": float(high)}
+
+
+def covered(records: int) -> dict[str, Any]:
+    """The coverage of the intervals."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from benchmarks._identified.coverage import coverage, FAILURES, LIMITS
+
+    rows = coverage(records)
+    for row in rows:
+        is_met = LIMITS[0] <= row["covered, %"] <= LIMITS[1]
+        is_met = is_met and row["failures, %"] <= FAILURES
+        print(f"  {row['plant']}: {'met' if is_met else 'NOT met'}")
+    return {"rows": rows}
+
+
+def main() -> None:
+    """Run the parts that are named, and write the page."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.identification")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="the folder")
+    parser.add_argument("--part", choices=PARTS, action="append")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="of the networks")
+    parser.add_argument("--records", type=int, default=1000, help="of the coverage")
+    parser.add_argument("--page", action="store_true", help="write the page alone")
+    options = parser.parse_args()
+    for part in [] if options.page else options.part or PARTS:
+        print(f"\n== {part}", flush=True)
+        if part in PROBLEMS:
+            result = problem(part, options.data, options.seeds)
+        elif part == "coverage":
+            result = covered(options.records)
+        else:
+            result = in_the_lung(options.data)
+        if result is not None:
+            new = {part: result | {"machine": describe()}}
+            updated(RESULTS, lambda old, new=new: new)
+    page(RESULTS)
+
+
+def in_the_lung(data: Path) -> dict[str, Any] | None:
+    """Controllers in the published simulator."""
+    from benchmarks import _published_lung
+
+    file = data / _published_lung.FILE
+    if not file.exists():
+        print(f"  {file} is not there, and the lung is left out")
+        return None
+    return _published_lung.published_lung(file)
+
+
+if __name__ == "__main__":
+    limit_cores(2)
+    main()
