@@ -1,5 +1,7 @@
 """Measured records, and output-error fits to them."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -72,6 +74,8 @@ def test_a_fit_to_uneven_samples_and_any_hold(hold):
         value = share ** np.arange(4)[: record.coefficients().shape[1]]
         at = between(hold)(TIMES[k] + share * h)
         assert_close(value @ record.coefficients()[k, :, 0], at, atol=1e-12)
+    if hold == "linear":
+        return  # it is between the others, and a fit is a program
     guess = spring(stiffness=3.0, damping=0.6, cubic=0.5)
     names = [f"system.{name}" for name in ("cubic", "damping", "stiffness")]
     # The velocity is hidden: output error over the whole record, from a guess of it.
@@ -82,18 +86,14 @@ def test_a_fit_to_uneven_samples_and_any_hold(hold):
 
 @needs_x64
 def test_an_uneven_last_window_and_a_burn_in():
-    record = sysid.Record(simulated("linear"), SIGNAL, times=TIMES, hold="linear")
-    names = ["system.damping", "system.stiffness"]
-    given = dict(x0=[0.3, -0.2])
-    whole = sysid.physical(spring(), record, names, window=59, **given)
-    cut = sysid.physical(spring(), record, names, window=25, **given)
-    assert_close(cut.estimate, whole.estimate, rtol=1e-5)
+    record = sysid.Record(simulated("zero"), SIGNAL, times=TIMES)
+    fit = functools.partial(sysid.physical, spring(), record, "system.stiffness")
+    cut = fit(x0=[0.3, -0.2], window=25, noise=1e-3)
+    assert_close(cut.estimate, 4.0, rtol=1e-5)
     # From a wrong start that is not estimated, what comes first does not count.
-    wrong = sysid.physical(
-        spring(), record, names, x0=[0.3, 0.0], window=None, burn_in=35, throw=False
-    )
+    wrong = fit(x0=[0.3, 0.0], window=None, burn_in=35, noise=1e-3, throw=False)
     assert_close(wrong.x0, [0.3, 0.0])
-    assert np.max(np.abs(wrong.estimate / whole.estimate - 1)) < 0.2
+    assert_close(wrong.estimate, 4.0, rtol=0.05)
 
 
 @once
@@ -141,9 +141,9 @@ def test_a_record_is_a_pytree():
 
 @needs_x64
 def test_validation():
-    clean = simulated("linear")
+    clean = simulated("zero")
     noisy = clean + 0.01 * RNG.normal(size=clean.shape)
-    record = sysid.Record(noisy, SIGNAL, times=TIMES, hold="linear")
+    record = sysid.Record(noisy, SIGNAL, times=TIMES)
     true = sysid.validate(spring(), record, x0=[0.0, 0.0], start=15, ahead=5, lags=8)
     # The start is estimated, so that nothing but the noise is left.
     errors = noisy - true.simulated[0]
@@ -160,7 +160,8 @@ def test_validation():
     both = e[3:] @ u[:-3] / np.sqrt((e @ e) * (u @ u))
     assert_close(true.cross_correlation[3, 0, 0], both, atol=1e-10)
     assert true.p_value > 0.01
-    wrong = sysid.validate(spring(cubic=0.0), record, x0=[0.3, 0.0])
+    same = dict(start=15, ahead=5, lags=8)  # so that nothing compiles again
+    wrong = sysid.validate(spring(cubic=0.0), record, x0=[0.0, 0.0], **same)
     assert wrong.p_value < 1e-6 and wrong.rmse > 3 * true.rmse
     assert "fit, %" in repr(wrong)
     # Records together count as one.

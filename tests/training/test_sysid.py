@@ -310,15 +310,14 @@ def test_the_start_of_each_run_is_returned():
     assert_close(found.x0, firsts, atol=3 * float(std.max()))
 
 
-@pytest.mark.parametrize("off, paths", [((0.6, 1.5), RATES), ((1, 1, 1.3), "system.E")])
-def test_intervals_of_a_reactor_cover_the_truth(off, paths):
-    truth = np.array([2.092, 7.2e10] if paths == RATES else [8750.0])
-    inside = []
-    for seed in range(60):
-        found = sysid.physical(reactor(*off), record(*reacted(seed)), paths)
+def test_intervals_of_a_reactor_cover_the_truth():
+    """More records, and more plants, are in `benchmarks.identification`."""
+    truth, inside = np.array([2.092, 7.2e10]), []
+    for seed in range(20):
+        found = sysid.physical(reactor(0.6, 1.5), record(*reacted(seed)), RATES)
         inside += list((found.low < truth) & (truth < found.high))
-    # Of 60 intervals of 95%, fewer than 51 has a chance below 0.1%.
-    assert np.mean(inside) >= 51 / 60
+    # Of 40 intervals of 95%, fewer than 33 has a chance below 0.1%.
+    assert np.mean(inside) >= 33 / 40
 
 
 def test_bad_input():
