@@ -10,5 +10,6 @@ from ._neural import (
 )
 from ._physical import physical as physical
 from ._record import Record as Record
+from ._subspace import Subspace as Subspace, subspace as subspace
 from ._tables import from_frame as from_frame, read_csv as read_csv
 from ._validate import validate as validate, Validation as Validation
