@@ -110,8 +110,10 @@ def subspace(
     the number of samples.
 
     The model is strictly proper: a control moves no output before the next sample, as
-    in all dynamics here. Controls that depend on the noise, as those of a feedback do,
-    bias the estimate. A and B are not forced to be stable.
+    in all dynamics here. Where it does, as a measured input between two samples may,
+    `Record(outputs[:-1], controls[1:], dt=dt)` is the record of such a model. Controls
+    that depend on the noise, as those of a feedback do, bias the estimate. The model is
+    not forced to be stable; too high an order may give a mode that is not.
 
     **Arguments:**
 
