@@ -139,6 +139,13 @@ def test_a_record_is_a_pytree():
     assert_close(second.times, [0.3, 0.4], rtol=1e-6)
 
 
+@once
+def test_a_traced_record_is_fitted():
+    y, u = RNG.normal(size=(3, 30, 1)), RNG.normal(size=(30, 1))
+    fit = lambda y: sysid.linear(sysid.Record(y, u, dt=0.1), throw=False).estimate
+    assert_close(eqx.filter_jit(jax.vmap(fit))(y)[1], fit(y[1]), atol=1e-5)
+
+
 @needs_x64
 def test_validation():
     clean = simulated("zero")

@@ -219,7 +219,8 @@ def uniform_records(records: Any, where: str) -> list[Record]:
                 "resample them."
             )
         steps = record.dt, listed[0].dt
-        if is_concrete(steps) and not np.allclose(*map(float, steps), rtol=_UNEVEN):
+        known = all(map(is_concrete, steps))
+        if known and not np.allclose(*map(float, steps), rtol=_UNEVEN):
             raise ValueError(
                 f"{where}: all records must have one dt, got {float(listed[0].dt):g} "
                 f"and, in record[{index}], {float(record.dt):g}."
