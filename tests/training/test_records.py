@@ -177,3 +177,38 @@ def test_validation():
     assert [len(run) for run in parts.simulated] == [30, 30]
     with user_error(match="must have more than the 70 samples of start and ahead"):
         sysid.validate(spring(), record, x0=[0.0, 0.0], start=50)
+
+
+@needs_x64
+def test_bootstrap():
+    """Of a straight line, whose covariance is known: y = h / mass sum of u."""
+    rng = np.random.default_rng(3)
+
+    class Integrator(dlx.AbstractSystem):
+        state_names, control_names = ("x",), ("u",)
+        gain: jax.Array = dlx.parameter(1.0)
+
+        def vector_field(self, t, x, u, w):
+            return self.gain * u
+
+    plant = dlx.Discretized(Integrator(), 0.1, diffrax.Euler())
+    u = rng.normal(size=(120, 1))
+    past = 0.1 * np.concatenate([np.zeros((1, 1)), np.cumsum(u[:-1], axis=0)])
+    y = 0.5 + 2.0 * past + 0.05 * rng.normal(size=past.shape)
+    record = sysid.Record(y, u, dt=0.1)
+    fitted = sysid.physical(plant, record, "system.gain", window=None)
+    rows = np.concatenate([past, np.ones_like(past)], axis=1)
+    std = fitted.noise[0] * np.sqrt(np.linalg.inv(rows.T @ rows)[0, 0])
+    assert_close(fitted.std, std, rtol=1e-6)
+    drawn = functools.partial(sysid.bootstrap, fitted, record, window=None)
+    again = drawn(draws=200, key=jax.random.key(0))
+    assert again.failures == 0 and again.names == fitted.names
+    # The standard deviation of 200 draws is known to 5%.
+    assert_close(again.std, std, rtol=0.2)
+    assert_close(again.low, fitted.low, atol=float(std))
+    assert_close(again.high, fitted.high, atol=float(std))
+    with user_error(match="block must be at most the 120 of a record, got 121"):
+        drawn(block=121, key=jax.random.key(0))
+    linear = sysid.linear(record)
+    with user_error(match="fitted must be of sysid.physical"):
+        sysid.bootstrap(linear, record, key=jax.random.key(0))

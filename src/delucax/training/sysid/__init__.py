@@ -1,5 +1,6 @@
 """System identification: models of the dynamics from recorded data."""
 
+from ._bootstrap import Bootstrap as Bootstrap, bootstrap as bootstrap
 from ._grey_box import grey_box as grey_box, GreyBox as GreyBox
 from ._identified import Identified as Identified
 from ._latent import Encoder as Encoder, LatentDynamics as LatentDynamics

@@ -108,18 +108,20 @@ def estimated_starts(
     dynamics: AbstractDynamics,
     sampling: Sampling,
     guesses: Float[Array, "windows n"],
-    times: Float[Array, "windows points"],
-    rows: Float[Array, "windows steps row"],
-    outputs: Float[Array, "windows points y"],
+    data: Windows,
 ) -> Solution:
     """The states at which windows begin, by least squares on their outputs."""
-    # In units of their spread, so that none outweighs the others.
-    spread = jnp.std(outputs, axis=(0, 1))
-    spread = jnp.where(spread > 0, spread, 1).astype(outputs.dtype)
-    counts = jnp.ones(times.shape, bool)
-    data = Windows(times, rows, outputs, counts, spread, 0 * spread)
-    nothing = {"": jnp.zeros(1, outputs.dtype)}
+    nothing = {"": jnp.zeros(1, data.observations.dtype)}
     most: Any = np.asarray(_MAX_STEPS)
     leaves, structure = jax.tree.flatten(dynamics)
     known = Assembly(leaves, structure, holes=(), constraints={})
     return solve(known, nothing, guesses, data, sampling, most)
+
+
+def whole_windows(times: Array, rows: Array, outputs: Array) -> Windows:
+    """Windows whose points all count, in units of the spread of the outputs, so that
+    none outweighs the others."""
+    spread = jnp.std(outputs, axis=(0, 1))
+    spread = jnp.where(spread > 0, spread, 1).astype(outputs.dtype)
+    counts = jnp.ones(times.shape, bool)
+    return Windows(times, rows, outputs, counts, spread, 0 * spread)

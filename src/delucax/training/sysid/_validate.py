@@ -14,7 +14,7 @@ from ..._results import first_failure, promote, RESULTS
 from ...dynamics import AbstractDynamics
 from ._record import Record, Records, records_of
 from ._sampled import Sampling, sampling_of
-from ._starts import estimated_starts, guessed_starts, simulated
+from ._starts import estimated_starts, guessed_starts, simulated, whole_windows
 
 
 # The most stretches on which predictions are judged.
@@ -176,7 +176,7 @@ def _validated(
     def predicted(x0, times, rows, outputs):
         """Outputs from a state that is estimated from the first of them."""
         early = times[:, :start], rows[:, : start - 1], outputs[:, :start]
-        begin = estimated_starts(model, sampling, x0, *early)
+        begin = estimated_starts(model, sampling, x0, whole_windows(*early))
         run = lambda x, t, rows: simulated(model, sampling, x, t, rows)
         states = jax.vmap(run)(begin.starts, times, rows)
         return observe(times, states), states, begin.result
