@@ -198,7 +198,7 @@ def test_a_damaged_checkpoint_is_refused(breaths, tmp_path):
 def test_wrong_arguments(breaths):
     with user_error(match="kind must be 'mlp' or 'cnn', got 'rnn'"):
         lung.BreathPolicy(lung.BreathWaveform(), 0.03, "rnn", key=KEY)
-    with user_error(match="model must be a LearnedLung or a LungModel"):
+    with user_error(match="model must be a LearnedLung, a LungModel or a"):
         lung.learned_lung(lung.SingleCompartment())
     with user_error(match="env must be a task with a breath waveform"):
         lung.explore(dlx.make("pendulum"), 3, key=KEY)

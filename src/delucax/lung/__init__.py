@@ -31,6 +31,12 @@ from ._lungs import (
     DoubleCompartment as DoubleCompartment,
     SingleCompartment as SingleCompartment,
 )
+from ._published import (
+    Published as Published,
+    PublishedController as PublishedController,
+    PublishedLung as PublishedLung,
+    read_published as read_published,
+)
 from ._runner import (
     run_breaths as run_breaths,
     Runner as Runner,

@@ -26,6 +26,7 @@ from ._lungs import (
     DoubleCompartment,
     SingleCompartment,
 )
+from ._published import PublishedLung
 from ._ventilation import ventilation
 from ._waveform import BreathWaveform
 
@@ -220,7 +221,10 @@ def double_compartment(
 
 
 def learned_lung(
-    model: LearnedLung | LungModel | None = None, *, horizon: int = 100, **options: Any
+    model: LearnedLung | LungModel | PublishedLung | None = None,
+    *,
+    horizon: int = 100,
+    **options: Any,
 ) -> Environment:
     """Ventilate a lung that was learned from breaths: controllers are trained in it.
 
@@ -230,10 +234,11 @@ def learned_lung(
 
     **Arguments:**
 
-    - `model`: a [`delucax.lung.LearnedLung`][] or a [`delucax.lung.LungModel`][]. By
-        default the learned lung that comes with the library, from breaths of the task
-        `lung/double_compartment`; its sensor is two samples late, and so is its
-        pressure. In the repository, `python -m benchmarks.learned_lung` makes it.
+    - `model`: a [`delucax.lung.LearnedLung`][], a [`delucax.lung.LungModel`][] or a
+        [`delucax.lung.PublishedLung`][]. By default the learned lung that comes with
+        the library, from breaths of the task `lung/double_compartment`; its sensor is
+        two samples late, and so is its pressure. In the repository,
+        `python -m benchmarks.learned_lung` makes it.
     - `horizon`: steps per episode, 100 by default.
     - `**options`: `waveform`, `noise`, `limit` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
@@ -264,12 +269,12 @@ def learned_lung(
         # The task senses before it delays; so it takes what the model delays.
         options |= dict(sensor_delay=model.dynamics.sensor)
         dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
-    elif isinstance(model, LearnedLung):
+    elif isinstance(model, LearnedLung | PublishedLung):
         dynamics, rest = model, model.resting()
     else:
         raise ValueError(
-            f"{where}: model must be a LearnedLung or a LungModel, got "
-            f"{type(model).__name__}."
+            f"{where}: model must be a LearnedLung, a LungModel or a PublishedLung, "
+            f"got {type(model).__name__}."
         )
     options.setdefault("resting_state", rest)
     return ventilation(dynamics, horizon=horizon, **options)
