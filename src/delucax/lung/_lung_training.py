@@ -370,7 +370,7 @@ def train_controllers(
 
 
 @eqx.filter_jit
-def _searched(envs, lists, pips, key, kind, horizon):
+def _searched(envs, lists, pips, key, kind):
     """All combinations of the lists of gains, and the error of each in each lung."""
     lists = [jnp.ravel(values).astype(float) for values in lists]
     gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
@@ -378,8 +378,7 @@ def _searched(envs, lists, pips, key, kind, horizon):
     def in_lung(env):
         def one(gains):
             pid = _KINDS[kind](*gains, dt=env.dt, reference=env.cost.waveform)
-            given: Any = dict(key=key, pips=pips, horizon=horizon)
-            return jnp.mean(breath_error(env, pid, **given))
+            return jnp.mean(breath_error(env, pid, key=key, pips=pips))
 
         return jax.vmap(one)(gains)
 
@@ -395,7 +394,6 @@ def pid_grid(
     ki: Any = GAINS,
     kd: Any = (0.0,),
     pips: Any = PIPS,
-    horizon: int = LENGTH,
 ) -> tuple[Float[Array, "grid 3"], Float[Array, "lungs grid"]]:
     """The error of every PID of a grid in every lung, all at once.
 
@@ -409,7 +407,6 @@ def pid_grid(
     - `kp`, `ki`, `kd`: the gains, of which all combinations are tried; 0, 0.1, ...,
         0.9, 1, 2, ..., 10 for the first two and 0 for the last by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `horizon`: steps per episode, 29 by default.
 
     **Returns:** the gains (kp, ki, kd) of each, shape `(grid, 3)`, and the mean error
         of each in each lung, shape `(lungs, grid)` [cmH2O]; that of one lung for a
@@ -437,7 +434,6 @@ def pid_grid(
     pips = as_pips(pips, waveform_of(envs, where, stacked=True), where)
     check_key(key, where)
     check_choice(kind, tuple(_KINDS), "kind", where)
-    horizon = check_count(horizon, "horizon", where)
     lists = []
     for name, values in (("kp", kp), ("ki", ki), ("kd", kd)):
         array = as_float_array(values)
@@ -446,4 +442,4 @@ def pid_grid(
         check_finite(array, name, where)
         lists.append(array)
     envs = envs if jnp.ndim(envs.dt) else stack([envs])
-    return _searched(envs, lists, pips, key, kind, horizon)
+    return _searched(envs, lists, pips, key, kind)
