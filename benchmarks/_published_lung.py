@@ -44,8 +44,9 @@ noise was chosen, of five settings and three sizes, by leaving out one of the si
 those held out became what they are now. Of this second plan the differences to the best
 PID of all were -0.16 [-0.23, -0.09] and -0.22 [-0.44, 0.07]: the networks were worse
 between 11 and 14 cmH2O, where the simulator wants other controls than at 10 and at 15.
-Hence all are tuned at more pressures now. After the run of the third one a row was
-added, of networks trained at their target, and its difference to their controller there.
+Hence all are tuned at more pressures now. After the run of the third plan a row was
+added, of networks trained at their target, and its difference to their controller
+there.
 """
 
 import argparse
