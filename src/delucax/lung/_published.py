@@ -53,8 +53,7 @@ class PublishedLung(AbstractDynamics):
     [the comparison](../ventilator.md#the-published-simulator).
 
     The state is (the controls, the pressures, both scaled and newest first, and the
-    count of steps), and the observation is the pressure [cmH2O]. In contrast to
-    [`delucax.lung.LearnedLung`][] with `published`, what is given are weights.
+    count of steps), and the observation is the pressure [cmH2O].
 
     **Arguments:**
 
@@ -109,8 +108,8 @@ class PublishedLung(AbstractDynamics):
 
     def __check_init__(self):
         check_parameters(self)
-        _check_shapes(self, hidden=(STEPS, None, 2 * STEPS), output=(STEPS, None))
-        _check_shapes(self, bias=(STEPS,))
+        first = dict(output=(STEPS, None), bias=(STEPS,))
+        _check_shapes(self, hidden=(STEPS, None, 2 * STEPS), **first)
 
     @host_unless_traced
     def resting(self) -> State:
@@ -287,10 +286,9 @@ def read_published(
                 print(error)  # it lacks the array 'sim/u_scaler/mean', ...
         ```
     """
-    path = as_path(path, "path", _WHERE)
     waveform = BreathWaveform() if waveform is None else waveform
     check_waveform(waveform, _WHERE)
-    arrays = _arrays(path)
+    arrays = _arrays(as_path(path, "path", _WHERE))
     scales = {
         f"{letter}_{name}": arrays[f"sim/{letter}_scaler/{name}"]
         for letter in "up"
