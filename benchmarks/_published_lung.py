@@ -1,4 +1,4 @@
-"""`python -m benchmarks._published_lung --data DIR`: networks in Deluca's simulator.
+"""Networks in the simulator of Deluca: the part `lung` of `benchmarks.identification`.
 
 The learned lung and the deep controller that the authors of Deluca published
 (google/deluca-lung, Apache-2.0) are rebuilt from `DIR/deluca_lung/arrays.npz`, and a
@@ -49,7 +49,6 @@ added, of networks trained at their target, and its difference to their controll
 there.
 """
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -64,7 +63,7 @@ import pandas as pd
 from jaxtyping import Array
 
 import delucax as dlx
-from benchmarks._machine import compile_anew, describe
+from benchmarks._machine import describe
 from delucax import lung
 from delucax._module import stack, taken, unstack
 from delucax.controllers import LeakyPID, PID
@@ -370,14 +369,3 @@ def store(found: dict[str, Any]) -> None:
     """Write the results file."""
     text = json.dumps({"machine": describe()} | found, indent=1)
     RESULTS.write_text(text + "\n")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Networks in Deluca's own simulator.")
-    parser.add_argument("--data", type=Path, required=True, help=f"holds {FILE}")
-    compile_anew()
-    store(published_lung(parser.parse_args().data / FILE))
-
-
-if __name__ == "__main__":
-    main()

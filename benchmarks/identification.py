@@ -12,7 +12,8 @@ parts:
   needs no file;
 - `coverage`: how often intervals of 95% hold the truth, on 1,000 simulated records of
   three plants;
-- `lung`: controllers in the simulator that was published with Deluca.
+- `lung`: controllers in the simulator that was published with Deluca
+  (`benchmarks/_published_lung.py`).
 
 A part whose file is not there is left out. All is in double precision.
 """
@@ -123,15 +124,15 @@ def main() -> None:
     page(RESULTS)
 
 
-def in_the_lung(data: Path) -> dict[str, Any] | None:
-    """Controllers in the published simulator."""
+def in_the_lung(data: Path) -> None:
+    """Controllers in the published simulator, for the page of the ventilator."""
     from benchmarks import _published_lung
 
     file = data / _published_lung.FILE
-    if not file.exists():
+    if file.exists():
+        _published_lung.store(_published_lung.published_lung(file))
+    else:
         print(f"  {file} is not there, and the lung is left out")
-        return None
-    return _published_lung.published_lung(file)
 
 
 if __name__ == "__main__":
