@@ -29,9 +29,11 @@ pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8 --di
 kept := JAX_COMPILATION_CACHE_DIR="$${JAX_COMPILATION_CACHE_DIR:-$(CURDIR)/.cache/programs}" \
 	JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-# The examples of docs and docstrings. They run once, in single precision, compiled as a
-# user's programs are; all other tests are compiled lightly, which takes half of the time.
-examples := tests/contracts/test_public.py tests/test_docs.py
+# The examples of pages and docstrings run once, in single precision; those of pages are
+# compiled as a user's programs are. All else is compiled lightly, which takes half of the
+# time.
+pages := tests/test_docs.py
+examples := tests/contracts/test_public.py $(pages)
 no_examples := $(addprefix --ignore=,$(examples))
 # An expression may select no test of a part.
 or_none := || [ $$? -eq 5 ]
@@ -69,8 +71,8 @@ test: test-float32 test-float64 notebooks ## the tests in both precisions, then 
 
 .PHONY: test-float32
 test-float32: $(VENV)/.tests ## the tests in single precision
-	JAX_ENABLE_X64=0 $(pytest) $(examples) $(PYTEST_ARGS) $(or_none)
-	$(lightly) JAX_ENABLE_X64=0 $(pytest) $(no_examples) $(PYTEST_ARGS) $(or_none)
+	JAX_ENABLE_X64=0 $(pytest) $(pages) $(PYTEST_ARGS) $(or_none)
+	$(lightly) JAX_ENABLE_X64=0 $(pytest) --ignore $(pages) $(PYTEST_ARGS) $(or_none)
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before

@@ -133,9 +133,9 @@ def grey_box(
         states = dlx.open_loop(true, [1.0, 0.0], controls)
         record = sysid.Record(states, controls, dt=0.05)
         guess = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
-        options = dict(width=3, corrected=["velocity"], spreads=[0.3], max_steps=5)
-        key = jax.random.key(1)
-        grey = sysid.grey_box(guess, record, "system.length", **options, key=key)
+        small = dict(width=3, spreads=[0.3], max_steps=5, key=jax.random.key(1))
+        known = dict(x0=[1.0, 0.0], corrected=["velocity"])
+        grey = sysid.grey_box(guess, record, "system.length", **known, **small)
         grey.errors, grey.spread
         ```
     """

@@ -189,8 +189,10 @@ def physical(
     solution = fit(values, guesses, window)
     # A second attempt, if it is known now that the first did not converge, or that its
     # residuals are correlated from step to step, as the noise is not.
-    is_observed = x0 is None and size == n
-    rungs = [] if few or not estimates_starts else _rungs(window, is_observed)
+    is_observed = size == n
+    # A guess of a state that is observed is asked for, and windows begin there.
+    has_rungs = estimates_starts and not few and (x0 is None or not is_observed)
+    rungs = _rungs(window, is_observed) if has_rungs else []
     if rungs and is_concrete(solution.correlation):
         failed = solution.result != RESULTS.successful
         # On short windows nothing grows, so that a worse guess does, and there are
