@@ -27,7 +27,7 @@ def case(problem: str, method: str, seed: int) -> dict[str, Any]:
     extra: dict[str, Any] = {}
     if method == "linear":
         order = len(module.first(estimation))
-        models = {"linear": sysid.subspace(estimation, order).model}
+        models = {"linear": sysid.subspace(estimation, order, affine=True).model}
         first = lambda record: [0.0] * order
     else:
         grey = module.fitted(estimation, seed)
