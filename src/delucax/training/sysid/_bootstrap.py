@@ -136,7 +136,8 @@ def bootstrap(
         parameters = sorted({name.split("[")[0] for name in fitted.names})
     model, x0 = fitted.model, fitted.x0
     longest = max(map(len, records)) - 1
-    window = longest if window is None else min(window, longest)
+    whole = longest if window is None else check_count(window, "window", _WHERE)
+    window = min(whole, longest)
     sampling, groups, rows = sampling_of(model, records, _WHERE)
     firsts = x0[None] if isinstance(record, Record) else x0
     firsts = guessed_starts(model, firsts, groups, _WHERE)

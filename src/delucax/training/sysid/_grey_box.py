@@ -150,7 +150,8 @@ def grey_box(
         check_choice(name, tuple(names), "corrected", _WHERE)
     most: Any = np.asarray(check_count(max_steps, "max_steps", _WHERE))
     longest = max(map(len, records)) - 1
-    window = longest if window is None else min(window, longest)
+    window = longest if window is None else check_count(window, "window", _WHERE)
+    window = min(window, longest)
     given: Any = dict(x0=x0, window=window, max_steps=max(max_steps, 100), throw=False)
     physics = physical(dynamics, record, parameters, **given)
     result: Any = physics.result

@@ -45,7 +45,8 @@ def linear(
     [`delucax.LinearDynamics`][], and row i of its `estimate` holds the entries of A, B
     and c for the state i.
 
-    **Raises:** `ValueError` if `record` is none; an error at run time as `throw` says.
+    **Raises:** `ValueError` if `record` is not one; an error at run time as `throw`
+    says.
 
     !!! example
 
@@ -108,8 +109,8 @@ def arx(
     the entries of `A_1, ..., A_a, B_0, ..., B_{b-1}` for the output i. The state of the
     model at step k is `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`.
 
-    **Raises:** `ValueError` if `record` is none, on counts below 1, or fewer steps than
-    are looked back on; an error at run time as `throw` says.
+    **Raises:** `ValueError` if `record` is not one, on counts below 1, or fewer steps
+    than are looked back on; an error at run time as `throw` says.
 
     Source: Ljung, 1999.
 

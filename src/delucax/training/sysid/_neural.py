@@ -131,7 +131,7 @@ def windows(
     **Returns:** `(times, states, controls)` of shapes `(N,)`, `(N, steps + 1, n)` and
     `(N, steps, m)`, for `data=` of [`delucax.training.fit`][].
 
-    **Raises:** `ValueError` if `record` is none, or shorter than a stretch.
+    **Raises:** `ValueError` if `record` is not one, or shorter than a stretch.
 
     !!! example
 
