@@ -1,14 +1,17 @@
 """Every Python block of the pages and of the README runs, page by page.
 
-The blocks of a page share one namespace. A comment `<!-- raises -->` before a block
-says that it raises the error that the `text` block after it shows, and `<!-- notest:
-why -->`, or `notest` after the language, that it is left out.
+The blocks of a page share one namespace. A `text` block right under one is what it
+shows, as under the cell of a notebook. A comment `<!-- raises -->` before a block says
+that it raises the error that the `text` block after it shows, and `<!-- notest: why
+-->`, or `notest` after the language, that it is left out.
 """
 
+import itertools
 import re
 from pathlib import Path
 
 import pytest
+from examples import check_output, output_of
 from helpers import as_a_user, has_compiler
 
 
@@ -22,21 +25,21 @@ BLOCK = re.compile(
 
 
 def _blocks(page):
-    """`(line, mark, code, message)` of each Python block that is to run."""
+    """`(line, code, shown, raises)` of each Python block that is to run."""
     text = page.read_text()
-    found = [
-        (m, m.group("mark") or m.group("rest").strip()) for m in BLOCK.finditer(text)
-    ]
-    for i, (match, mark) in enumerate(found):
-        if match.group("language") != "python" or mark == "notest":
+    line_of = lambda match: text.count("\n", 0, match.start("code"))
+    blocks = list(BLOCK.finditer(text))
+    for block, after in itertools.zip_longest(blocks, blocks[1:]):
+        mark = block.group("mark") or block.group("rest").strip()
+        if block.group("language") != "python" or mark == "notest":
             continue
-        message = None
-        if mark == "raises":
-            after = found[i + 1][0]
-            assert after.group("language") == "text", f"{page.name}: no message shown"
-            message = " ".join(after.group("code").split())
-        line = text.count("\n", 0, match.start("code"))
-        yield line, match.group("code"), message
+        shown = None
+        if after is not None and after.group("language") == "text":
+            between = text[block.end() : after.start()]
+            shown = None if between.strip() else after.group("code")
+        raises = mark == "raises"
+        assert shown or not raises, f"{page.name}: no message is shown"
+        yield line_of(block), block.group("code"), shown, raises
 
 
 RUNNABLE = [page for page in PAGES if list(_blocks(page))]
@@ -54,14 +57,16 @@ def test_page_runs(page, tmp_path, monkeypatch):
     namespace = {"__name__": "page"}
     if not has_compiler and "export.load" in page.read_text():
         pytest.skip("no C compiler is there")
-    for line, code, message in _blocks(page):
+    for line, code, shown, raises in _blocks(page):
         # Padded, so that a traceback names the line of the page.
-        compiled = compile("\n" * line + code, str(page), "exec")
-        if message is None:
-            exec(compiled, namespace)
+        code = "\n" * line + code
+        if not raises:
+            output = output_of(code, namespace, str(page))
+            if shown is not None:
+                check_output(output, shown)
             continue
         # Not B017: which error it must be is said by the message.
         with as_a_user(), pytest.raises(Exception) as raised:  # noqa: B017
-            exec(compiled, namespace)
-        shown = f"{raised.type.__name__}: {' '.join(str(raised.value).split())}"
-        assert shown == message
+            exec(compile(code, str(page), "exec"), namespace)
+        message = f"{raised.type.__name__}: {raised.value}"
+        assert message.split() == shown.split()

@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from examples import check_output, output_of
 from helpers import has_compiler
 
 import delucax as dlx
@@ -104,8 +105,10 @@ def _inherited(cls, attribute):
 
 
 def _examples(doc):
-    blocks = re.findall(r"^( *)```python\n(.*?)^\1```", doc, re.DOTALL | re.MULTILINE)
-    return [textwrap.dedent(code) for _, code in blocks]
+    """The code of each example, and the output that is printed right under it."""
+    block = r"^( *)```python\n(.*?)^\1```(?:\n\s*\1```text\n(.*?)^\1```)?"
+    examples = re.findall(block, doc, re.DOTALL | re.MULTILINE)
+    return [(textwrap.dedent(code), printed) for _, code, printed in examples]
 
 
 @pytest.mark.parametrize(
@@ -121,10 +124,12 @@ def test_example_runs(name, value, tmp_path, monkeypatch):
     if owner is not None:  # what a method returns is shown where it is returned
         examples = _examples(inspect.getdoc(owner) or "")
     assert examples, f"{name} has no example"
-    if not has_compiler and any("export.load" in code for code in examples):
+    if not has_compiler and any("export.load" in code for code, _ in examples):
         pytest.skip("no C compiler is there")
-    for code in examples:
-        exec(compile(code, name, "exec"), {"__name__": "example"})
+    for code, printed in examples:
+        output = output_of(code, {"__name__": "example"}, name)
+        if printed:
+            check_output(output, printed)
 
 
 @pytest.mark.parametrize("name", [name for name, _ in MEMBERS])
