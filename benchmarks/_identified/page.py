@@ -10,58 +10,63 @@ from benchmarks._identified.published import RESULTS as PUBLISHED, SOURCES
 PAGE = Path(__file__).parents[2] / "docs" / "identification_exam.md"
 _HEAD = """# Identification, graded by public data
 
-Three public problems of nonlinear identification with published results beside ours,
-and two checks on simulated and rebuilt plants. `python -m benchmarks.identification
---data DIR` makes this page.
+This page shows three public benchmarks of nonlinear identification, with published
+results beside ours, and a check of our intervals on simulated plants. To make it again,
+run `python -m benchmarks.identification --data DIR`. `DIR` is the folder with the data,
+which delucax does not ship.
 
-Each model is fitted to the estimation half alone, in double precision. It then runs
-freely along the test, by the recorded input, from a state that is estimated on the
-first 50 samples. The error is the root of the mean square after these. Networks have
-ten seeds, and their median, least and largest errors are shown; how much a network may
-do is chosen on the last quarter of the estimation half. Published numbers are as their
-sources print them. They may be of other splits where they are older than the package
-`nonlinear_benchmarks`, which defines those used here.
+Each model is fitted to the estimation half alone, in double precision. On the test it
+runs freely: it gets the recorded input and a state that is estimated from the first 50
+samples. The error is the root mean square error after these 50 samples. Networks are
+trained from ten seeds, and the table shows the median, the least and the largest error.
+How much a network may correct is chosen on the last quarter of the estimation half.
+
+Published errors are quoted as their sources print them. The package
+`nonlinear_benchmarks` defines the splits that are used here; older results may be of
+other splits.
 """
 _TITLES = {
     "tanks": (
         "Cascaded tanks",
-        "Two tanks of which the lower one is measured, and which overflow. 1,024 "
-        "samples for estimation and for the test, every 4 s. The data are those of "
-        "nonlinearbenchmark.org, as a file `cascaded_tanks/dataBenchmark.csv` with the "
-        "columns `uEst`, `yEst`, `uVal` and `yVal`. The physics: Bernoulli's law, the "
-        "overflow, an offset of the pump and the depth of the outlet. The error is in "
-        "V.",
+        "A pump fills the upper of two tanks, which drains into the lower one. Both "
+        "can overflow, and only the level of the lower one is measured. The "
+        "estimation and the test have 1,024 samples each, one every 4 s. The data are"
+        " those of nonlinearbenchmark.org, as a file "
+        "`cascaded_tanks/dataBenchmark.csv` with the columns `uEst`, `yEst`, `uVal` "
+        "and `yVal`. The physical model has Bernoulli's law, the overflow, an offset "
+        "of the pump and the depth of the outlet. The error is in V.",
     ),
     "silverbox": (
         "Silverbox",
-        "An electronic oscillator with a cubic spring. The data are those of "
-        "nonlinearbenchmark.org, as a file `silverbox/SNLS80mV.csv.gz` with the "
-        "columns `V1` and `V2`. The tests: the last quarter of the multisine, the "
-        "arrow, and the part of the arrow that stays within the amplitudes of the "
-        "estimation. The error is in mV. Ours are fitted to the first 16,000 of the "
-        "65,062 samples.",
+        "The Silverbox is an electronic oscillator with a cubic spring. The data are "
+        "those of nonlinearbenchmark.org, as a file `silverbox/SNLS80mV.csv.gz` with "
+        "the columns `V1` and `V2`. There are three tests: the last quarter of the "
+        "multisine, the whole arrow, and the part of the arrow whose amplitudes occur"
+        " in the estimation half. The error is in mV. Our models are fitted to the "
+        "first 16,000 of the 65,062 samples.",
     ),
     "bouc_wen": (
         "Bouc-Wen",
-        "An oscillator with a hysteretic force. The data are generated from the "
-        "published equations, constants and signals, with random phases and an "
-        "integrator of our own, so that the test records are not the official ones. "
-        "The physics knows the oscillator, and that a force is hidden; a network "
-        "learns its rate. The error is in micrometres; the noise of the estimation "
-        "data is 8. Ours are fitted to the first 8,192 of the 40,960 samples.",
+        "This is an oscillator with a hysteretic force. The data are generated here "
+        "from the published equations, constants and signals. The random phases and "
+        "the integrator are our own, so the test records are not the official ones. "
+        "The physical model knows the oscillator and that a hidden force acts; a "
+        "network learns the rate of that force. The error is in micrometres, and the "
+        "noise of the estimation data is 8 micrometres. Our models are fitted to the "
+        "first 8,192 of the 40,960 samples.",
     ),
 }
 
 
 def page(results: Path) -> None:
     """Write the page from the results."""
-    found = json.loads(results.read_text()) if results.exists() else {}
+    stored = json.loads(results.read_text()) if results.exists() else {}
     parts = [_HEAD]
     for name, (title, about) in _TITLES.items():
-        if name in found:
-            parts.append(f"## {title}\n\n{about}\n\n{_table(name, found[name])}")
-    if "coverage" in found:
-        parts.append(_coverage(found["coverage"]["rows"]))
+        if name in stored:
+            parts.append(f"## {title}\n\n{about}\n\n{_table(name, stored[name])}")
+    if "coverage" in stored:
+        parts.append(_coverage(stored["coverage"]["rows"]))
     parts.append(
         "## Sources\n\n" + "\n".join(f"- {k}: {v}" for k, v in SOURCES.items())
     )
@@ -99,9 +104,10 @@ def _coverage(rows: list[dict[str, Any]]) -> str:
         "## Intervals",
         "",
         f"How often intervals of 95% hold the truth, on {rows[0]['records']:,} "
-        "simulated records of each of three plants with a hidden state. The guess of "
-        "each parameter is 20% off. A fit that says it did not converge, or that the "
-        "data do not tell a parameter, is a failure and has no intervals.",
+        "simulated records of each of three plants with a hidden state. The initial "
+        "guess of each parameter is 20% off. A fit fails if it reports that it did not "
+        "converge, or that the data do not determine a parameter. It then has no "
+        "intervals.",
         "",
         "| plant | covered, % | by parameter, % | failures, % |",
         "|---|---|---|---|",

@@ -1,5 +1,6 @@
 """The designs that an environment defines."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from helpers import assert_close, needs_x64, user_error
@@ -61,6 +62,10 @@ def test_bad_input():
         (lambda: local_lqr(half), "LQR: dynamics must observe their state"),
         (lambda: local_mpc(_environment(), 3), "local_mpc: lqr must be a LQR"),
         (lambda: local_mpc(3), "local_mpc: environment must be an Environment"),
+        (
+            lambda: eqx.filter_jit(local_model)(_environment()),
+            "local_model: environment must hold values",
+        ),
         (lambda: local_model(3), "local_model: environment must be an Environment"),
         (
             lambda: local_lqr(_environment(), regularisation=0.0),

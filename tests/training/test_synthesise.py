@@ -105,6 +105,23 @@ def test_a_policy_that_seldom_fails_is_better_than_one_that_never_works():
     assert search.chosen() == ("network", net)
 
 
+def test_the_last_choice_is_made_on_more_starts(monkeypatch):
+    module = sys.modules[PolicySearch.__module__]
+    # On the first starts the network is the better one, and on the others it is not.
+    later = lambda _, __, policy, keys: np.full(len(keys), float(policy.value[0]))
+    monkeypatch.setattr(module, "costs_of", later)
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    search.best = {}
+    first = search.keys(module.CHOICE)
+    for name, value in ("network", 3.0), ("LQR + network", 2.0), ("LQR", 4.0):
+        policy = dlx.controllers.Constant([value])
+        search.enter(known(name, policy, *np.full(len(first), 1.0 / value)))
+    assert search.chosen()[0] == "LQR"
+    name, policy = search.choose()
+    assert name == "LQR + network" and policy.value == 2.0
+    assert len(search.best[name].costs) == 8 * module.CHOICE
+
+
 def test_a_reward_is_a_large_usual_cost():
     """Of a mountain car: zero control costs nothing, and a little effort little."""
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_instance, check_positive
+from .._check import check_instance, check_positive, is_concrete
 from .._typing import RealScalar, State
 from ..costs import AbstractCost, Function
 from ..dynamics import LinearDynamics, linearize
@@ -58,9 +58,10 @@ def local_model(
 
     **Returns:** a [`delucax.controllers.LocalModel`][].
 
-    **Raises:** `ValueError` if the environment has no target and no equilibrium, or the
-    cost is not twice differentiable there; an error at run time if there is no
-    operating point.
+    **Raises:** `ValueError` if the environment has no target and no equilibrium, if the
+    cost is not twice differentiable there, or if the environment is traced (under
+    `jax.jit`, `jax.vmap` or `jax.grad`); an error at run time if there is no operating
+    point.
 
     !!! example
 
@@ -78,6 +79,11 @@ def local_model(
 def _local_model(environment: Any, regularisation: Any, where: str) -> LocalModel:
     check_instance(environment, Environment, "environment", where)
     check_positive(regularisation, "regularisation", where)
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves(environment)):
+        raise ValueError(
+            f"{where}: environment must hold values. Under jax.jit, jax.vmap or "
+            "jax.grad use delucax.linearize and delucax.controllers.LQR."
+        )
     point = environment.trim()
     x, u = point.x, point.u
     H = np.asarray(_curvature(environment.cost, x, u), float)
@@ -113,9 +119,9 @@ def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if the state is not observed, the environment has no target
-    and no equilibrium, or the cost is not twice differentiable there; an error at run
-    time if there is no operating point or no stabilising gain.
+    **Raises:** `ValueError` if the state is not observed, and where
+    [`delucax.controllers.local_model`][] raises; an error at run time if there is no
+    stabilising gain.
 
     !!! example
 

@@ -319,5 +319,9 @@ def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:
     costs = batch[:, seed % BATCH].astype(float)
     middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
     trainings = costs.tolist() if method in TRAINED else None
-    found = {"cost": middle, "trainings": trainings, "us_per_step": speed}
-    return found | {"unsuitable": None}
+    return {
+        "cost": middle,
+        "trainings": trainings,
+        "us_per_step": speed,
+        "unsuitable": None,
+    }

@@ -4,8 +4,6 @@ import time
 import warnings
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -15,7 +13,7 @@ from jaxtyping import Array
 from .._controller import AbstractController
 from .._module import get_path
 from .._typing import PRNGKey
-from ..controllers import Constant, local_lqr, local_mpc, LQR, Residual, Zero
+from ..controllers import local_lqr, local_mpc, LQR, Residual, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
 from ._attempt import Attempt, Line
@@ -24,7 +22,6 @@ from ._episode_costs import (
     costs_of,
     costs_of_mpc,
     costs_of_plan,
-    first_steps,
     on_plants,
     tamed,
     TamedCost,
@@ -42,16 +39,18 @@ with warnings.catch_warnings():
     from tqdm.auto import tqdm
 
 
-_WHERE = "synthesise"
 # After how many trials it is asked whether the LQR is enough.
 _FIRST = 2
 # After which share of the episode a damped gradient is forgotten.
 _MEMORIES = (1 / 30, 1 / 10, 1 / 4)
 # Starts on which policies are chosen, and others on which the best is compared: more
 # where each has a plant of its own.
-_CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
-# The share of the budget for training; the rest is for the comparison.
-_TRAINING = 0.7
+CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
+# How many policies are chosen from at the end, and on how many times more starts.
+_LAST, _ROUNDS = 4, 8
+# The share of the budget for training, and until when there are more starts; the rest
+# is for the comparison.
+_TRAINING, _CHOOSING = 0.7, 0.75
 # How far a comparison may overrun it, if it takes as long as the longest step before,
 # and MPC that many times as long.
 _OVERRUN, _MPC = 1.1, 2
@@ -98,11 +97,12 @@ class PolicySearch:
         self.key, self.draws, self.budget = key, 0, budget
         self.began = time.perf_counter()
         layout = "{desc}: {bar}| {n:.0f}/{total:.0f} s{postfix}"
-        options: Any = dict(desc=_WHERE, bar_format=layout, disable=not progress)
+        options: Any = dict(desc="synthesise", bar_format=layout, disable=not progress)
         self.bar = tqdm(total=round(budget), **options)
         # Also what an interrupt leaves before anything has been tried.
         zero = Zero(environment.control_size)
         self.best = {"zero": Line("zero", "none", zero)}
+        self.last: list[Line] = []
         self.tried: list[Attempt] = []
         self.lqr: LQR | None = None
         self.steps = min(environment.horizon, _LONGEST)
@@ -140,33 +140,7 @@ class PolicySearch:
     def fresh_key(self) -> PRNGKey:
         """A key that was not used before."""
         self.draws += 1
-        return jr.fold_in(self.key, _CHOICE + self.draws)
-
-    def check(self) -> None:
-        """Raise where nothing could be trained, whatever the method."""
-        env, keys = self.environment, self.keys(_CHOICE)
-        loss = expected_cost(env, batch=1, horizon=1, ranges=self.ranges)
-        held = Constant(jnp.zeros(env.control_size))
-        try:
-            jax.eval_shape(eqx.filter_grad(loss), held, keys[0])
-        except Exception as error:
-            reason, *_ = str(error).splitlines() or [f"{type(error).__name__}."]
-            raise ValueError(
-                f"{_WHERE}: environment must have dynamics and a cost that JAX can "
-                f"differentiate, got: {reason} For others use delucax.training.evolve."
-            ) from error
-        starts, costs, steps = map(np.asarray, first_steps(env, keys))
-        for what, values in (("first state", starts), ("cost of a first state", costs)):
-            finite = np.isfinite(values.reshape(_CHOICE, -1)).all(axis=1)
-            if not finite.all():
-                x = starts[finite.argmin()]
-                raise ValueError(f"{_WHERE}: the {what} must be finite, at x0 = {x}.")
-        kept = np.isfinite(steps).all(axis=-1).any(axis=1)
-        if not kept.all():
-            raise ValueError(
-                f"{_WHERE}: no control keeps the first step finite from x0 = "
-                f"{starts[kept.argmin()]}."
-            )
+        return jr.fold_in(self.key, CHOICE + self.draws)
 
     def run(self, width: int, depth: int) -> None:
         """Train until the time is up or nothing gains any more."""
@@ -216,7 +190,7 @@ class PolicySearch:
         plan is better than the LQR, or MPC where a plan would know the disturbances."""
         if self.chosen()[0] != "LQR":
             return False
-        keys = self.keys(_CHOICE)[: len(self.comparison)]
+        keys = self.keys(CHOICE)[: len(self.comparison)]
         own = np.mean(costs_of(self.environment, self.ranges, self.lqr, keys))
         known = isinstance(self.environment.disturbance, NoDisturbance)
         other = np.mean(self.costs_of_rival("plan" if known else "MPC", self.lqr, keys))
@@ -287,7 +261,7 @@ class PolicySearch:
         """Whether MPC costs less, on some of the starts of the choice."""
         if not self.environment.dynamics.observes_state or self.ranges is not None:
             return False
-        keys = self.keys(_CHOICE)[:_COMPARISON]
+        keys = self.keys(CHOICE)[:_COMPARISON]
         expert = np.mean(self.costs_of_rival("MPC", policy, keys))
         own = np.mean(costs_of(self.environment, None, policy, keys))
         return _is_better(expert, own)
@@ -316,9 +290,9 @@ class PolicySearch:
         self.bar.update(min(self.seconds, self.bar.total) - self.bar.n)
         return best
 
-    def costs(self, policy: AbstractController) -> np.ndarray:
-        """The costs from the starts on which policies are chosen."""
-        keys = self.keys(_CHOICE)
+    def costs(self, policy: AbstractController, keys: Any = None) -> np.ndarray:
+        """The costs from starts, by default those on which policies are chosen."""
+        keys = self.keys(CHOICE) if keys is None else keys
         return np.asarray(costs_of(self.environment, self.ranges, policy, keys), float)
 
     def enter(self, line: Line) -> None:
@@ -327,6 +301,7 @@ class PolicySearch:
         if line.costs is None:
             line = line._replace(costs=self.costs(line.policy))
         name = line.structure
+        self.last = sorted([*self.last, line], key=self.score)[:_LAST]
         self.best[name] = min(self.best.get(name, line), line, key=self.score)
         costs = self.best[name].costs
         middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
@@ -344,6 +319,29 @@ class PolicySearch:
         """The mean cost, infinite where one is not finite."""
         costs = np.inf if line.costs is None else line.costs
         return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
+
+    def choose(self) -> tuple[str, AbstractController]:
+        """The best of the last policies and the floor, on many more starts.
+
+        One start in a hundred, from which the plant runs away, is often not among the
+        first 64, and is what tells two good policies apart.
+        """
+        floor = [self.best[name] for name in ("zero", "LQR") if name in self.best]
+        lines = [line for line in self.last if line.costs is not None]
+        lines += [line for line in floor if line.costs is not None]
+        for k in range(1, _ROUNDS):
+            if self.seconds > _CHOOSING * self.budget:
+                break
+            keys = jr.split(jr.fold_in(jr.fold_in(self.key, CHOICE), k), CHOICE)
+            more = [self.costs(line.policy, keys) for line in lines]
+            lines = [
+                line._replace(costs=np.concatenate([line.costs, costs]))
+                for line, costs in zip(lines, more, strict=True)
+            ]
+        for line in lines:
+            own = [other for other in lines if other.structure == line.structure]
+            self.best[line.structure] = min(own, key=self.score)
+        return self.chosen()
 
     def chosen(self) -> tuple[str, AbstractController]:
         """The best policy, or the floor where that is as good."""

@@ -3,7 +3,9 @@
 import warnings
 from typing import Any, NamedTuple, TYPE_CHECKING
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._check import (
@@ -17,9 +19,12 @@ from .._check import (
 from .._controller import AbstractController
 from .._extras import extra
 from .._typing import PRNGKey
+from ..controllers import Constant
 from ..environments import Environment
 from ._attempt import Attempt
-from ._policy_search import PolicySearch
+from ._costs import expected_cost
+from ._episode_costs import first_steps
+from ._policy_search import CHOICE, PolicySearch
 
 
 if TYPE_CHECKING:
@@ -116,8 +121,9 @@ def synthesise(
         That one is trained by the methods that still gain, then at a tenth of the
         learning rate. Once none gains, an imitation of MPC
         ([`delucax.training.imitate`][]) is tried, if MPC costs less.
-    4. Choice of the best on starts that it was not trained on, by the mean cost, in
-        which costs above 20 times the usual one count by their logarithm. Where the
+    4. Choice among the last four and the floor, on up to 512 starts that none was
+        trained on, by the mean cost, in which costs above 20 times the usual one count
+        by their logarithm. Where the
         LQR, or no control, is as good to half a percent, that is returned.
 
     **Arguments:**
@@ -175,12 +181,12 @@ def synthesise(
     check_bool(progress, "progress", _WHERE)
     search = PolicySearch(environment, ranges, key, float(budget), progress)
     with search.bar:
-        search.check()
+        _check_environment(environment, ranges, search.keys(CHOICE))
         try:
             search.run(width, depth)
         except KeyboardInterrupt:
             pass
-        structure, policy = search.chosen()
+        structure, policy = search.choose()
         costs = search.compared(policy)
     if lost := np.sum(~np.isfinite(costs["policy"])):
         warnings.warn(
@@ -190,3 +196,31 @@ def synthesise(
         )
     tried, plants = search.tried, search.plants()
     return Synthesis(policy, structure, costs, tried, search.seconds, plants)
+
+
+def _check_environment(
+    env: Environment, ranges: dict[str, Any] | None, keys: Any
+) -> None:
+    """Raise where nothing could be trained, whatever the method."""
+    loss = expected_cost(env, batch=1, horizon=1, ranges=ranges)
+    held = Constant(jnp.zeros(env.control_size))
+    try:
+        jax.eval_shape(eqx.filter_grad(loss), held, keys[0])
+    except Exception as error:
+        reason, *_ = str(error).splitlines() or [f"{type(error).__name__}."]
+        raise ValueError(
+            f"{_WHERE}: environment must have dynamics and a cost that JAX can "
+            f"differentiate, got: {reason} For others use delucax.training.evolve."
+        ) from error
+    starts, costs, steps = map(np.asarray, first_steps(env, keys))
+    for what, values in (("first state", starts), ("cost of a first state", costs)):
+        finite = np.isfinite(values.reshape(len(keys), -1)).all(axis=1)
+        if not finite.all():
+            x = starts[finite.argmin()]
+            raise ValueError(f"{_WHERE}: the {what} must be finite, at x0 = {x}.")
+    kept = np.isfinite(steps).all(axis=-1).any(axis=1)
+    if not kept.all():
+        raise ValueError(
+            f"{_WHERE}: no control keeps the first step finite from x0 = "
+            f"{starts[kept.argmin()]}."
+        )
