@@ -29,11 +29,8 @@ pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8 --di
 kept := JAX_COMPILATION_CACHE_DIR="$${JAX_COMPILATION_CACHE_DIR:-$(CURDIR)/.cache/programs}" \
 	JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-# The examples of pages and docstrings run once, in single precision; those of pages are
-# compiled as a user's programs are. All else is compiled lightly, which takes half of the
-# time.
-pages := tests/test_docs.py
-examples := tests/contracts/test_public.py $(pages)
+# The examples of pages and docstrings run once, in single precision.
+examples := tests/contracts/test_public.py tests/test_docs.py
 no_examples := $(addprefix --ignore=,$(examples))
 # An expression may select no test of a part.
 or_none := || [ $$? -eq 5 ]
@@ -44,7 +41,7 @@ spine := tests/contracts/test_controllers.py tests/contracts/test_systems.py tes
 outward := tests/dynamics/test_integration.py tests/experiments tests/interop \
 	tests/plotting/test_plot.py tests/plotting/test_animate.py
 
-# LLVM's optimiser takes a fifth of the time, for programs that run for milliseconds.
+# LLVM's optimiser takes half of the time, for programs that run for milliseconds.
 lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
 	--xla_llvm_disable_expensive_passes=true $$XLA_FLAGS"; export XLA_FLAGS;
 
@@ -71,8 +68,7 @@ test: test-float32 test-float64 notebooks ## the tests in both precisions, then 
 
 .PHONY: test-float32
 test-float32: $(VENV)/.tests ## the tests in single precision
-	JAX_ENABLE_X64=0 $(pytest) $(pages) $(PYTEST_ARGS) $(or_none)
-	$(lightly) JAX_ENABLE_X64=0 $(pytest) --ignore $(pages) $(PYTEST_ARGS) $(or_none)
+	$(lightly) JAX_ENABLE_X64=0 $(pytest) $(PYTEST_ARGS) $(or_none)
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before

@@ -213,38 +213,37 @@ def test_jit_vmap_and_both_precisions():
         assert_close(call(start).controls, row, atol=close)
 
 
+@jax.jit
+def convex_plan(A, B, x0, low, directions):
+    """The optimum, and the costs along directions inside the bounds."""
+    steps, m = directions.shape[1:]
+    dynamics = dlx.LinearDynamics(A, B, dt=0.1)
+    cost = dlx.costs.Quadratic(jnp.ones(x0.size), jnp.full(m, 0.1))
+    speed = SoftConstraint(lambda t, x, u: x[0] - 0.1, 0.2, 1.0)
+    limits = dict(bounds=(low, 0.3), constraints=Constraints({"speed": speed}))
+    plan = SQP()(dynamics, cost, x0, jnp.zeros((steps, m)), **limits)
+
+    def total(u):
+        x = dlx.open_loop(dynamics, x0, u)
+        over = jnp.maximum(x[:-1, 0] - 0.1, 0)
+        each = jax.vmap(cost)(jnp.zeros(steps), x[:-1], u)
+        final = cost.final(0.0, x[-1])
+        return jnp.sum(each) + final + jnp.sum(0.2 * over + 0.5 * over**2)
+
+    moved = jnp.clip(plan.controls + 1e-3 * directions, low, 0.3)
+    return total(plan.controls), jax.vmap(total)(moved)
+
+
 @needs_x64
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_a_convex_plan_is_its_quadratic_program(seed):
     draw = np.random.default_rng(seed)
-    n, m, T = 3, 2, 6
-    A, B = draw.normal(size=(n, n)) / 1.5, draw.normal(size=(n, m))
-    x0, low = draw.normal(size=n), -0.2 - 0.3 * draw.random(m)
-    dynamics = dlx.LinearDynamics(jnp.asarray(A), jnp.asarray(B), dt=0.1)
-    cost = dlx.costs.Quadratic(jnp.ones(n), jnp.full(m, 0.1))
-    speed = SoftConstraint(lambda t, x, u: x[0] - 0.1, 0.2, 1.0)
-    plan = SQP()(
-        dynamics,
-        cost,
-        jnp.asarray(x0),
-        jnp.zeros((T, m)),
-        bounds=(low, 0.3),
-        constraints=Constraints({"speed": speed}),
-    )
-
+    A, B = draw.normal(size=(3, 3)) / 1.5, draw.normal(size=(3, 2))
+    x0, low = draw.normal(size=3), -0.2 - 0.3 * draw.random(2)
+    best, others = convex_plan(A, B, x0, low, draw.normal(size=(20, 6, 2)))
     # Optimal is where no direction inside the bounds improves.
-    def total(u):
-        x = dlx.open_loop(dynamics, jnp.asarray(x0), u)
-        t = jnp.maximum(x[:-1, 0] - 0.1, 0)
-        each = jax.vmap(cost)(jnp.zeros(T), x[:-1], u)
-        final = cost.final(0.0, x[-1])
-        return jnp.sum(each) + final + jnp.sum(0.2 * t + 0.5 * t**2)
-
-    best = total(plan.controls)
-    for direction in draw.normal(size=(20, T, m)):
-        moved = jnp.clip(plan.controls + 1e-3 * direction, low, 0.3)
-        assert total(moved) >= best - 1e-9
+    assert jnp.min(others) >= best - 1e-9
 
 
 @once
@@ -278,15 +277,6 @@ def test_bad_input():
     with user_error(match="soft|bounds"):
         soft = Constraints({"limit": SoftConstraint(lambda t, x, u: u, 1.0)})
         dlx.planning.ilqr(dynamics, cost, x0, U, constraints=soft)
-    plan = SQP()(
-        dynamics,
-        cost,
-        x0,
-        U,
-        constraints=Constraints({"log": lambda t, x, u: jnp.log(-1 - x[0] ** 2)}),
-        throw=False,
-    )
-    assert plan.result == dlx.RESULTS.diverged
     with pytest.raises(RuntimeError, match="`log` .* at stage 0"):
         solve(Constraints({"log": lambda t, x, u: jnp.log(-1 - x[0] ** 2)}))
 
