@@ -499,6 +499,14 @@ def test_paper(monkeypatch):
     assert all(kept) and all(row["holds"] for row in lungs)
 
 
+def test_identification_exam(monkeypatch):
+    """The page is that of what is stored."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    made = importlib.import_module("benchmarks._identified.page")
+    results = ROOT / "benchmarks/results/identification.json"
+    assert made.written(results) == made.PAGE.read_text()
+
+
 def test_scoreboard(monkeypatch):
     """The page is that of what is stored, nothing is better than the best known, and
     what the summary says is so."""

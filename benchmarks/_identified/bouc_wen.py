@@ -94,7 +94,7 @@ def fitted(record: sysid.Record, seed: int) -> Any:
     """The oscillator alone, and with a network for the rate of the force."""
     guess = dlx.Discretized(Oscillator(), 1 / RATE)
     names = [f"system.{name}" for name in PARAMETERS]
-    options: Any = dict(x0=first(record), window=200, max_steps=50, width=10)
+    options: Any = dict(x0=first(record), window=200, max_steps=150, width=10)
     options |= dict(corrected=["force"], spreads=[3.0])
     return sysid.grey_box(guess, record, names, key=jax.random.key(seed), **options)
 

@@ -60,6 +60,11 @@ _TITLES = {
 
 def page(results: Path) -> None:
     """Write the page from the results."""
+    PAGE.write_text(written(results))
+
+
+def written(results: Path) -> str:
+    """The text of the page."""
     stored = json.loads(results.read_text()) if results.exists() else {}
     parts = [_HEAD]
     for name, (title, about) in _TITLES.items():
@@ -70,7 +75,7 @@ def page(results: Path) -> None:
     parts.append(
         "## Sources\n\n" + "\n".join(f"- {k}: {v}" for k, v in SOURCES.items())
     )
-    PAGE.write_text("\n\n".join(part.strip() for part in parts) + "\n")
+    return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
 def _table(name: str, result: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ VOLTERRA = "Birpoutsoukis, Csurcsia and Schoukens, 2018"
 NOEL = "Noël et al., 2017"
 SCHOUKENS = "Schoukens, 2021"
 IACOB = "Iacob et al., 2025"
+PADUART = "Paduart et al., 2010"
 MANIFOLD = "Forgione and Piga, 2025"
 
 RESULTS: dict[str, list[tuple[str, dict[str, float], str]]] = {
@@ -25,6 +26,7 @@ RESULTS: dict[str, list[tuple[str, dict[str, float], str]]] = {
         ("GP-NARX", {"test": 0.622}, CHAMPNEYS),
     ],
     "silverbox": [
+        ("polynomial state space", {"arrow": 0.26}, PADUART),
         (
             "GP-NARX",
             {"multisine": 0.301, "arrow": 0.60, "inside": 0.259},
@@ -60,6 +62,8 @@ SOURCES = {
     CHAMPNEYS: "Baseline results for selected nonlinear system identification "
     "benchmarks, arXiv 2405.10779. Its numbers are taken from a transcription.",
     BEINTEMA: "Nonlinear state-space identification using deep encoder networks, L4DC.",
+    PADUART: "Identification of nonlinear systems using polynomial nonlinear state "
+    "space models, Automatica 46; as later papers quote it. Fitted to other samples.",
     WORDEN: "as the authors of the baselines quote it.",
     RELAN: "An unstructured flexible nonlinear model for the cascaded water-tanks "
     "benchmark, IFAC-PapersOnLine 50-1.",
