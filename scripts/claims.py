@@ -5,7 +5,8 @@ the committed results. `python scripts/claims.py` fails where
 
 - a page has a number with a unit, with "times" or with "%", one "of" another, that of a
   slope, ratio, residual or speed-up, a table a cell that is a number, or a block of
-  text one that the code before it printed, and nothing in the ledger covers it;
+  text one that the code before it printed, and nothing in the ledger covers it (the
+  output right under a block that runs is compared by `tests/test_docs.py` instead);
 - a number is not that of the results, at the digits that are printed;
 - the results were made by an older minor version of delucax than this one;
 - an entry is not on its page, or its command, test or results file does not exist;
@@ -73,7 +74,7 @@ _NUMERIC_CELL = re.compile(rf"[*<>=~≤≥ ]*{_NUMBER}")
 _ROW = re.compile(r"^\|.*\|[ ]*$", re.MULTILINE)
 _HEAD = re.compile(r"^\|.*\|[ ]*\n\|[ :|-]+\|[ ]*$", re.MULTILINE)
 _FENCED = re.compile(
-    r"^(?P<raises><!-- raises[^\n]*-->\n)?```(?P<language>\w*)[^\n]*\n"
+    r"^(?:<!-- (?P<mark>raises|notest)[^\n]*-->\n)?```(?P<language>\w*)[^\n]*\n"
     r"(?P<code>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
@@ -286,12 +287,16 @@ def _measured(text: str, *, cells: bool = True) -> Iterator[tuple[int, int]]:
 
 
 def _printed(text: str) -> Iterator[tuple[int, int]]:
-    """Where a page shows what the code before prints, but for errors."""
-    shows = False
+    """Where a page shows what the code before prints, and no test compares it. An error
+    is no number, and `tests/test_docs.py` compares what is right under a block."""
+    shows, before = None, 0
     for block in _FENCED.finditer(text):
-        if block["language"] == "text" and shows:
+        is_right_under = shows == "runs" and not text[before : block.start()].strip()
+        if block["language"] == "text" and shows and not is_right_under:
             yield block.span("code")
-        shows = block["language"] == "python" and not block["raises"]
+        shows, before = None, block.end()
+        if block["language"] == "python" and block["mark"] != "raises":
+            shows = block["mark"] or "runs"
 
 
 def _claim(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:

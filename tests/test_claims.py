@@ -365,6 +365,16 @@ def test_what_a_page_shows_of_the_output(tree):
     assert claims.problems(tree) == []
 
 
+def test_output_right_under_a_block_is_compared_by_the_tests_of_the_pages(tree):
+    shown = "```python\nprint(2.5)\n```\n\n```text\n2.5 of x1\n```\n"
+    change(tree / "docs/page.md", "Results:", f"{shown}\nResults:")
+    assert claims.problems(tree) == []
+    # A block that does not run compares nothing.
+    change(tree / "docs/page.md", "```python", "<!-- notest: slow -->\n```python")
+    (said,) = claims.problems(tree)
+    assert said.endswith("'2.5' is not in docs/claims.toml")
+
+
 def test_a_patch_does_not_make_results_stale(tree):
     change(tree / "pyproject.toml", "0.2.0", "0.2.9")
     assert claims.problems(tree) == []
