@@ -1,4 +1,5 @@
-"""Vector fields `dx/dt = f(t, x, u, w)`. Independent of steps, costs and solvers."""
+"""Plants in continuous time. A system is a vector field `dx/dt = f(t, x, u, w)`: it
+knows no step, no cost and no solver."""
 
 from typing import TYPE_CHECKING
 
@@ -42,13 +43,7 @@ if TYPE_CHECKING:
         DoublePendulumCart as DoublePendulumCart,
         FurutaPendulum as FurutaPendulum,
     )
-    from ._quadrotors import (
-        ConstantWind as ConstantWind,
-        DissipativeWind as DissipativeWind,
-        PlanarQuadrotor as PlanarQuadrotor,
-        Quadrotor as Quadrotor,
-        VortexWind as VortexWind,
-    )
+    from ._quadrotors import PlanarQuadrotor as PlanarQuadrotor, Quadrotor as Quadrotor
     from ._robots import (
         DynamicBicycle as DynamicBicycle,
         KinematicBicycle as KinematicBicycle,
@@ -61,8 +56,13 @@ if TYPE_CHECKING:
     )
     from ._vehicles import DriftingCar as DriftingCar, SlungLoad as SlungLoad
     from ._walkers import CompassGait as CompassGait, SimplestWalker as SimplestWalker
+    from ._winds import (
+        ConstantWind as ConstantWind,
+        DissipativeWind as DissipativeWind,
+        VortexWind as VortexWind,
+    )
 else:
-    # The catalogue is imported as it is used.
+    # Each plant is imported when it is first used, so that the package loads quickly.
     __getattr__, __dir__ = _lazily(
         __name__,
         {
@@ -71,12 +71,12 @@ else:
             "_industrial": "CSTR PermanentMagnetMotor TwoTank",
             "_oscillators": "DoubleIntegrator Lorenz MassSpringDamper VanDerPol",
             "_pendulums": "DoublePendulumCart FurutaPendulum",
-            "_quadrotors": "ConstantWind DissipativeWind PlanarQuadrotor Quadrotor "
-            "VortexWind",
+            "_quadrotors": "PlanarQuadrotor Quadrotor",
             "_robots": "DynamicBicycle KinematicBicycle Reacher",
             "_switching": "StickSlip Thermostat ValveWithStops",
             "_vehicles": "DriftingCar SlungLoad",
             "_walkers": "CompassGait SimplestWalker",
+            "_winds": "ConstantWind DissipativeWind VortexWind",
         },
     )
 del TYPE_CHECKING

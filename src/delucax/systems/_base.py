@@ -1,4 +1,5 @@
-"""Plants, and those in continuous time: a vector field and its names."""
+"""The base classes of plants: `AbstractPlant`, and `AbstractSystem` in continuous
+time."""
 
 import abc
 from typing import Any, ClassVar, Literal, TYPE_CHECKING
@@ -18,10 +19,11 @@ Noise = Literal["additive", "brownian"] | None
 
 
 class AbstractPlant(eqx.Module):
-    """The names and sizes of a plant, its sensor and its equilibrium.
+    """The common base of systems and dynamics: the names and sizes of a plant, its
+    sensor and its equilibrium.
 
-    [`delucax.AbstractSystem`][] adds a vector field to it, and
-    [`delucax.AbstractDynamics`][] a step.
+    You rarely subclass it directly. [`delucax.AbstractSystem`][] adds a vector field,
+    [`delucax.AbstractDynamics`][] adds a step.
 
     !!! example
 
@@ -33,6 +35,10 @@ class AbstractPlant(eqx.Module):
         assert isinstance(plant, dlx.systems.AbstractPlant)
         x, u = plant.equilibrium()
         plant.difference(jnp.array([6.3, 0.0]), x)
+        ```
+
+        ```text
+        Array([0.017, 0.   ], dtype=float32)
         ```
     """
 
@@ -60,14 +66,19 @@ class AbstractPlant(eqx.Module):
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`: that of its names, or of the state if there are none."""
+        """The size of the disturbance `w`: the number of `disturbance_names`, or the
+        number of states if there are no names."""
         return len(self.disturbance_names) or self.state_size
 
     @property
     def noise(self) -> Noise:
-        """How `w` acts: `None` if it enters the equations under `disturbance_names`,
-        `"additive"` if it is added to the next state, which is the default without
-        names, and `"brownian"` if it holds the increments of Brownian motions.
+        """How the disturbance `w` acts on the plant.
+
+        - `None`: it enters the equations. This is the default with
+            `disturbance_names`.
+        - `"additive"`: it is added to the next state. This is the default without
+            `disturbance_names`.
+        - `"brownian"`: it holds the increments of Brownian motions.
         """
         return None if self.disturbance_names else "additive"
 
@@ -78,7 +89,7 @@ class AbstractPlant(eqx.Module):
 
     @property
     def observation_size(self) -> int:
-        """The size of what `observe` returns."""
+        """The size of the observation that `observe` returns."""
         y = output_of(self.observe, (), (self.state_size,))
         is_array = isinstance(y, jax.ShapeDtypeStruct)
         if not is_array or len(y.shape) != 1:
@@ -90,7 +101,7 @@ class AbstractPlant(eqx.Module):
 
     @property
     def observes_state(self) -> bool:
-        """True if `observe` returns the state itself, which tracing it shows."""
+        """Whether `observe` returns the state itself. It is traced to find out."""
         shapes = (), (self.state_size,)
         t, x = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in shapes)
         traced = jax.make_jaxpr(self.observe)(t, x).jaxpr
@@ -99,18 +110,19 @@ class AbstractPlant(eqx.Module):
     def observe(self, t: Time, x: State) -> Observation:
         """The reading of the plant's sensor; the state by default.
 
-        **Arguments:** `t`: time. `x`: state.
+        **Arguments:** `t`: time, a scalar. `x`: state, shape `(state_size,)`.
 
-        **Returns:** the observation, rank 1.
+        **Returns:** the observation, a vector.
         """
         del t
         return x
 
     def difference(self, x: State, x_ref: State) -> State:
-        """The deviation of `x` from `x_ref`; by default `x - x_ref`, in which the
-        states that `angle_names` lists are wrapped to +-pi.
+        """The deviation of `x` from `x_ref`: by default `x - x_ref`, where the
+        differences of the states in `angle_names` are wrapped to +-pi.
 
-        **Arguments:** `x`: state. `x_ref`: the state to measure from.
+        **Arguments:** `x`: state, shape `(state_size,)`. `x_ref`: the state to measure
+            from, of the same shape.
 
         **Returns:** the deviation, a vector.
         """
@@ -123,13 +135,13 @@ class AbstractPlant(eqx.Module):
     def equilibrium(self) -> tuple[State, Control]:
         """A state and a control at which the plant rests.
 
-        **Returns:** `(x, u)`.
+        **Returns:** `(x, u)`, shapes `(state_size,)` and `(control_size,)`.
 
-        **Raises:** `ValueError` if none is defined.
+        **Raises:** `ValueError` if the class defines none, as by default.
         """
         raise ValueError(
             f"{type(self).__name__} defines no equilibrium: override `equilibrium`, or "
-            "give the state and control yourself."
+            "pass the state and control yourself."
         )
 
 
@@ -153,26 +165,27 @@ def check_names(plant: AbstractPlant) -> None:
 
 
 class AbstractSystem(AbstractPlant):
-    r"""A system in continuous time, `dx/dt = f(t, x, u, w)`.
+    r"""A system in continuous time, $\dot x = f(t, x, u, w)$.
 
     Subclass it, name the states and controls, and write `vector_field`. States,
-    controls and disturbances are rank-1 arrays whose sizes follow from the names.
+    controls and disturbances are vectors. Their sizes follow from the names.
 
-    **Class attributes** (or properties, where they depend on a field):
+    **Class attributes** (or properties, if they depend on a field):
 
     - `state_names`, `control_names`: tuples of strings.
-    - `angle_names`: those of the states that `difference` wraps; none by default.
-    - `disturbance_names`: tuple of strings, empty by default. If it is empty then `w`
-        has the size of the state and is added to the next state by the discrete
-        dynamics; otherwise `w` enters the vector field, and is held over a step.
+    - `angle_names`: the states that are angles, which `difference` wraps; none by
+        default.
+    - `disturbance_names`: a tuple of strings, empty by default. With names, `w` enters
+        the vector field and is held over a step. Without names, `w` has the size of the
+        state, and the discrete-time dynamics add it to the next state.
     - `state_units`, `control_units`: tuples of strings, empty by default.
     - `time_unit`: a string, `"s"` by default.
 
-    **Hooks**, which alone may be overridden: `observe`, `project`, `difference`,
-    `equilibrium`, `diffusion`.
+    **Hooks:** you may override `observe`, `project`, `difference`, `equilibrium` and
+    `diffusion`. Leave the other methods as they are.
 
     **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
-    or not valid, or if the names are missing.
+    or violates its constraint, or if the names are missing.
 
     !!! example
 
@@ -192,6 +205,10 @@ class AbstractSystem(AbstractPlant):
 
         VanDerPol().vector_field(0.0, jnp.ones(2), jnp.zeros(1), None)
         ```
+
+        ```text
+        Array([ 1., -1.], dtype=float32)
+        ```
     """
 
     def __check_init__(self):
@@ -206,57 +223,60 @@ class AbstractSystem(AbstractPlant):
 
     @property
     def projects_state(self) -> bool:
-        """Whether the class has a `project` of its own."""
+        """Whether the class overrides `project`."""
         return type(self).project is not AbstractSystem.project
 
     @property
     def noise(self) -> Noise:
-        """`"brownian"` with a `diffusion`; else `None` with `disturbance_names`, and
-        `"additive"` without."""
+        """How `w` acts: `"brownian"` with a `diffusion`; otherwise `None` with
+        `disturbance_names` and `"additive"` without."""
         return super().noise if _brownian_size(self) is None else "brownian"
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`: that of its Brownian motions or of its names, or of the
-        state if there are neither."""
+        """The size of `w`: the number of Brownian motions with a `diffusion`, else the
+        number of `disturbance_names`, else the number of states."""
         motions = _brownian_size(self)
         return super().disturbance_size if motions is None else motions
 
     @abc.abstractmethod
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        """The time derivative of the state.
+        r"""The time derivative of the state.
 
         **Arguments:**
 
         - `t`: time, a scalar.
         - `x`: state, shape `(state_size,)`.
         - `u`: control, shape `(control_size,)`.
-        - `w`: disturbance, shape `(disturbance_size,)` if `disturbance_names` is given
-            (zeros where there is no disturbance), else `None`.
+        - `w`: disturbance, shape `(disturbance_size,)` if the system has
+            `disturbance_names` (zeros if there is no disturbance), else `None`.
 
-        **Returns:** dx/dt, shape `(state_size,)`.
+        **Returns:** $\dot x$, shape `(state_size,)`.
         """
 
     def project(self, x: State) -> State:
-        """Brings the state back to its manifold after each control interval; the
+        """Bring the state back to its manifold after each control interval; the
         identity by default. Normalise a quaternion or wrap an angle here.
 
-        **Arguments:** `x`: state.
+        **Arguments:** `x`: state, shape `(state_size,)`.
 
-        **Returns:** the projected state.
+        **Returns:** the projected state, of the same shape.
         """
         return x
 
     def diffusion(self, t: Time, x: State, u: Control) -> Array | None:
-        """The matrix g of `dx = f dt + g dB`; none by default.
+        r"""The matrix $g$ of $\mathrm{d}x = f \,\mathrm{d}t + g \,\mathrm{d}B$; none by
+        default.
 
-        With a diffusion `w` holds the increments of its k Brownian motions over the
-        step, whose names `disturbance_names` may give.
+        With a diffusion, `w` holds the increments of the $k$ Brownian motions over the
+        step. You may name them in `disturbance_names`.
 
-        **Arguments:** `t`: time. `x`: state. `u`: control.
+        **Arguments:** `t`: time, a scalar. `x`: state, shape `(state_size,)`. `u`:
+            control, shape `(control_size,)`.
 
-        **Returns:** shape `(state_size, k)`, or `(state_size,)` for a diagonal (k is
-        then the number of states); or `None` for a deterministic system.
+        **Returns:** $g$, shape `(state_size, k)`; or its diagonal, shape
+        `(state_size,)`, with one motion for each state; or `None` for a deterministic
+        system.
         """
         del t, x, u
         return None
@@ -274,12 +294,12 @@ def _brownian_size(system: AbstractSystem) -> int | None:
     if shape is None or len(shape) not in (1, 2) or shape[0] != n:
         got = f"a {type(g).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"{name}: diffusion must return an array of shape ({n}, k), of k Brownian "
-            f"motions, or ({n},), a diagonal, got {got}."
+            f"{name}: diffusion must return an array of shape ({n}, k), for k Brownian "
+            f"motions, or of shape ({n},), for a diagonal, got {got}."
         )
     if names and len(names) != shape[-1]:
         raise ValueError(
             f"{name}: disturbance_names must name the {shape[-1]} Brownian motions of "
-            f"the diffusion, or be left out, got {names}."
+            f"the diffusion, got {names}. Name each motion, or leave the names out."
         )
     return shape[-1]

@@ -14,19 +14,19 @@ from ._base import AbstractSystem
 
 
 class Pendulum(AbstractSystem):
-    r"""A uniform rod hinged at one end, driven by a torque at the hinge:
+    r"""A pendulum: a uniform rod hinged at one end, driven by a torque at the hinge.
 
-    `d2(angle)/dt2 = 3 g / (2 l) sin(angle) + 3 torque / (m l^2) - d(angle)/dt b`
+    $$\ddot\theta = \frac{3 g}{2 l} \sin\theta + \frac{3}{m l^2} \tau - b \dot\theta$$
 
-    with `angle = 0` upright. The state is (angle [rad], velocity [rad/s]), the control
-    is (torque [N m]). The vector field is smooth.
+    Here $\theta$ is the angle from upright and $\tau$ the torque. The state is (angle
+    [rad], velocity [rad/s]), the control is (torque [N m]). The vector field is smooth.
 
     **Arguments:**
 
-    - `mass`: m [kg], 1 by default.
-    - `length`: l [m], 1 by default.
-    - `gravity`: g [m/s^2], 10 by default, as in Gym.
-    - `damping`: viscous friction b [1/s], 0 by default.
+    - `mass`: $m$ [kg], 1 by default.
+    - `length`: $l$ [m], 1 by default.
+    - `gravity`: $g$ [m/s^2], 10 by default, as in Gym.
+    - `damping`: viscous friction $b$ [1/s], 0 by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
@@ -42,6 +42,10 @@ class Pendulum(AbstractSystem):
         pendulum = dlx.systems.Pendulum(length=1.2)
         pendulum.vector_field(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), None)
         ```
+
+        ```text
+        Array([0.   , 1.248], dtype=float32)
+        ```
     """
 
     mass: Real = parameter(1.0, constraint=positive)
@@ -54,14 +58,14 @@ class Pendulum(AbstractSystem):
     angle_names = ("angle",)
 
     def acceleration(self, angle: Array, velocity: Array, torque: Array) -> Array:
-        """The angular acceleration.
+        r"""The angular acceleration.
 
         **Arguments:** `angle` [rad], `velocity` [rad/s], `torque` [N m]: scalars.
 
-        **Returns:** d2(angle)/dt2 [rad/s^2].
+        **Returns:** $\ddot\theta$ [rad/s^2], a scalar.
         """
-        # m l^2 / 3 is the inertia of a rod about its end. Gravity, m g l/2 sin(angle),
-        # drives away from upright: its sign is plus.
+        # A rod has the inertia m l^2 / 3 about its end. The torque of gravity,
+        # m g l/2 sin(angle), drives the rod away from upright, so its sign is plus.
         weight = 3 * self.gravity / (2 * self.length) * sin(angle)
         drive = 3 / (self.mass * self.length**2) * torque
         return weight + drive - self.damping * velocity
@@ -75,26 +79,25 @@ class Pendulum(AbstractSystem):
 
 
 class CartPole(AbstractSystem):
-    r"""A pole hinged on a cart, which a force pushes along a track without friction:
+    r"""A pole hinged on a cart. A force pushes the cart along a track without friction.
 
-    ```
-    push = (force + m l spin^2 sin(angle)) / M
-    d(spin)/dt = (g sin(angle) - cos(angle) push) / (l (4/3 - m cos(angle)^2 / M))
-    d(velocity)/dt = push - m l d(spin)/dt cos(angle) / M
-    ```
+    $$\ddot\theta = \frac{g \sin\theta - a \cos\theta}
+    {l \left(\frac43 - \frac{m}{M} \cos^2\theta\right)}, \qquad
+    \ddot p = a - \frac{m l}{M} \ddot\theta \cos\theta, \qquad
+    a = \frac{F + m l \dot\theta^2 \sin\theta}{M}$$
 
-    with `M` the mass of cart and pole together. The state is (position [m], velocity
-    [m/s], angle [rad], spin [rad/s]), the control is (force [N]). `angle = 0` is
-    upright, and it grows in the direction of positive positions. The vector field is
-    smooth.
+    Here $p$ is the position, $\theta$ the angle, $F$ the force and $M$ the mass of cart
+    and pole together. The state is (position [m], velocity [m/s], angle [rad], spin
+    [rad/s]), the control is (force [N]). The pole is upright at angle 0, and a positive
+    angle leans towards positive positions. The vector field is smooth.
 
     **Arguments:**
 
-    - `cart_mass`: [kg], 1 by default.
-    - `pole_mass`: m [kg], 0.1 by default.
-    - `half_length`: l, half the length of the pole [m], 0.5 by default. Gym calls it
+    - `cart_mass`: mass of the cart, $M - m$ [kg], 1 by default.
+    - `pole_mass`: $m$ [kg], 0.1 by default.
+    - `half_length`: $l$, half the length of the pole [m], 0.5 by default. Gym calls it
         the length.
-    - `gravity`: g [m/s^2], 9.8 by default.
+    - `gravity`: $g$ [m/s^2], 9.8 by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
@@ -111,6 +114,13 @@ class CartPole(AbstractSystem):
         upright = dlx.linearize(cartpole)
         upright.A
         ```
+
+        ```text
+        Array([[ 0.   ,  1.   ,  0.   ,  0.   ],
+               [ 0.   ,  0.   , -0.717,  0.   ],
+               [ 0.   ,  0.   ,  0.   ,  1.   ],
+               [ 0.   ,  0.   , 13.146,  0.   ]], dtype=float32)
+        ```
     """
 
     cart_mass: Real = parameter(1.0, constraint=positive)
@@ -126,21 +136,20 @@ class CartPole(AbstractSystem):
     def accelerations(
         self, angle: Array, spin: Array, force: Array
     ) -> tuple[Array, Array]:
-        """The accelerations of the cart and of the pole.
+        r"""The accelerations of the cart and of the pole.
 
         **Arguments:** `angle` [rad], `spin` [rad/s], `force` [N]: scalars.
 
-        **Returns:** `(d(velocity)/dt [m/s^2], d(spin)/dt [rad/s^2])`.
+        **Returns:** $\ddot p$ [m/s^2] and $\ddot\theta$ [rad/s^2], scalars.
         """
         total = self.cart_mass + self.pole_mass
         moment = self.pole_mass * self.half_length
         lean, upright = sin(angle), cos(angle)
-        # The pole pulls the cart outwards as it swings: a centrifugal force, along
-        # lean.
+        # The second term is the centrifugal force of the swinging pole on the cart.
         push = (force + moment * (spin * spin) * lean) / total
-        # 4/3: of a uniform rod of half-length l about its end, over m l.
+        # A uniform rod of half-length l has the inertia 4/3 m l^2 about its end.
         inertia = 4 / 3 - self.pole_mass * (upright * upright) / total
-        # A cart that is pushed forwards leaves the pole behind: hence the minus.
+        # The minus: a cart that is pushed forwards leaves the pole behind.
         turn = (self.gravity * lean - upright * push) / (self.half_length * inertia)
         return push - moment * turn * upright / total, turn
 
@@ -154,21 +163,21 @@ class CartPole(AbstractSystem):
 
 
 class MountainCar(AbstractSystem):
-    r"""A car in a valley whose slopes are steeper than its motor can climb:
+    r"""A car in a valley whose slopes are too steep for its motor.
 
-    `d(velocity)/dt = power push - gravity cos(3 position)`
+    $$\ddot p = c\, u - g \cos(3 p)$$
 
-    The state is (position, velocity), the control is (push). The unit of time is a
-    step: Gym gives its constants for one step at a time, so Gym's arithmetic is
-    semi-implicit Euler with `dt = 1`. Gravity acts along the position, not along the
-    track. The vector field is smooth, and has no walls and no speed limit. The
-    equilibrium that it names is the bottom of the valley, `position = -pi/6`.
+    Here $p$ is the position and $u$ the push. The state is (position, velocity), the
+    control is (push). The unit of time is one step, because Gym gives its constants per
+    step: Gym's arithmetic is semi-implicit Euler with `dt=1`. Gravity acts along the
+    position, not along the track. The vector field is smooth, and has no walls and no
+    speed limit. `equilibrium` is the bottom of the valley, $p = -\pi/6$.
 
     **Arguments:**
 
-    - `power`: of the motor, 0.0015 by default, as in `MountainCarContinuous-v0`;
-        `MountainCar-v0` has 0.001.
-    - `gravity`: 0.0025 by default.
+    - `power`: $c$, the power of the motor [1/step^2], 0.0015 by default, as in
+        `MountainCarContinuous-v0`. `MountainCar-v0` has 0.001.
+    - `gravity`: $g$ [1/step^2], 0.0025 by default.
 
     **Raises:** `ValueError` if a number is not finite.
 
@@ -184,6 +193,10 @@ class MountainCar(AbstractSystem):
         car = dlx.systems.MountainCar()
         car.vector_field(0.0, jnp.array([-0.5, 0.0]), jnp.ones(1), None)
         ```
+
+        ```text
+        Array([0.     , 0.00132], dtype=float32)
+        ```
     """
 
     power: Real = parameter(0.0015)
@@ -194,17 +207,18 @@ class MountainCar(AbstractSystem):
     time_unit = "steps"
 
     def acceleration(self, position: Array, push: Array) -> Array:
-        """The acceleration.
+        r"""The acceleration.
 
         **Arguments:** `position`, `push`: scalars.
 
-        **Returns:** d(velocity)/dt, a step being the unit of time.
+        **Returns:** $\ddot p$ [1/step^2], a scalar.
         """
-        # The slope of `height` over 1.35: gravity acts as if the track were flat.
+        # cos(3 position) is the slope of `height` over 1.35: gravity acts as if the
+        # track were flat.
         return self.power * push - self.gravity * cos(3 * position)
 
     def height(self, position: ArrayLike) -> Array:
-        """The height of the track, `0.45 sin(3 position) + 0.55`, as Gym draws it.
+        r"""The height of the track, $0.45 \sin(3 p) + 0.55$, as Gym draws it.
 
         **Arguments:** `position`: any shape.
 
@@ -221,39 +235,42 @@ class MountainCar(AbstractSystem):
 
 
 class Acrobot(AbstractSystem):
-    r"""Two links that hang in a chain, with a torque at the joint between them:
+    r"""Two links that hang in a chain, with a torque $\tau$ at the joint between them.
 
-    ```
-    d1 = m1 c1^2 + m2 (l1^2 + c2^2 + 2 l1 c2 cos(angle_2)) + I1 + I2
-    d2 = m2 (c2^2 + l1 c2 cos(angle_2)) + I2
-    phi2 = m2 c2 g sin(angle_1 + angle_2)
-    phi1 = -m2 l1 c2 (velocity_2^2 + 2 velocity_1 velocity_2) sin(angle_2)
-           + (m1 c1 + m2 l1) g sin(angle_1) + phi2
-    d(velocity_2)/dt = (torque + d2/d1 phi1 - m2 l1 c2 velocity_1^2 sin(angle_2) - phi2)
-                       / (m2 c2^2 + I2 - d2^2/d1)
-    d(velocity_1)/dt = -(d2 d(velocity_2)/dt + phi1) / d1
-    ```
+    $$\begin{aligned}
+    d_1 &= m_1 c_1^2 + m_2 (l_1^2 + c_2^2 + 2 l_1 c_2 \cos\theta_2) + I_1 + I_2 \\
+    d_2 &= m_2 (c_2^2 + l_1 c_2 \cos\theta_2) + I_2 \\
+    \phi_2 &= m_2 c_2 g \sin(\theta_1 + \theta_2) \\
+    \phi_1 &= -m_2 l_1 c_2 (\dot\theta_2^2 + 2 \dot\theta_1 \dot\theta_2) \sin\theta_2
+    + (m_1 c_1 + m_2 l_1) g \sin\theta_1 + \phi_2 \\
+    \ddot\theta_2 &= \left(\tau + \tfrac{d_2}{d_1} \phi_1
+    - m_2 l_1 c_2 \dot\theta_1^2 \sin\theta_2 - \phi_2\right)
+    / \left(m_2 c_2^2 + I_2 - d_2^2 / d_1\right) \\
+    \ddot\theta_1 &= -(d_2 \ddot\theta_2 + \phi_1) / d_1
+    \end{aligned}$$
 
     The state is (angle_1 [rad], angle_2 [rad], velocity_1 [rad/s], velocity_2 [rad/s]),
-    the control is (torque [N m]), to which the disturbance w, (push [N m]), is added.
-    `angle_1 = 0` hangs down; `angle_2` is measured from the line of the first link. The
-    vector field is smooth. The equilibrium that it names is the upright one,
+    the control is (torque [N m]). The disturbance (push [N m]) is added to the torque.
+    The first link hangs down at `angle_1 = 0`, and `angle_2` is measured from the line
+    of the first link. The vector field is smooth. `equilibrium` is the upright one,
     `angle_1 = pi`.
 
     **Arguments:**
 
-    - `mass_1`, `mass_2`: of the links [kg], 1 by default.
-    - `length_1`: of the first link [m], 1 by default. That of the second plays no part.
-    - `center_1`, `center_2`: c1 and c2, from a link's joint to its center of mass [m],
-        0.5 by default.
-    - `inertia_1`, `inertia_2`: of a link about its center of mass [kg m^2], 1 by
-        default.
-    - `gravity`: g [m/s^2], 9.8 by default.
-    - `form`: `"book"` (default), the equations of motion; or `"nips"`, those printed in
-        the paper, which lack the term in `velocity_1^2` and do not conserve energy.
+    - `mass_1`, `mass_2`: $m_1$ and $m_2$, masses of the links [kg], 1 by default.
+    - `length_1`: $l_1$, length of the first link [m], 1 by default. The length of the
+        second link does not enter the equations.
+    - `center_1`, `center_2`: $c_1$ and $c_2$, distance from a link's joint to its
+        center of mass [m], 0.5 by default.
+    - `inertia_1`, `inertia_2`: $I_1$ and $I_2$, inertia of a link about its center of
+        mass [kg m^2], 1 by default.
+    - `gravity`: $g$ [m/s^2], 9.8 by default.
+    - `form`: `"book"` (default) for the equations of motion; or `"nips"` for the
+        equations printed in the paper. Those lack the term in $\dot\theta_1^2$ and do
+        not conserve energy.
 
     **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
-    not finite, or `form` is neither.
+    not finite, or `form` is neither `"book"` nor `"nips"`.
 
     Source: Sutton, 1996 (`"nips"`); Sutton and Barto, 2018 (`"book"`); Gymnasium
     (Towers et al., 2023), `Acrobot-v1`.
@@ -266,6 +283,10 @@ class Acrobot(AbstractSystem):
 
         acrobot = dlx.systems.Acrobot(mass_2=1.2)
         acrobot.vector_field(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), jnp.ones(1), None)
+        ```
+
+        ```text
+        Array([ 0.   ,  0.   , -1.313,  2.237], dtype=float32)
         ```
     """
 
@@ -294,13 +315,11 @@ class Acrobot(AbstractSystem):
         angle_1, angle_2, velocity_1, velocity_2 = x[0], x[1], x[2], x[3]
         bend, straight = sin(angle_2), cos(angle_2)
         own = m2 * c2**2 + self.inertia_2
-        # The inertia about the first joint, and how it couples to the second.
         d1 = m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2 * straight)
         d1 = d1 + self.inertia_1 + self.inertia_2
         d2 = m2 * (c2**2 + l1 * c2 * straight) + self.inertia_2
-        # Gravity about the second joint; gravity and Coriolis forces about the first.
-        # Gym has cos(angle - pi/2), from angles to the horizontal; from hanging down it
-        # is the sine, and pulls back.
+        # Gym measures angles from the horizontal and writes cos(angle - pi/2). Here
+        # angles are measured from hanging down, which makes it the sine.
         phi2 = m2 * c2 * g * sin(angle_1 + angle_2)
         swing = velocity_2 * velocity_2 + 2 * velocity_1 * velocity_2
         phi1 = (m1 * c1 + m2 * l1) * g * sin(angle_1) + phi2

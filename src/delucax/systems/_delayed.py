@@ -12,16 +12,23 @@ from ._base import AbstractPlant, check_names
 
 
 class AbstractDelaySystem(AbstractPlant):
-    """A system with delayed states,
+    r"""A system whose derivative depends on past states.
 
-    `dx/dt = f(t, x(t), u, w, late)`, `late[i] = x(t - delays[i])`.
+    $$\dot x(t) = f(t, x(t), u, w, x(t - \tau_1), \dots, x(t - \tau_d))$$
 
-    Subclass it as a [`delucax.AbstractSystem`][], with one argument more.
-    [`delucax.dynamics.MethodOfSteps`][] makes dynamics of it. Delays of controls and
-    sensors alone are those of [`delucax.dynamics.TransportDelay`][].
+    Subclass it like [`delucax.AbstractSystem`][]; its `vector_field` takes one more
+    argument, `late`, which holds the delayed states.
+    [`delucax.dynamics.MethodOfSteps`][] turns it into discrete-time dynamics. If only
+    controls or sensor readings are late, use [`delucax.dynamics.TransportDelay`][]
+    instead.
 
-    **Attributes:** `delays`: the delays, positive, shape `(d,)`; a
-    [`delucax.parameter`][], or a property that is computed from some.
+    **Attributes:**
+
+    - `delays`: the delays $\tau_i$, positive, shape `(d,)`: a [`delucax.parameter`][],
+        or a property computed from parameters.
+
+    **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
+    or violates its constraint, or if the names are missing.
 
     !!! example
 
@@ -43,6 +50,10 @@ class AbstractDelaySystem(AbstractPlant):
         x0 = dynamics.filled([1.0])
         dlx.open_loop(dynamics, x0, jnp.zeros((100, 1)))[-1, 0]
         ```
+
+        ```text
+        Array(5.93, dtype=float32)
+        ```
     """
 
     if TYPE_CHECKING:  # a static checker would ask for an abstract field as argument
@@ -63,7 +74,7 @@ class AbstractDelaySystem(AbstractPlant):
         w: Disturbance,
         late: Float[Array, "d n"],
     ) -> State:
-        """The time derivative of the state.
+        r"""The time derivative of the state.
 
         **Arguments:**
 
@@ -71,7 +82,8 @@ class AbstractDelaySystem(AbstractPlant):
         - `x`: state, shape `(state_size,)`.
         - `u`: control, shape `(control_size,)`.
         - `w`: disturbance, as for [`delucax.AbstractSystem`][].
-        - `late`: the state at `t - delays[i]` as row `i`, shape `(d, state_size)`.
+        - `late`: the delayed states, shape `(d, state_size)`; row `i` is the state at
+            `t - delays[i]`.
 
-        **Returns:** dx/dt, shape `(state_size,)`.
+        **Returns:** $\dot x$, shape `(state_size,)`.
         """

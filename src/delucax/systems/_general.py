@@ -1,4 +1,4 @@
-"""Systems of no particular plant: of matrices, of a function, of a neural network."""
+"""General systems: from matrices, from a function, from a neural network."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY
@@ -34,9 +34,10 @@ from ._base import AbstractSystem
 
 
 class LinearSystem(AbstractSystem):
-    """An affine system about its operating point,
+    r"""A linear system, or an affine one about an operating point.
 
-    `dx/dt = dx_ref + A (x - x_ref) + B (u - u_ref) + E w`, `y = C x`.
+    $$\dot x = \dot x_\mathrm{ref} + A (x - x_\mathrm{ref}) + B (u - u_\mathrm{ref})
+    + E w, \qquad y = C x$$
 
     **Arguments:**
 
@@ -44,10 +45,12 @@ class LinearSystem(AbstractSystem):
     - `B`: shape `(n, m)`.
     - `C`: shape `(p, n)`; the identity by default.
     - `E`: shape `(n, k)`: how `w` enters the vector field. By default `w` has the size
-        of the state and is added to the next state by the discrete dynamics.
+        of the state, and the discrete-time dynamics add it to the next state.
     - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`; zero by default.
-    - `dx_ref`: the vector field there, shape `(n,)`; zero by default.
-    - `state_names`, `control_names`: `("x0", ...)` and `("u0", ...)` by default.
+    - `dx_ref`: $\dot x_\mathrm{ref}$, the vector field at the operating point, shape
+        `(n,)`; zero by default.
+    - `state_names`, `control_names`: tuples of `n` and `m` strings; `("x0", ...)` and
+        `("u0", ...)` by default.
 
     **Raises:** `ValueError` if shapes do not fit or entries are not finite.
 
@@ -59,7 +62,12 @@ class LinearSystem(AbstractSystem):
 
         A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
         B = jnp.array([[0.0], [1.0]])
-        dynamics = dlx.c2d(dlx.systems.LinearSystem(A, B), dt=0.1)
+        system = dlx.systems.LinearSystem(A, B)
+        system.vector_field(0.0, jnp.array([1.0, 0.5]), jnp.ones(1), None)
+        ```
+
+        ```text
+        Array([0.5, 1. ], dtype=float32)
         ```
     """
 
@@ -100,12 +108,12 @@ class LinearSystem(AbstractSystem):
 
     @property
     def disturbance_names(self) -> tuple[str, ...]:
-        """Names of the disturbances, one a column of `E`."""
+        """Names of the disturbances, one for each column of `E`."""
         return () if self.E is None else indexed_names("w", self.E.shape[1])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        # Deviations first: about a large operating point `A x - A x_ref` would cancel.
-        # dx_ref is not zero where the point is no equilibrium.
+        # Deviations are taken before the products: far from zero, `A x - A x_ref`
+        # would lose digits. dx_ref is not zero if the point is no equilibrium.
         dx = self.dx_ref + matvec(self.A, x - self.x_ref)
         dx = dx + matvec(self.B, u - self.u_ref)
         if self.E is not None and w is not None:
@@ -120,20 +128,27 @@ class LinearSystem(AbstractSystem):
 
 
 class FunctionSystem(AbstractSystem):
-    """A system whose vector field is a function; made by [`delucax.system`][].
+    """A system whose vector field is a function. [`delucax.system`][] makes one.
 
     **Arguments:**
 
-    - `function`: `(t, x, u, w) -> dx/dt`; may itself be an `eqx.Module`, whose arrays
-        are then leaves of the system.
-    - `state_names`, `control_names`, `disturbance_names`: tuples of strings.
+    - `function`: `(t, x, u, w) -> dx/dt`. It may be an `eqx.Module`: its arrays are
+        then leaves of the system.
+    - `state_names`, `control_names`: tuples of strings.
+    - `disturbance_names`: a tuple of strings, empty by default.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
 
         decay = dlx.system(lambda t, x, u, w: u - x, states=1, controls=1)
+        decay.vector_field(0.0, jnp.array([2.0]), jnp.array([0.5]), None)
+        ```
+
+        ```text
+        Array([-1.5], dtype=float32)
         ```
     """
 
@@ -158,11 +173,12 @@ def system(
 
     **Arguments:**
 
-    - `f`: the vector field. A function's own constants are fixed; pass an `eqx.Module`
-        with a `__call__` to have them as differentiable leaves.
-    - `states`, `controls`: their names, or how many there are.
-    - `disturbances`: names or number of those that enter `f`; none by default, in which
-        case `w` is added to the next state.
+    - `f`: the vector field. Constants inside a function are fixed. To train or
+        differentiate them, pass an `eqx.Module` with a `__call__` and make them its
+        fields.
+    - `states`, `controls`: the names of the states and controls, or how many there are.
+    - `disturbances`: the names of the disturbances that enter `f`, or how many there
+        are. None by default: then `w` is added to the next state.
 
     **Returns:** a [`delucax.systems.FunctionSystem`][].
 
@@ -178,6 +194,11 @@ def system(
             return jnp.stack([x[1], u[0]])
 
         car = dlx.system(double_integrator, states=("position", "speed"), controls=1)
+        car.vector_field(0.0, jnp.array([1.0, 0.5]), jnp.array([2.0]), None)
+        ```
+
+        ```text
+        Array([0.5, 2. ], dtype=float32)
         ```
     """
     check_function(f, "f", "system", " of (t, x, u, w)")
@@ -190,20 +211,20 @@ def system(
 
 
 class NeuralSystem(AbstractSystem):
-    """A fully connected network of the state and the control,
+    r"""A system whose vector field is a neural network of the state and the control.
 
-    `dx/dt = network((x, u))`.
+    $$\dot x = \mathrm{network}(x, u)$$
 
-    As smooth as its activation. The network is trainable: `delucax.training.fit` moves
-    it and nothing else.
+    The network is fully connected and as smooth as its activation. It is trainable:
+    `delucax.training.fit` changes the network and nothing else.
 
     **Arguments:**
 
-    - `states`, `controls`: their names, or how many there are.
-    - `width`: units in a hidden layer, 64 by default.
-    - `depth`: hidden layers, 2 by default; 0 for a linear field.
-    - `activation`: of the hidden layers, `jnp.tanh` by default.
-    - `key`: a random key, for the first weights.
+    - `states`, `controls`: the names of the states and controls, or how many there are.
+    - `width`: units in each hidden layer, 64 by default.
+    - `depth`: number of hidden layers, 2 by default; 0 for a linear vector field.
+    - `activation`: activation of the hidden layers, `jnp.tanh` by default.
+    - `key`: a random key for the initial weights.
 
     **Attributes:** `network`, an `eqx.nn.MLP`, trainable; `state_names` and
     `control_names`.
@@ -222,7 +243,11 @@ class NeuralSystem(AbstractSystem):
 
         field = dlx.systems.NeuralSystem(2, 1, width=32, key=jax.random.key(0))
         dynamics = dlx.Discretized(field, dt=0.05)
-        dynamics(0.0, jnp.ones(2), jnp.zeros(1))
+        dynamics(0.0, jnp.ones(2), jnp.zeros(1)).shape
+        ```
+
+        ```text
+        (2,)
         ```
     """
 

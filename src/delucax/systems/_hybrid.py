@@ -11,23 +11,24 @@ from ._hybrid_base import AbstractHybridSystem
 
 
 class BouncingBall(AbstractHybridSystem):
-    r"""A ball that falls, with quadratic drag, and bounces off the floor:
+    r"""A ball that falls with quadratic drag and bounces off the ground.
 
-    `m d2(height)/dt2 = force - m g - drag velocity |velocity|`
+    $$m \ddot h = F - m g - d\, \dot h |\dot h|, \qquad
+    \dot h^+ = -e\, \dot h^- \text{ when } h \text{ falls to } 0$$
 
-    and `velocity+ = -restitution velocity-` where the height falls to zero. The state
-    is (height [m], velocity [m/s]), the control is (force [N]).
+    Here $h$ is the height and $F$ the force. The state is (height [m], velocity [m/s]),
+    the control is (force [N]).
 
-    A bounce that loses energy is followed by infinitely many in finite time. The
-    interval in which they accumulate ends with `RESULTS.too_many_events`, and the ball
-    on the floor.
+    If bounces lose energy, infinitely many of them happen in finite time. The control
+    interval in which they accumulate ends with `RESULTS.too_many_events`, with the ball
+    on the ground.
 
     **Arguments:**
 
-    - `mass`: m [kg], 1 by default.
-    - `gravity`: g [m/s^2], 9.81 by default.
-    - `drag`: [kg/m], 0 by default.
-    - `restitution`: the share of its speed that the ball keeps, 0.8 by default.
+    - `mass`: $m$ [kg], 1 by default.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
+    - `drag`: $d$ [kg/m], 0 by default.
+    - `restitution`: $e$, the fraction of its speed that the ball keeps, 0.8 by default.
 
     **Raises:** `ValueError` if the mass or the restitution is not positive, or a number
     is not finite.
@@ -42,7 +43,11 @@ class BouncingBall(AbstractHybridSystem):
 
         ball = dlx.systems.BouncingBall(restitution=0.9)
         dynamics = dlx.Discretized(ball, dt=0.1)
-        dlx.open_loop(dynamics, jnp.array([1.0, 0.0]), jnp.zeros((10, 1)))
+        dlx.open_loop(dynamics, jnp.array([1.0, 0.0]), jnp.zeros((10, 1)))[-1]
+        ```
+
+        ```text
+        Array([ 0.711, -1.394], dtype=float32)
         ```
     """
 
@@ -67,26 +72,30 @@ class BouncingBall(AbstractHybridSystem):
 
 
 class RimlessWheel(AbstractHybridSystem):
-    r"""A wheel of spokes without a rim, which rolls down a slope from spoke to spoke:
+    r"""A wheel of spokes without a rim, which rolls down a slope from spoke to spoke.
 
-    `d2(angle)/dt2 = g / l sin(angle) + torque / (m l^2)`
+    $$\ddot\theta = \frac{g}{l} \sin\theta + \frac{\tau}{m l^2}$$
 
-    about the foot of the spoke that stands, at `angle` from the vertical, downhill
-    positive. The next spoke hits the ground where `angle = slope + half`, in which
-    `half` is half the angle between spokes; the angle then falls by `2 half`, and
-    `velocity+ = cos(2 half) velocity-`, as angular momentum about the new foot is kept.
-    Rolling back it is the same the other way. The state is (angle [rad],
-    velocity [rad/s]), the control is (torque [N m]).
+    Here $\theta$ is the angle of the standing spoke from the vertical, positive
+    downhill, and $\tau$ the torque. The next spoke hits the ground at
+    $\theta = \gamma + \alpha$. Angular momentum about the new foot is conserved, so
+    that
 
-    Its rolling is a limit cycle whose multiplier is `cos(2 half)^2`.
+    $$\theta^+ = \theta^- - 2 \alpha, \qquad
+    \dot\theta^+ = \cos(2 \alpha)\, \dot\theta^-$$
+
+    When the wheel rolls back, the same happens in the other direction. The state is
+    (angle [rad], velocity [rad/s]), the control is (torque [N m]).
+
+    Steady rolling is a limit cycle with the multiplier $\cos^2(2 \alpha)$.
 
     **Arguments:**
 
-    - `length`: l of a spoke [m], 1 by default.
-    - `mass`: m, all of it at the hub [kg], 1 by default.
-    - `gravity`: g [m/s^2], 9.81 by default.
-    - `half`: half the angle between spokes [rad], pi / 8 by default.
-    - `slope`: of the ground [rad], 0.08 by default.
+    - `length`: $l$, the length of a spoke [m], 1 by default.
+    - `mass`: $m$, all of it at the hub [kg], 1 by default.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
+    - `half`: $\alpha$, half the angle between spokes [rad], pi / 8 by default.
+    - `slope`: $\gamma$, the slope of the ground [rad], 0.08 by default.
 
     **Raises:** `ValueError` if the length, mass or half angle is not positive, or a
     number is not finite.
@@ -101,7 +110,11 @@ class RimlessWheel(AbstractHybridSystem):
 
         wheel = dlx.systems.RimlessWheel(slope=0.1)
         dynamics = dlx.Discretized(wheel, dt=0.05)
-        dlx.open_loop(dynamics, jnp.array([0.0, 1.0]), jnp.zeros((40, 1)))
+        dlx.open_loop(dynamics, jnp.array([0.0, 1.0]), jnp.zeros((40, 1)))[-1]
+        ```
+
+        ```text
+        Array([-0.096,  0.893], dtype=float32)
         ```
     """
 

@@ -16,33 +16,41 @@ from ._base import AbstractSystem
 class AbstractHybridSystem(AbstractSystem):
     r"""A system in continuous time whose state jumps at events.
 
-    Between events `dx/dt = f(t, x, u, w)`. Event i fires where its guard
-    `g_i(t, x, u)` crosses zero while it is enabled, and the state becomes
-    `x+ = r_i(t, x-, u)`. Subclass it, name the events, and write `vector_field`,
-    `guards` and `resets`. Everything that takes a system takes it, by
-    [`delucax.Discretized`][].
+    Between events, $\dot x = f(t, x, u, w)$. Event $i$ fires when its guard
+    $g_i(t, x, u)$ crosses zero while the event is enabled. The state then becomes
+    $x^+ = r_i(t, x^-, u)$.
 
-    A guard that falls, as most do, is a distance: the plant lives where it is positive,
-    and the event is what happens when it is used up. A state that is beyond an enabled
-    guard at the start of an interval or after a reset is a fault of the model,
-    `RESULTS.beyond_guard`, unless the event is urgent; one that is on the guard and
-    moves beyond it fires at once.
+    Subclass it, name the events, and write `vector_field`, `guards` and `resets`.
+    [`delucax.Discretized`][] steps it like any other system, so environments, planners
+    and controllers take it too.
+
+    Think of a guard as a distance, such as the height of a ball: the plant lives where
+    it is positive, and the event fires when it falls to zero. If the state is on the
+    guard and moves beyond it, the event fires at once. If the state is already beyond
+    an enabled guard at the start of an interval or after a reset, the model is wrong,
+    and the status is `RESULTS.beyond_guard`. An urgent event fires instead.
 
     **Class attributes** (or properties), besides those of [`delucax.AbstractSystem`][]:
 
     - `event_names`: a tuple of strings.
-    - `event_directions`: for each event -1 if its guard falls (the default), +1 if it
-        rises, or 0 for both, which allows either side.
-    - `urgent_events`: those that also fire at once where the state is beyond their
-        guard at the start of an interval or after a reset, none by default. A guard
-        that depends on the control needs it, as a control may jump between intervals.
-    - `crossing_events`: those with a direction that only tell that the guard crosses
-        zero, such as the tick of a clock, a switch or the top of a flight: the state
+    - `event_directions`: for each event, -1 if it fires when its guard falls through
+        zero (the default), +1 if it fires when the guard rises, or 0 for both. With 0,
+        the state may be on either side of the guard.
+    - `urgent_events`: the events that also fire when the state is already beyond their
+        guard at the start of an interval or after a reset; none by default. List an
+        event here if its guard depends on the control, because the control may jump
+        between intervals.
+    - `crossing_events`: the events that only report that their guard crosses zero, such
+        as the tick of a clock or the top of a flight. They need a direction. The state
         may be on either side of the guard, and the reset may leave it there. None by
         default.
-    - `mode_names`: the names of discrete modes, none by default. With them one of the
-        states is named `"mode"`; it holds 0.0, 1.0, ..., resets change it, and its
-        derivative is zero. `mode` reads it.
+    - `mode_names`: the names of discrete modes, none by default. With modes, one of the
+        states is named `"mode"` and holds 0.0, 1.0, ...; resets change it, and its
+        derivative is zero. Read it with `mode`.
+
+    **Raises:** `ValueError` at construction if the names, directions or modes do not
+    fit together, if there is not one guard and one reset for each event, or if the
+    system has a diffusion.
 
     !!! example
 
@@ -67,7 +75,11 @@ class AbstractHybridSystem(AbstractSystem):
                 return (jnp.stack([x[0], -self.restitution * x[1]]),)
 
         dynamics = dlx.Discretized(Ball(), dt=0.05)
-        dlx.open_loop(dynamics, jnp.array([1.0, 0.0]), jnp.zeros((20, 1)))
+        dlx.open_loop(dynamics, jnp.array([1.0, 0.0]), jnp.zeros((20, 1)))[-1]
+        ```
+
+        ```text
+        Array([ 0.468, -1.837], dtype=float32)
         ```
     """
 
@@ -103,20 +115,22 @@ class AbstractHybridSystem(AbstractSystem):
                 )
         if both := sorted(set(self.urgent_events) & set(self.crossing_events)):
             raise ValueError(
-                f"{where}: {both[0]!r} must not be both in urgent_events and in "
-                "crossing_events."
+                f"{where}: {both[0]!r} must be in urgent_events or in crossing_events, "
+                "not in both."
             )
         if self.mode_names and "mode" not in self.state_names:
             raise ValueError(
-                f"{where}: with mode_names one of state_names must be 'mode', got "
-                f"{self.state_names}."
+                f"{where}: state_names must contain 'mode', because there are "
+                f"mode_names, got {self.state_names}."
             )
         if self.noise == "brownian":
-            raise ValueError(f"{where}: a hybrid system must have no diffusion.")
+            raise ValueError(
+                f"{where}: diffusion must be left out of a system with events."
+            )
         self._check_events()
 
     def _check_events(self) -> None:
-        """Raise unless there are a guard and a reset for each event."""
+        """Raise unless there is a guard, a reset and a flag for each event."""
         where, count, n = type(self).__name__, len(self.event_names), self.state_size
         given = (), (n,), (self.control_size,)
         for hook, shape, what in (
@@ -137,42 +151,48 @@ class AbstractHybridSystem(AbstractSystem):
 
     @abc.abstractmethod
     def guards(self, t: Time, x: State, u: Control) -> Sequence[Scalar] | Array:
-        """What is zero at each event.
+        """The guard of each event: the number that crosses zero there.
 
-        **Arguments:** `t`: time. `x`: state. `u`: control, held over the interval.
+        **Arguments:** `t`: time, a scalar. `x`: state, shape `(state_size,)`. `u`:
+            control, shape `(control_size,)`, held over the interval.
 
-        **Returns:** a number for each of `event_names`, as a tuple or an array.
+        **Returns:** one number for each of `event_names`, as a tuple or an array.
         """
 
     @abc.abstractmethod
     def resets(self, t: Time, x: State, u: Control) -> Sequence[State] | Array:
-        """The state after each event, from that just before.
+        """The state just after each event.
 
-        **Arguments:** `t`: time. `x`: state before the event. `u`: control.
+        **Arguments:** `t`: time, a scalar. `x`: state just before the event, shape
+            `(state_size,)`. `u`: control, shape `(control_size,)`.
 
-        **Returns:** a state for each of `event_names`, as a tuple or an array.
+        **Returns:** one state for each of `event_names`, as a tuple or an array.
         """
 
     def enabled(self, t: Time, x: State, u: Control) -> Sequence[BoolScalar] | Array:
-        """Whether each event may fire, judged at its crossing; true by default.
+        """Whether each event may fire, evaluated where its guard crosses zero; true by
+        default.
 
-        **Arguments:** `t`: time. `x`: state. `u`: control.
+        **Arguments:** `t`: time, a scalar. `x`: state, shape `(state_size,)`. `u`:
+            control, shape `(control_size,)`.
 
-        **Returns:** a boolean for each of `event_names`, as a tuple or an array.
+        **Returns:** one boolean for each of `event_names`, as a tuple or an array.
         """
         del t, x, u
         return jnp.ones(len(self.event_names), bool)
 
     def mode(self, x: State) -> Array:
-        """The mode of a state, as a whole number.
+        """The mode of a state, as an integer.
 
-        **Arguments:** `x`: state.
+        **Arguments:** `x`: state, shape `(state_size,)`; leading axes are kept.
 
         **Returns:** the index in `mode_names`.
 
-        **Raises:** `ValueError` without `mode_names`.
+        **Raises:** `ValueError` if the system has no `mode_names`.
         """
         if not self.mode_names:
-            raise ValueError(f"{type(self).__name__}: mode needs mode_names.")
-        # Rounded, for code that gets a mode from an estimate.
+            raise ValueError(
+                f"{type(self).__name__}: mode needs a system with mode_names."
+            )
+        # Rounded, because an estimated state has a mode between two integers.
         return jnp.round(x[..., self.state_names.index("mode")]).astype(int)

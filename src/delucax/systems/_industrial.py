@@ -14,33 +14,35 @@ from ._base import AbstractSystem
 
 
 class CSTR(AbstractSystem):
-    r"""The continuous stirred-tank reactor: a reactant flows in, reacts in a tank that
-    is stirred, and gives off heat, which a jacket takes away,
+    r"""The continuous stirred-tank reactor. A reactant flows into a stirred tank and
+    reacts. The reaction gives off heat, which a cooling jacket takes away.
 
-    `dc/dt = flow (c_feed - c) - r`,
-    `dT/dt = flow (T_feed - T) + heat r + cooling (T_coolant - T)`,
-
-    with `r = rate exp(-activation / T) c`. Time is in minutes.
+    $$\dot c = f (c_\mathrm{feed} - c) - r, \qquad
+    \dot T = f (T_\mathrm{feed} - T) + h r + k (T_\mathrm{coolant} - T), \qquad
+    r = r_0 e^{-E / T} c$$
 
     The state is (concentration [mol/l], temperature [K]), the control is (coolant [K]),
-    the temperature of the jacket.
+    the temperature of the jacket. Time is in minutes.
 
-    With the numbers below it can rest at half the feed's concentration, but not by
-    itself: a little warmer, it reacts faster and gets warmer still. There the poles are
-    2.83 and -0.45 a minute.
+    With the default constants, half the feed's concentration is an unstable
+    equilibrium: if the tank gets a little warmer, it reacts faster and gets warmer
+    still. The poles there are 2.83 and -0.45 per minute.
 
     **Arguments:**
 
-    - `flow`: of the feed over the volume, q/V [1/min], 1 by default.
-    - `feed_concentration`: of the reactant in the feed [mol/l], 1 by default.
-    - `feed_temperature`: [K], 350 by default.
-    - `rate`: k0, of the reaction at infinite temperature [1/min], 7.2e10 by default.
-    - `activation`: the activation energy over the gas constant, E/R [K], 8750 by
+    - `flow`: $f$, the flow of the feed divided by the volume of the tank [1/min], 1 by
         default.
-    - `heat`: the temperature rise per concentration that reacts, -dH / (rho c_p)
-        [K l/mol], 209.2 by default.
-    - `cooling`: heat conducted to the jacket, over the capacity of the tank [1/min],
-        2.092 by default.
+    - `feed_concentration`: $c_\mathrm{feed}$, concentration of the reactant in the feed
+        [mol/l], 1 by default.
+    - `feed_temperature`: $T_\mathrm{feed}$ [K], 350 by default.
+    - `rate`: $r_0$, the rate of the reaction at infinite temperature [1/min], 7.2e10 by
+        default.
+    - `activation`: $E$, the activation energy divided by the gas constant [K], 8750 by
+        default.
+    - `heat`: $h$, the temperature rise per concentration that reacts,
+        $-\Delta H / (\rho c_p)$ [K l/mol], 209.2 by default.
+    - `cooling`: $k$, the heat conducted to the jacket divided by the heat capacity of
+        the tank [1/min], 2.092 by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -52,8 +54,11 @@ class CSTR(AbstractSystem):
         import delucax as dlx
 
         reactor = dlx.systems.CSTR()
-        x, u = reactor.equilibrium(concentration=0.5)
-        reactor.vector_field(0.0, x, u, None)
+        reactor.equilibrium(concentration=0.5)
+        ```
+
+        ```text
+        (Array([  0.5  , 350.001], dtype=float32), Array([300.001], dtype=float32))
         ```
     """
 
@@ -71,7 +76,7 @@ class CSTR(AbstractSystem):
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         c, T = x[0], x[1]
-        # A stage of a solver may have T <= 0, where the exponential would overflow.
+        # A solver may try a stage with T <= 0, where the exponential would overflow.
         reaction = self.rate * jnp.exp(-self.activation / jnp.maximum(T, 1.0)) * c
         dc = self.flow * (self.feed_concentration - c) - reaction
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
@@ -79,14 +84,14 @@ class CSTR(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
-        """The equilibrium at a concentration.
+        """The equilibrium at a given concentration.
 
-        **Arguments:** `concentration`: of the reactant, between 0 and that of the feed
-        [mol/l]; 0.5 by default.
+        **Arguments:** `concentration`: of the reactant in the tank [mol/l], above 0 and
+            below `feed_concentration`; 0.5 by default.
 
-        **Returns:** `(x, u)`.
+        **Returns:** `(x, u)`, shapes `(2,)` and `(1,)`.
 
-        **Raises:** `ValueError` if `concentration` is not between these.
+        **Raises:** `ValueError` if `concentration` is outside of this range.
         """
         c, feed = (
             xp.asarray(concentration, jnp.result_type(float)),
@@ -98,7 +103,8 @@ class CSTR(AbstractSystem):
                     "CSTR: concentration must be above 0 and below feed_concentration, "
                     f"{shortened(feed)}, got {shortened(c)}."
                 )
-        # All that flows in reacts: this gives the rate, and the rate the temperature.
+        # At rest, what flows in reacts. This gives the rate of the reaction, and the
+        # rate gives the temperature.
         reaction = self.flow * (feed - c)
         T = self.activation / xp.log(self.rate * c / reaction)
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
@@ -106,25 +112,29 @@ class CSTR(AbstractSystem):
 
 
 class TwoTank(AbstractSystem):
-    r"""A pump fills the upper of two tanks, which drains into the lower one, which
-    drains away:
+    r"""Two tanks in a cascade. A pump fills the upper tank, which drains into the lower
+    one, which drains away.
 
-    `A1 d(upper)/dt = flow - a1 sqrt(2 g) root(upper)`,
-    `A2 d(lower)/dt = a1 sqrt(2 g) root(upper) - a2 sqrt(2 g) root(lower)`.
+    $$A_1 \dot h_1 = q - a_1 \sqrt{2 g}\, r(h_1), \qquad
+    A_2 \dot h_2 = a_1 \sqrt{2 g}\, r(h_1) - a_2 \sqrt{2 g}\, r(h_2), \qquad
+    r(h) = \frac{h}{(h^2 + s^2)^{1/4}}$$
 
-    The state is the levels (upper [cm], lower [cm]), the control is (flow [cm^3/s]).
+    The state is the two levels (upper [cm], lower [cm]), the control is (flow
+    [cm^3/s]).
 
-    Torricelli's law has `root(h) = sqrt(h)`, whose slope is infinite at an empty tank,
-    and which has no value below. Here it is `root(h) = h / (h^2 + smoothing^2)^(1/4)`,
-    odd and smooth everywhere, and off by `(smoothing / h)^2 / 4` relatively: 2.5e-5 at
-    a level of 1 cm, by default. With a smaller `smoothing` an empty tank is stiffer.
+    Torricelli's law has $r(h) = \sqrt h$, which has an infinite slope at an empty tank
+    and no value below. The $r$ used here is odd and smooth everywhere. Its relative
+    error is about $(s / h)^2 / 4$: with the default $s$, 2.5e-5 at a level of 1 cm.
+    With a smaller $s$, an empty tank is stiffer.
 
     **Arguments:**
 
-    - `upper_area`, `lower_area`: A1 and A2, of the tanks [cm^2], 28 by default.
-    - `upper_outlet`, `lower_outlet`: a1 and a2, of the holes [cm^2], 0.071 by default.
-    - `gravity`: g [cm/s^2], 981 by default.
-    - `smoothing`: a level [cm], 0.01 by default.
+    - `upper_area`, `lower_area`: $A_1$ and $A_2$, cross sections of the tanks [cm^2],
+        28 by default.
+    - `upper_outlet`, `lower_outlet`: $a_1$ and $a_2$, areas of the outlets [cm^2],
+        0.071 by default.
+    - `gravity`: $g$ [cm/s^2], 981 by default.
+    - `smoothing`: $s$, a level [cm], 0.01 by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -134,11 +144,13 @@ class TwoTank(AbstractSystem):
 
         ```python
         import delucax as dlx
-        import jax.numpy as jnp
 
-        tanks = dlx.systems.TwoTank()
-        x, u = tanks.equilibrium(level=12.0)  # of the lower tank, in cm
-        tanks.vector_field(0.0, x, u, None)
+        tanks = dlx.systems.TwoTank(upper_outlet=0.1)
+        tanks.equilibrium(level=12.0)
+        ```
+
+        ```text
+        (Array([ 6.049, 12.   ], dtype=float32), Array([10.894], dtype=float32))
         ```
     """
 
@@ -153,8 +165,7 @@ class TwoTank(AbstractSystem):
     control_names, control_units = ("flow",), ("cm^3/s",)
 
     def _outflow(self, outlet: Scalar, level: Scalar) -> Scalar:
-        # Torricelli's sqrt(level) far above `smoothing`, and linear near zero; a level
-        # below zero, as a stage of a solver may have, flows back.
+        # Odd in the level, because a solver may try a stage with a level below zero.
         root = level * (level * level + self.smoothing**2) ** -0.25
         return outlet * (2 * self.gravity) ** 0.5 * root
 
@@ -166,42 +177,46 @@ class TwoTank(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self, level: Any = 10.0) -> tuple[State, Control]:
-        """The equilibrium at a level of the lower tank.
+        """The equilibrium at a given level of the lower tank.
 
-        **Arguments:** `level`: of the lower tank, not negative [cm]; 10 by default.
+        **Arguments:** `level`: level of the lower tank [cm], not negative; 10 by
+            default.
 
-        **Returns:** `(x, u)`.
+        **Returns:** `(x, u)`, shapes `(2,)` and `(1,)`.
         """
         level = xp.asarray(level, jnp.result_type(float))
         flow = self._outflow(self.lower_outlet, level)
-        # The level with that outflow: root(h)^2 = r solves for h^2 by a quadratic.
+        # The level of the upper tank at that outflow: r(h)^2 = r is quadratic in h^2.
         r = (flow / self.upper_outlet) ** 2 / (2 * self.gravity)
         square = r * (r + (r * r + 4 * self.smoothing**2) ** 0.5) / 2
         return xp.stack([square**0.5, level]), xp.stack([flow])
 
 
 class PermanentMagnetMotor(AbstractSystem):
-    r"""A synchronous motor with permanent magnets, in the coordinates d (along the
-    magnets) and q (across them) that turn with the rotor:
+    r"""A synchronous motor with permanent magnets, in coordinates that turn with the
+    rotor: d along the magnets, q across them.
 
-    `L_d d(i_d)/dt = v_d - R i_d + p speed L_q i_q`,
-    `L_q d(i_q)/dt = v_q - R i_q - p speed (L_d i_d + flux)`,
-    `J d(speed)/dt = 3/2 p (flux i_q + (L_d - L_q) i_d i_q) - b speed - load`.
+    $$\begin{aligned}
+    L_d \dot i_d &= v_d - R i_d + p \omega L_q i_q \\
+    L_q \dot i_q &= v_q - R i_q - p \omega (L_d i_d + \psi) \\
+    J \dot\omega &= \tfrac32 p (\psi i_q + (L_d - L_q) i_d i_q) - b \omega - \tau
+    \end{aligned}$$
 
-    The state is (i_d [A], i_q [A], speed [rad/s]), the speed being that of the shaft;
-    the control is (v_d [V], v_q [V]); the disturbance is (load [N m]). Smooth.
+    The state is (i_d [A], i_q [A], speed [rad/s]), where the speed $\omega$ is that of
+    the shaft. The control is (v_d [V], v_q [V]). The disturbance is (load [N m]), the
+    torque $\tau$ that brakes the shaft. The vector field is smooth.
 
     **Arguments:**
 
-    - `resistance`: R [ohm], 2.875 by default.
-    - `d_inductance`, `q_inductance`: L_d and L_q [H], 0.0085 by default.
-    - `flux`: of the magnets [Wb], 0.175 by default.
-    - `inertia`: J [kg m^2], 0.0008 by default.
-    - `friction`: b [N m s], 0.001 by default.
-    - `pole_pairs`: p, 4 by default.
+    - `resistance`: $R$ [ohm], 2.875 by default.
+    - `d_inductance`, `q_inductance`: $L_d$ and $L_q$ [H], 0.0085 by default.
+    - `flux`: $\psi$, flux of the magnets [Wb], 0.175 by default.
+    - `inertia`: $J$ [kg m^2], 0.0008 by default.
+    - `friction`: $b$ [N m s], 0.001 by default.
+    - `pole_pairs`: $p$, 4 by default.
 
     **Raises:** `ValueError` if an inductance, the flux, the inertia or the number of
-    poles is not positive, or a number is not finite.
+    pole pairs is not positive, or a number is not finite.
 
     Source: Krause, Wasynczuk and Sudhoff, 2002. The constants are those of a small
     servo motor.
@@ -210,11 +225,14 @@ class PermanentMagnetMotor(AbstractSystem):
 
         ```python
         import delucax as dlx
-        import jax.numpy as jnp
 
         motor = dlx.systems.PermanentMagnetMotor()
-        x, u = motor.equilibrium(speed=100.0)
-        motor.vector_field(0.0, x, u, None)
+        motor.equilibrium(speed=100.0)
+        ```
+
+        ```text
+        (Array([0.000e+00, 9.524e-02, 1.000e+02], dtype=float32),
+         Array([-0.324, 70.274], dtype=float32))
         ```
     """
 
@@ -233,38 +251,39 @@ class PermanentMagnetMotor(AbstractSystem):
     def torque(self, x: State) -> Scalar:
         """The torque of the currents on the shaft.
 
-        **Arguments:** `x`: state.
+        **Arguments:** `x`: state, shape `(3,)`.
 
         **Returns:** the torque [N m], a scalar.
         """
         saliency = self.d_inductance - self.q_inductance
-        # 3/2, as d and q are of the transformation that keeps amplitudes (Clarke's):
-        # the power is 3/2 (v_d i_d + v_q i_q).
+        # The factor 3/2 belongs to Clarke's transformation, which keeps amplitudes: the
+        # power is 3/2 (v_d i_d + v_q i_q).
         return 1.5 * self.pole_pairs * (self.flux * x[1] + saliency * x[0] * x[1])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         electrical = self.pole_pairs * x[2]  # the speed at which d and q turn
         d_flux = self.d_inductance * x[0] + self.flux
         q_flux = self.q_inductance * x[1]
-        # The axes turn with the rotor, so that each sees the flux along the other as a
-        # voltage, with opposite signs.
+        # Because the axes turn, the flux along each axis induces a voltage in the
+        # other, with opposite signs.
         d_voltage = u[0] - self.resistance * x[0] + electrical * q_flux
         q_voltage = u[1] - self.resistance * x[1] - electrical * d_flux
         torque = self.torque(x) - self.friction * x[2]
         if w is not None:
             torque = torque - w[0]
-        # Loops compute the reciprocals once.
+        # Reciprocals, because a loop computes them once.
         d_slope = d_voltage * (1 / self.d_inductance)
         q_slope = q_voltage * (1 / self.q_inductance)
         return jnp.stack([d_slope, q_slope, torque * (1 / self.inertia)])
 
     @host_unless_traced
     def equilibrium(self, speed: Any = 0.0) -> tuple[State, Control]:
-        """Turning at a speed without load, with no current along the magnets.
+        """The equilibrium at a given speed without load, with no current along the
+        magnets.
 
-        **Arguments:** `speed`: [rad/s], 0 by default.
+        **Arguments:** `speed`: speed of the shaft [rad/s], 0 by default.
 
-        **Returns:** `(x, u)`.
+        **Returns:** `(x, u)`, shapes `(3,)` and `(2,)`.
         """
         speed = xp.asarray(speed, jnp.result_type(float))
         current = self.friction * speed / (1.5 * self.pole_pairs * self.flux)

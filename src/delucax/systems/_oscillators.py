@@ -14,15 +14,15 @@ from ._base import AbstractSystem
 
 
 class DoubleIntegrator(AbstractSystem):
-    """A mass pushed along a line,
+    r"""A mass pushed along a line.
 
-    `m d2(position)/dt2 = force`.
+    $$m \ddot p = F$$
 
     The state is (position [m], velocity [m/s]), the control is (force [N]).
 
     **Arguments:**
 
-    - `mass`: m [kg], 1 by default.
+    - `mass`: $m$ [kg], 1 by default.
 
     **Raises:** `ValueError` if the mass is not positive.
 
@@ -36,6 +36,10 @@ class DoubleIntegrator(AbstractSystem):
 
         mass = dlx.systems.DoubleIntegrator()
         mass.vector_field(0.0, jnp.array([1.0, 0.5]), jnp.ones(1), None)
+        ```
+
+        ```text
+        Array([0.5, 1. ], dtype=float32)
         ```
     """
 
@@ -57,23 +61,25 @@ def _as_count(masses: Any) -> int:
 
 
 class MassSpringDamper(AbstractSystem):
-    """A mass on a spring and a damper, or a chain of them from a wall to the mass that
-    the force acts on:
+    r"""A mass on a spring and a damper, or a chain of such masses. One end of the chain
+    is fixed to a wall, and a force acts on the last mass.
 
-    `m_i d2(q_i)/dt2 = T_(i+1) - T_i`, `T_i = k_i (q_i - q_(i-1)) + c_i (v_i - v_(i-1))`
+    $$m_i \ddot q_i = T_{i+1} - T_i, \qquad
+    T_i = k_i (q_i - q_{i-1}) + c_i (v_i - v_{i-1})$$
 
-    with `q_0 = v_0 = 0` the wall and `T_(n+1)` the force. The state is the positions
-    [m], measured from rest, and then the velocities [m/s]; the control is (force [N]).
+    The wall is $q_0 = v_0 = 0$, and $T_{n+1}$ is the force. The state is the positions
+    [m], measured from rest, followed by the velocities [m/s]. The control is (force
+    [N]).
 
     **Arguments:**
 
-    - `mass`: m [kg], a number or one for each mass, 1 by default.
-    - `stiffness`: k [N/m], a number or one for each spring, 1 by default.
-    - `damping`: c [N s/m], a number or one for each damper, 0.1 by default.
-    - `masses`: how many there are, 1 by default.
+    - `mass`: $m$ [kg], one number or shape `(masses,)`, 1 by default.
+    - `stiffness`: $k$ [N/m], one number or shape `(masses,)`, 1 by default.
+    - `damping`: $c$ [N s/m], one number or shape `(masses,)`, 0.1 by default.
+    - `masses`: the number of masses $n$, 1 by default.
 
-    **Raises:** `ValueError` if a mass is not positive, a number is not finite, or there
-    are not as many numbers as masses.
+    **Raises:** `ValueError` if a mass is not positive, a number is not finite, or a
+    shape does not fit.
 
     Source: Åström and Murray, 2008.
 
@@ -85,6 +91,10 @@ class MassSpringDamper(AbstractSystem):
 
         chain = dlx.systems.MassSpringDamper(stiffness=[1.0, 2.0, 3.0], masses=3)
         chain.vector_field(0.0, jnp.ones(6), jnp.zeros(1), None)
+        ```
+
+        ```text
+        Array([ 1. ,  1. ,  1. , -1.1,  0. ,  0. ], dtype=float32)
         ```
     """
 
@@ -124,7 +134,7 @@ class MassSpringDamper(AbstractSystem):
             tension.append(k[i] * (x[i] - q) + c[i] * (x[n + i] - v))
             q, v = x[i], x[n + i]
         tension.append(u[0])  # the force acts where a further spring would
-        # Loops compute the reciprocals once.
+        # Reciprocals, because a loop computes them once.
         lightness = 1 / m
         # T_i pulls mass i back, and the mass before it along.
         pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]
@@ -136,17 +146,17 @@ class MassSpringDamper(AbstractSystem):
 
 
 class VanDerPol(AbstractSystem):
-    """Van der Pol's oscillator, forced,
+    r"""Van der Pol's oscillator with a control.
 
-    `dx/dt = v`, `dv/dt = mu (1 - x^2) v - x + u`.
+    $$\dot x = v, \qquad \dot v = \mu (1 - x^2) v - x + u$$
 
-    Without control all trajectories but the origin converge to one limit cycle, of
-    amplitude near 2.
-    Smooth; stiff for large mu. The numbers have no units.
+    Without control, every trajectory that starts outside of the origin converges to one
+    limit cycle, of amplitude near 2. The vector field is smooth, and stiff for large
+    $\mu$. States, control and time have no units.
 
     **Arguments:**
 
-    - `mu`: the damping, 1 by default.
+    - `mu`: $\mu$, the damping, 1 by default.
 
     **Raises:** `ValueError` if `mu` is not finite.
 
@@ -161,6 +171,10 @@ class VanDerPol(AbstractSystem):
         oscillator = dlx.systems.VanDerPol(mu=2.0)
         oscillator.vector_field(0.0, jnp.ones(2), jnp.zeros(1), None)
         ```
+
+        ```text
+        Array([ 1., -1.], dtype=float32)
+        ```
     """
 
     mu: Real = parameter(1.0)
@@ -168,8 +182,7 @@ class VanDerPol(AbstractSystem):
     state_names, control_names, time_unit = ("x", "v"), ("u",), ""
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        # With mu > 0 positive inside |x| = 1, where it feeds energy in: the origin is
-        # unstable, and beyond it takes energy out.
+        # For mu > 0 this feeds energy in where |x| < 1, and takes it out beyond.
         damping = self.mu * (1 - x[0] * x[0])
         return jnp.stack([x[1], damping * x[1] - x[0] + u[0]])
 
@@ -179,18 +192,20 @@ class VanDerPol(AbstractSystem):
 
 
 class Lorenz(AbstractSystem):
-    """Lorenz's model of convection, forced,
+    r"""Lorenz's model of convection with a control.
 
-    `dx/dt = sigma (y - x) + u`, `dy/dt = x (rho - z) - y`, `dz/dt = x y - beta z`.
+    $$\dot x = \sigma (y - x) + u, \qquad \dot y = x (\rho - z) - y, \qquad
+    \dot z = x y - \beta z$$
 
-    Chaotic at the default constants: two starts drift apart by a factor e in about 1.1.
-    Smooth. The numbers have no units.
+    The system is chaotic at the default constants: the distance between neighbouring
+    trajectories grows by a factor of $e$ in a time of about 1.1. The vector field is
+    smooth. States, control and time have no units.
 
     **Arguments:**
 
-    - `sigma`: 10 by default.
-    - `rho`: 28 by default.
-    - `beta`: 8/3 by default.
+    - `sigma`: $\sigma$, 10 by default.
+    - `rho`: $\rho$, 28 by default.
+    - `beta`: $\beta$, 8/3 by default.
 
     **Raises:** `ValueError` if a number is not finite.
 
@@ -204,6 +219,10 @@ class Lorenz(AbstractSystem):
 
         lorenz = dlx.systems.Lorenz()
         lorenz.vector_field(0.0, jnp.ones(3), jnp.zeros(1), None)
+        ```
+
+        ```text
+        Array([ 0.   , 26.   , -1.667], dtype=float32)
         ```
     """
 
@@ -220,13 +239,13 @@ class Lorenz(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """The centre of the right wing, `x = y = sqrt(beta (rho - 1))`, `z = rho - 1`;
-        the origin where there are no wings (`rho <= 1`).
+        r"""The centre of the right wing, $x = y = \sqrt{\beta (\rho - 1)}$ and
+        $z = \rho - 1$; or the origin if there are no wings ($\rho \le 1$).
 
-        **Returns:** the state, and no control.
+        **Returns:** the state, shape `(3,)`, and a zero control, shape `(1,)`.
         """
         winged = (self.rho > 1) & (self.beta > 0)
-        # The root of 1 where there are no wings: that of 0 has no gradient.
+        # Without wings the root of 1 is taken, because that of 0 has no gradient.
         height = xp.where(winged, self.rho - 1, 0.0)
         square = xp.where(winged, self.beta * height, 1.0)
         wing = xp.where(winged, xp.sqrt(square), 0.0)

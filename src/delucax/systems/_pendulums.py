@@ -10,36 +10,36 @@ from ._base import AbstractSystem
 
 
 class DoublePendulumCart(AbstractSystem):
-    r"""Two uniform rods in a chain on a cart, which a force pushes along a track
-    without friction:
+    r"""Two uniform rods in a chain on a cart. A force pushes the cart along a track
+    without friction.
 
-    ```
-    d1 a + d2 c1 a1 + d3 c2 a2 = force + d2 s1 spin_1^2 + d3 s2 spin_2^2
-    d2 c1 a + d4 a1 + d5 c12 a2 = f1 s1 - d5 s12 spin_2^2
-    d3 c2 a + d5 c12 a1 + d6 a2 = f2 s2 + d5 s12 spin_1^2
-    ```
+    $$\begin{aligned}
+    d_1 \ddot p + d_2 c_1 \ddot\theta_1 + d_3 c_2 \ddot\theta_2
+    &= F + d_2 s_1 \dot\theta_1^2 + d_3 s_2 \dot\theta_2^2 \\
+    d_2 c_1 \ddot p + d_4 \ddot\theta_1 + d_5 c_{12} \ddot\theta_2
+    &= d_2 g s_1 - d_5 s_{12} \dot\theta_2^2 \\
+    d_3 c_2 \ddot p + d_5 c_{12} \ddot\theta_1 + d_6 \ddot\theta_2
+    &= d_3 g s_2 + d_5 s_{12} \dot\theta_1^2
+    \end{aligned}$$
 
-    for the accelerations a, a1 and a2 of the cart and of the two angles, with `c1`,
-    `s1` the cosine and sine of angle_1, `c12`, `s12` those of angle_1 - angle_2, and
-
-    ```
-    d1 = M + m1 + m2         d2 = (m1/2 + m2) l1      d3 = m2 l2 / 2
-    d4 = (m1/3 + m2) l1^2    d5 = m2 l1 l2 / 2        d6 = m2 l2^2 / 3
-    f1 = d2 g                f2 = d3 g
-    ```
+    Here $p$ is the position of the cart, and $c_i$ and $s_i$ are the cosine and sine of
+    $\theta_i$, $c_{12}$ and $s_{12}$ those of $\theta_1 - \theta_2$. The constants are
+    $d_1 = M + m_1 + m_2$, $d_2 = (m_1 / 2 + m_2) l_1$, $d_3 = m_2 l_2 / 2$,
+    $d_4 = (m_1 / 3 + m_2) l_1^2$, $d_5 = m_2 l_1 l_2 / 2$ and $d_6 = m_2 l_2^2 / 3$.
 
     The state is (position [m], angle_1 [rad], angle_2 [rad], velocity [m/s], spin_1
     [rad/s], spin_2 [rad/s]), the control is (force [N]). Both angles are measured from
-    the vertical, are 0 upright and grow in the direction of positive positions. The
-    vector field is smooth.
+    upright, and a positive angle leans towards positive positions. The vector field is
+    smooth.
 
     **Arguments:**
 
-    - `cart_mass`: M [kg], 1.5 by default.
-    - `mass_1`, `mass_2`: of the rods, the lower one first [kg], 0.5 and 0.75 by
+    - `cart_mass`: $M$ [kg], 1.5 by default.
+    - `mass_1`, `mass_2`: $m_1$ and $m_2$, masses of the lower and the upper rod [kg],
+        0.5 and 0.75 by default.
+    - `length_1`, `length_2`: $l_1$ and $l_2$, lengths of the rods [m], 0.5 and 0.75 by
         default.
-    - `length_1`, `length_2`: l1 and l2 [m], 0.5 and 0.75 by default.
-    - `gravity`: g [m/s^2], 9.8 by default.
+    - `gravity`: $g$ [m/s^2], 9.8 by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
@@ -52,7 +52,13 @@ class DoublePendulumCart(AbstractSystem):
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.DoublePendulumCart(length_2=0.6))
-        upright.A
+        upright.A[3:, :3]  # from positions to accelerations
+        ```
+
+        ```text
+        Array([[  0.   ,  -7.35 ,   0.787],
+               [  0.   ,  73.5  , -33.075],
+               [  0.   , -73.5  ,  63.875]], dtype=float32)
         ```
     """
 
@@ -77,8 +83,8 @@ class DoublePendulumCart(AbstractSystem):
         b0 = u[0] + d2 * s1 * square_1 + d3 * s2 * square_2
         b1 = d2 * self.gravity * s1 - d5 * sine * square_2
         b2 = d3 * self.gravity * s2 + d5 * sine * square_1
-        # M a = b for the symmetric inertia M = [[m, p, q], [p, i, r], [q, r, j]], by
-        # its cofactors.
+        # Solves M a = b by cofactors, for the inertia M = [[m, p, q], [p, i, r], [q, r,
+        # j]].
         m = self.cart_mass + m1 + m2
         i, j = (m1 / 3 + m2) * l1**2, m2 * l2**2 / 3
         p, q, r = d2 * c1, d3 * c2, d5 * cosine
@@ -94,44 +100,51 @@ class DoublePendulumCart(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """Both rods upright, in the middle of the track.
+        """Both rods upright and at rest, with the cart at position 0.
 
-        **Returns:** the zero state and control.
+        **Returns:** the zero state and control, shapes `(6,)` and `(1,)`.
         """
         return xp.zeros(6), xp.zeros(1)
 
 
 class FurutaPendulum(AbstractSystem):
-    r"""A pendulum at the end of an arm that a motor turns in the horizontal plane:
+    r"""The Furuta pendulum: a pendulum at the end of an arm that a motor turns in the
+    horizontal plane.
 
-    ```
-    (J0 + J2 s^2) d(arm_rate)/dt + K c d(spin)/dt
-        = torque - b1 arm_rate - 2 J2 s c arm_rate spin + K s spin^2
-    J2 d(spin)/dt + K c d(arm_rate)/dt
-        = m g l s - b2 spin + J2 s c arm_rate^2
-    torque = k / R (voltage - k arm_rate)
-    ```
+    $$\begin{aligned}
+    (J_0 + J_2 \sin^2\theta) \ddot\phi + K \cos\theta\, \ddot\theta
+    &= \tau - b_1 \dot\phi - 2 J_2 \sin\theta \cos\theta\, \dot\phi \dot\theta
+    + K \sin\theta\, \dot\theta^2 \\
+    J_2 \ddot\theta + K \cos\theta\, \ddot\phi
+    &= m g l \sin\theta - b_2 \dot\theta + J_2 \sin\theta \cos\theta\, \dot\phi^2 \\
+    \tau &= \frac{k}{R} (v - k \dot\phi)
+    \end{aligned}$$
 
-    with `c`, `s` the cosine and sine of the angle, `J0 = J1 + m L^2` and `K = m L l`.
+    Here $\phi$ is the angle of the arm, $\theta$ that of the pendulum, $v$ the voltage,
+    $J_0 = J_1 + m L^2$ and $K = m L l$.
 
     The state is (arm [rad], angle [rad], arm_rate [rad/s], spin [rad/s]), the control
-    is (voltage [V]). `angle = 0` is upright, and it grows in the direction in which the
-    arm turns. The vector field is smooth.
+    is (voltage [V]). The pendulum is upright at angle 0, and a positive angle leans in
+    the direction of positive arm rates. The vector field is smooth.
 
-    The numbers are those of Quanser's QUBE-Servo 2: an arm of 95 g and 85 mm, and a
-    rod of 24 g and 129 mm, whose inertias are those of thin rods about their ends.
+    The default constants are those of Quanser's QUBE-Servo 2: an arm of 95 g and 85 mm,
+    and a rod of 24 g and 129 mm. Their inertias are those of thin rods about their
+    ends.
 
     **Arguments:**
 
-    - `arm_inertia`: J1, of the arm about the motor [kg m^2], 2.288e-4 by default.
-    - `arm_length`: L [m], 0.085 by default.
-    - `mass`: m, of the pendulum [kg], 0.024 by default.
-    - `center`: l, from the hinge to its centre of mass [m], 0.0645 by default.
-    - `inertia`: J2, of the pendulum about the hinge [kg m^2], 1.331e-4 by default.
-    - `arm_friction`, `friction`: b1 and b2 [N m s/rad], 1e-3 and 5e-5 by default.
-    - `motor_constant`: k [N m/A], 0.042 by default.
-    - `resistance`: R [Ohm], 8.4 by default.
-    - `gravity`: g [m/s^2], 9.81 by default.
+    - `arm_inertia`: $J_1$, inertia of the arm about the motor [kg m^2], 2.288e-4 by
+        default.
+    - `arm_length`: $L$ [m], 0.085 by default.
+    - `mass`: $m$, mass of the pendulum [kg], 0.024 by default.
+    - `center`: $l$, distance from the hinge to the pendulum's centre of mass [m],
+        0.0645 by default.
+    - `inertia`: $J_2$, inertia of the pendulum about the hinge [kg m^2], 1.331e-4 by
+        default.
+    - `arm_friction`, `friction`: $b_1$ and $b_2$ [N m s/rad], 1e-3 and 5e-5 by default.
+    - `motor_constant`: $k$ [N m/A], 0.042 by default.
+    - `resistance`: $R$ [ohm], 8.4 by default.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
 
     **Raises:** `ValueError` if a mass, length, inertia or resistance is not positive,
     or a number is not finite.
@@ -145,7 +158,12 @@ class FurutaPendulum(AbstractSystem):
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.FurutaPendulum(mass=0.03))
-        upright.A
+        upright.B[2:]  # from the voltage to the accelerations
+        ```
+
+        ```text
+        Array([[ 20.635],
+               [-25.499]], dtype=float32)
         ```
     """
 
@@ -183,8 +201,8 @@ class FurutaPendulum(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """The pendulum upright, and the arm at 0.
+        """The pendulum upright and at rest, and the arm at 0.
 
-        **Returns:** the zero state and control.
+        **Returns:** the zero state and control, shapes `(4,)` and `(1,)`.
         """
         return xp.zeros(4), xp.zeros(1)

@@ -1,5 +1,4 @@
-"""Robots on the ground: cars as bicycles, on wheels that roll where they point and on
-tyres that slip; and an arm of two links."""
+"""Robots on the ground: two bicycle models of a car, and an arm of two links."""
 
 import jax.numpy as jnp
 
@@ -11,20 +10,21 @@ from ._base import AbstractSystem
 
 
 class KinematicBicycle(AbstractSystem):
-    r"""A car whose wheels roll without slip, as a bicycle about its centre of mass:
+    r"""The kinematic bicycle: a car whose wheels roll without slip.
 
-    `dx/dt = speed cos(heading + slip)`, `dy/dt = speed sin(heading + slip)`,
-    `d(heading)/dt = speed sin(slip) / rear`, `d(speed)/dt = acceleration`,
-    `tan(slip) = rear / (front + rear) tan(steering)`.
+    $$\dot x = v \cos(\psi + \beta), \qquad \dot y = v \sin(\psi + \beta), \qquad
+    \dot\psi = \frac{v}{l_r} \sin\beta, \qquad \dot v = a, \qquad
+    \tan\beta = \frac{l_r}{l_f + l_r} \tan\delta$$
 
-    The state is (x [m], y [m], heading [rad], speed [m/s]), the control is
-    (acceleration [m/s^2], steering [rad]). Smooth for steering inside +-pi/2, where the
-    tangent ends.
+    Here $\beta$ is the slip angle at the centre of mass. The state is (x [m], y [m],
+    heading $\psi$ [rad], speed $v$ [m/s]), the control is (acceleration $a$ [m/s^2],
+    steering $\delta$ [rad]). The vector field is smooth for steering angles inside
+    +-pi/2, where the tangent is finite.
 
     **Arguments:**
 
-    - `front`, `rear`: from the centre of mass to the axles [m], 1.105 and 1.738 by
-        default.
+    - `front`, `rear`: $l_f$ and $l_r$, distances from the centre of mass to the axles
+        [m], 1.105 and 1.738 by default.
 
     **Raises:** `ValueError` if a length is not positive.
 
@@ -40,6 +40,10 @@ class KinematicBicycle(AbstractSystem):
         x, u = jnp.array([0.0, 0.0, 0.0, 10.0]), jnp.array([0.0, 0.1])
         car.vector_field(0.0, x, u, None)
         ```
+
+        ```text
+        Array([9.981, 0.612, 0.352, 0.   ], dtype=float32)
+        ```
     """
 
     front: Real = parameter(1.105, constraint=positive)
@@ -51,10 +55,10 @@ class KinematicBicycle(AbstractSystem):
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         share = self.rear / (self.front + self.rear)
-        # Wheels that roll turn about the point where the axles' lines meet; the slip is
-        # the angle of the velocity at the centre of mass to the heading.
+        # The slip is the angle between the velocity at the centre of mass and the
+        # heading.
         tangent = share * sin(u[1]) / cos(u[1])
-        # Cosine and sine of the slip angle, from its tangent: no arctangent is needed.
+        # The cosine and sine of the slip follow from its tangent without an arctangent.
         along = (1 + tangent * tangent) ** -0.5
         across = tangent * along
         c, s, v = cos(x[2]), sin(x[2]), x[3]
@@ -63,39 +67,44 @@ class KinematicBicycle(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """Standing at the origin; a standing car is not controllable.
+        """Standing at the origin. The linearisation there is not controllable, because
+        a standing car cannot turn or move sideways.
 
-        **Returns:** the zero state and control.
+        **Returns:** the zero state and control, shapes `(4,)` and `(2,)`.
         """
         return xp.zeros(4), xp.zeros(2)
 
 
 class DynamicBicycle(AbstractSystem):
-    r"""A car on tyres whose lateral force is proportional to the slip angle:
+    r"""The dynamic bicycle: a car on tyres whose lateral force is proportional to the
+    slip angle.
 
-    `d(vx)/dt = acceleration - F_f sin(steering) / m + vy rate`,
-    `d(vy)/dt = (F_f cos(steering) + F_r) / m - vx rate`,
-    `d(rate)/dt = (front F_f cos(steering) - rear F_r) / I`,
-    `F_f = -C_f (angle(vy + front rate, vx) - steering)`,
-    `F_r = -C_r angle(vy - rear rate, vx)`,
+    $$\begin{aligned}
+    \dot v_x &= a - F_f \sin(\delta) / m + v_y r \\
+    \dot v_y &= (F_f \cos\delta + F_r) / m - v_x r \\
+    \dot r &= (l_f F_f \cos\delta - l_r F_r) / I \\
+    F_f &= -C_f (\alpha(v_y + l_f r, v_x) - \delta) \\
+    F_r &= -C_r\, \alpha(v_y - l_r r, v_x) \\
+    \alpha(v, v_x) &= \arctan\left(v / \sqrt{v_x^2 + v_0^2}\right)
+    \end{aligned}$$
 
-    `angle(v, vx) = atan(v / sqrt(vx^2 + standstill^2))`. The state is (x [m], y [m],
-    heading [rad], vx [m/s], vy [m/s], rate [rad/s]), the velocities those of the centre
-    of mass along and across the car; the control is (acceleration [m/s^2], steering
-    [rad]).
+    The state is (x [m], y [m], heading [rad], vx [m/s], vy [m/s], rate $r$ [rad/s]),
+    where vx and vy are the velocities of the centre of mass along and across the car.
+    The control is (acceleration $a$ [m/s^2], steering $\delta$ [rad]).
 
-    The slip angle itself, `atan(v / vx)`, has no value at rest: `standstill` is what
-    keeps this one smooth there. It is meant for driving forward, much faster than that.
+    The exact slip angle, $\arctan(v / v_x)$, is not defined at rest. The speed $v_0$
+    makes it smooth there. The model is meant for driving forward, much faster than
+    $v_0$.
 
     **Arguments:**
 
-    - `mass`: m [kg], 1573 by default.
-    - `inertia`: I, about the vertical axis [kg m^2], 2873 by default.
-    - `front`, `rear`: from the centre of mass to the axles [m], 1.1 and 1.58 by
-        default.
-    - `front_stiffness`, `rear_stiffness`: C_f and C_r, of both tyres of an axle
-        [N/rad], 160000 by default.
-    - `standstill`: a speed [m/s], 1 by default.
+    - `mass`: $m$ [kg], 1573 by default.
+    - `inertia`: $I$, about the vertical axis [kg m^2], 2873 by default.
+    - `front`, `rear`: $l_f$ and $l_r$, distances from the centre of mass to the axles
+        [m], 1.1 and 1.58 by default.
+    - `front_stiffness`, `rear_stiffness`: $C_f$ and $C_r$, of both tyres of an axle
+        together [N/rad], 160000 by default.
+    - `standstill`: $v_0$ [m/s], 1 by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -110,6 +119,10 @@ class DynamicBicycle(AbstractSystem):
         car = dlx.systems.DynamicBicycle()
         x = jnp.array([0.0, 0.0, 0.0, 20.0, 0.0, 0.0])
         car.vector_field(0.0, x, jnp.array([0.0, 0.02]), None)
+        ```
+
+        ```text
+        Array([20.   ,  0.   ,  0.   , -0.041,  2.034,  1.225], dtype=float32)
         ```
     """
 
@@ -130,7 +143,7 @@ class DynamicBicycle(AbstractSystem):
         heading, vx, vy, rate = x[2], x[3], x[4], x[5]
         # Never zero, so that neither the slip angles nor their gradients are NaN.
         speed = (vx * vx + self.standstill**2) ** 0.5
-        # The angle from where a tyre points to where it moves; the force is against it.
+        # The angle from where a tyre points to where it moves.
         slip_front = jnp.arctan2(vy + self.front * rate, speed) - u[1]
         slip_rear = jnp.arctan2(vy - self.rear * rate, speed)
         force_front = -self.front_stiffness * slip_front
@@ -138,7 +151,7 @@ class DynamicBicycle(AbstractSystem):
         c, s = cos(heading), sin(heading)
         dx, dy = vx * c - vy * s, vx * s + vy * c
         aside = force_front * cos(u[1])
-        # vy rate and -vx rate: the axes that the velocities are given in turn.
+        # The terms with the rate: the axes of the velocities turn with the car.
         along = u[0] - force_front * sin(u[1]) / self.mass + vy * rate
         across = (aside + force_rear) / self.mass - vx * rate
         turn = (self.front * aside - self.rear * force_rear) / self.inertia
@@ -148,34 +161,35 @@ class DynamicBicycle(AbstractSystem):
     def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin.
 
-        **Returns:** the zero state and control.
+        **Returns:** the zero state and control, shapes `(6,)` and `(2,)`.
         """
         return xp.zeros(6), xp.zeros(2)
 
 
 class Reacher(AbstractSystem):
-    r"""Two massless links with a point mass at the end of each, and a torque at each
-    joint:
+    r"""A planar arm of two massless links, with a point mass at the end of each link
+    and a torque at each joint.
 
-    `M(q) d2q/dt2 = u + h(q, dq/dt) - G(q)`, `q = (shoulder, elbow)`,
+    $$M(q) \ddot q = u + h(q, \dot q) - G(q), \qquad q = (q_1, q_2)$$
 
-    `M11 = (m1 + m2) l1^2 + m2 l2^2 + 2 m2 l1 l2 cos(elbow)`,
-    `M12 = m2 l2^2 + m2 l1 l2 cos(elbow)`, `M22 = m2 l2^2`.
+    $$M_{11} = (m_1 + m_2) l_1^2 + m_2 l_2^2 + 2 m_2 l_1 l_2 \cos q_2, \qquad
+    M_{12} = m_2 l_2^2 + m_2 l_1 l_2 \cos q_2, \qquad M_{22} = m_2 l_2^2$$
 
-    The state is (shoulder [rad], elbow [rad], their rates), the control two torques
-    [N m]. The shoulder's angle is measured from the x axis, the elbow's from the first
-    link, so the arm is stretched along x at zero. The vector field is smooth.
+    Here $h$ holds the Coriolis and centrifugal torques and $G$ those of gravity. The
+    state is (shoulder $q_1$ [rad], elbow $q_2$ [rad], shoulder_rate [rad/s], elbow_rate
+    [rad/s]), the control is (shoulder_torque [N m], elbow_torque [N m]). The angle of
+    the shoulder is measured from the x axis and that of the elbow from the first link:
+    at zero the arm is stretched along the x axis. The vector field is smooth.
 
-    A positive `gravity` pulls **along the x axis**, towards the arm stretched at zero,
-    and a negative one away from it: this is what the paper's experiments change to make
-    a plant that differs from its model. For ordinary gravity, let the x axis point
-    down.
+    A positive `gravity` pulls **along the x axis**, and a negative one against it. The
+    paper's experiments change it to make a plant that differs from its model. For
+    ordinary gravity, let the x axis point down.
 
     **Arguments:**
 
-    - `mass_1`, `mass_2`: [kg], 1 by default.
-    - `length_1`, `length_2`: [m], 1 by default.
-    - `gravity`: [m/s^2], 0 by default.
+    - `mass_1`, `mass_2`: $m_1$ and $m_2$ [kg], 1 by default.
+    - `length_1`, `length_2`: $l_1$ and $l_2$ [m], 1 by default.
+    - `gravity`: along the x axis [m/s^2], 0 by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
@@ -189,8 +203,13 @@ class Reacher(AbstractSystem):
         import jax.numpy as jnp
 
         arm = dlx.systems.Reacher(gravity=-10.0)
-        arm.vector_field(0.0, jnp.array([0.8, 1.6, 0.0, 0.0]), jnp.zeros(2), None)
-        arm.tip(jnp.zeros(4))
+        x = jnp.array([0.8, 1.6, 0.0, 0.0])
+        arm.tip(x), arm.vector_field(0.0, x, jnp.zeros(2), None)
+        ```
+
+        ```text
+        (Array([-0.041,  1.393], dtype=float32),
+         Array([ 0.   ,  0.   ,  7.275, -0.308], dtype=float32))
         ```
     """
 
@@ -206,11 +225,11 @@ class Reacher(AbstractSystem):
     angle_names = ("shoulder", "elbow")
 
     def tip(self, x: State) -> Vector:
-        """The position of the hand.
+        """The position of the tip of the arm.
 
-        **Arguments:** `x`: state.
+        **Arguments:** `x`: state, shape `(4,)`.
 
-        **Returns:** shape `(2,)` [m].
+        **Returns:** the position [m], shape `(2,)`.
         """
         l1, l2, both = self.length_1, self.length_2, x[0] + x[1]
         return jnp.stack([l1 * along(x[0]) + l2 * along(both) for along in (cos, sin)])
@@ -221,7 +240,7 @@ class Reacher(AbstractSystem):
         d1, d2 = x[2], x[3]
         c, s = cos(x[1]), sin(x[1])
         coupling = m2 * l1 * l2
-        # Gravity pulls along x: its torque is as the sine of the angle from there.
+        # Gravity pulls along x, so its torque grows with the sine of the angle.
         far = m2 * l2 * self.gravity * sin(x[0] + x[1])
         near = total * l1 * self.gravity * sin(x[0])
         # M a = b, with the Coriolis and centrifugal forces on the right.
@@ -230,7 +249,7 @@ class Reacher(AbstractSystem):
         m22 = m2 * l2**2
         m12 = m22 + coupling * c
         m11 = total * l1**2 + m22 + 2 * coupling * c
-        # The determinant without the cancellation of m11 m22 - m12^2.
+        # Not as m11 m22 - m12^2, which would lose digits.
         determinant = m22 * l1**2 * (self.mass_1 + m2 * (s * s))
         a1 = (m22 * b1 - m12 * b2) / determinant
         a2 = (m11 * b2 - m12 * b1) / determinant
@@ -240,6 +259,6 @@ class Reacher(AbstractSystem):
     def equilibrium(self) -> tuple[State, Control]:
         """The arm stretched along the x axis, at rest.
 
-        **Returns:** the zero state and control.
+        **Returns:** the zero state and control, shapes `(4,)` and `(2,)`.
         """
         return xp.zeros(4), xp.zeros(2)

@@ -13,22 +13,24 @@ from ._hybrid_base import AbstractHybridSystem
 
 
 class Thermostat(AbstractHybridSystem):
-    r"""A room whose heater a thermostat switches on below a band and off above it:
+    r"""A room with a heater that a thermostat switches on below a band of temperatures
+    and off above it.
 
-    `capacity d(temperature)/dt = on power + heat - loss (temperature - outside)`.
+    $$C \dot T = s P + u - k (T - T_\mathrm{outside})$$
 
-    The state is (temperature [degC], mode), the control is (heat [kW]) of a second
-    source, the modes are off and on. Time is in hours.
+    Here $s$ is 1 while the heater is on and 0 while it is off. The state is
+    (temperature $T$ [degC], mode), the control is (heat $u$ [kW]), a second source of
+    heat. The modes are `"off"` and `"on"`. Time is in hours.
 
-    Between `low` and `high` the temperature goes to and fro, if the heater is strong
-    enough and the outside cold enough.
+    If the heater is strong enough and the outside cold enough, the temperature swings
+    between `low` and `high`.
 
     **Arguments:**
 
-    - `capacity`: of the room [kWh/K], 2 by default.
-    - `loss`: to the outside [kW/K], 0.2 by default.
-    - `power`: of the heater [kW], 6 by default.
-    - `outside`: its temperature [degC], 5 by default.
+    - `capacity`: $C$, heat capacity of the room [kWh/K], 2 by default.
+    - `loss`: $k$, heat loss to the outside [kW/K], 0.2 by default.
+    - `power`: $P$, power of the heater [kW], 6 by default.
+    - `outside`: $T_\mathrm{outside}$ [degC], 5 by default.
     - `low`, `high`: the ends of the band [degC], 19 and 21 by default.
 
     **Raises:** `ValueError` if the capacity or the loss is not positive, `low` is not
@@ -43,7 +45,15 @@ class Thermostat(AbstractHybridSystem):
         import jax.numpy as jnp
 
         dynamics = dlx.Discretized(dlx.systems.Thermostat(), dt=0.1)
-        dlx.open_loop(dynamics, jnp.array([20.0, 0.0]), jnp.zeros((100, 1)))
+        dlx.open_loop(dynamics, jnp.array([20.0, 0.0]), jnp.zeros((100, 1)))[::25]
+        ```
+
+        ```text
+        Array([[20.   ,  0.   ],
+               [20.258,  0.   ],
+               [20.521,  0.   ],
+               [20.788,  0.   ],
+               [20.948,  1.   ]], dtype=float32)
         ```
     """
 
@@ -59,7 +69,7 @@ class Thermostat(AbstractHybridSystem):
     time_unit = "h"
     mode_names = ("off", "on")
     event_names, event_directions = ("too cold", "too warm"), (-1, 1)
-    # It may be switched off in a cold room.
+    # Urgent, because a simulation may start with the heater off in a cold room.
     urgent_events = event_names
 
     def __check_init__(self):
@@ -82,34 +92,39 @@ class Thermostat(AbstractHybridSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """In the middle of the band, where the heater is off and the control heats."""
+        """The middle of the band, with the heater off and the control heating.
+
+        **Returns:** the state, shape `(2,)`, and the heat, shape `(1,)`.
+        """
         middle = (self.low + self.high) / 2
         heat = self.loss * (middle - self.outside)
         return xp.stack([middle, xp.zeros_like(middle)]), xp.stack([heat])
 
 
 class StickSlip(AbstractHybridSystem):
-    r"""A mass on a belt that moves, held by a spring and a damper, with dry friction:
+    r"""A mass on a moving belt, held by a spring and a damper, with dry friction.
 
-    `mass d2(position)/dt2 = force + friction - stiffness position - damping velocity`.
+    $$m \ddot p = u + F - k p - c \dot p$$
 
-    Where it slips on the belt the friction is `kinetic`, against the motion relative to
-    the belt. Where it sticks it moves with the belt, until what holds it there would
-    have to exceed `static`. The state is (position [m], velocity [m/s], mode), the
-    control is (force [N]); the modes are to stick, to slip slower than the belt
-    (`"slip behind"`) and to slip faster (`"slip ahead"`).
+    Here $u$ is the control and $F$ the friction. While the mass slips on the belt,
+    $|F|$ is `kinetic`, and $F$ opposes the motion relative to the belt. While the mass
+    sticks, it moves with the belt, until the friction would have to exceed `static`.
 
-    Without damping and control it settles into a cycle of sticking and slipping, which
-    begins where `position = static / stiffness`.
+    The state is (position $p$ [m], velocity [m/s], mode), the control is (force [N]).
+    The modes are `"stick"`, `"slip behind"` (slower than the belt) and `"slip ahead"`
+    (faster than the belt).
+
+    Without damping and control, the mass settles into a cycle of sticking and slipping.
+    It begins to slip at `position = static / stiffness`.
 
     **Arguments:**
 
-    - `mass`: [kg], 1 by default.
-    - `stiffness`: of the spring [N/m], 10 by default.
-    - `damping`: [N s/m], 0 by default.
-    - `belt`: its velocity [m/s], 0.2 by default.
-    - `static`: the most friction of a mass that sticks [N], 1.5 by default.
-    - `kinetic`: the friction of one that slips [N], 1 by default.
+    - `mass`: $m$ [kg], 1 by default.
+    - `stiffness`: $k$, of the spring [N/m], 10 by default.
+    - `damping`: $c$ [N s/m], 0 by default.
+    - `belt`: velocity of the belt [m/s], 0.2 by default.
+    - `static`: the largest friction while the mass sticks [N], 1.5 by default.
+    - `kinetic`: the friction while the mass slips [N], 1 by default.
 
     **Raises:** `ValueError` if the mass, stiffness or kinetic friction is not positive,
     `kinetic` is not below `static`, or a number is not finite.
@@ -123,7 +138,15 @@ class StickSlip(AbstractHybridSystem):
         import jax.numpy as jnp
 
         dynamics = dlx.Discretized(dlx.systems.StickSlip(), dt=0.05)
-        dlx.open_loop(dynamics, jnp.array([0.0, 0.2, 0.0]), jnp.zeros((100, 1)))
+        dlx.open_loop(dynamics, jnp.array([0.0, 0.2, 0.0]), jnp.zeros((100, 1)))[::25]
+        ```
+
+        ```text
+        Array([[ 0.   ,  0.2  ,  0.   ],
+               [ 0.163, -0.16 ,  1.   ],
+               [ 0.087,  0.2  ,  0.   ],
+               [ 0.062, -0.225,  1.   ],
+               [ 0.17 ,  0.126,  1.   ]], dtype=float32)
         ```
     """
 
@@ -138,7 +161,7 @@ class StickSlip(AbstractHybridSystem):
     control_names, control_units = ("force",), ("N",)
     mode_names = ("stick", "slip behind", "slip ahead")
     event_names = ("break behind", "break ahead", "meet behind", "meet ahead")
-    # What holds the mass depends on the control.
+    # Urgent, because the friction that holds the mass depends on the control.
     urgent_events = ("break behind", "break ahead")
 
     def __check_init__(self):
@@ -154,7 +177,7 @@ class StickSlip(AbstractHybridSystem):
         return jnp.stack([velocity, jnp.where(mode == 0, 0, slips), 0 * x[2]])
 
     def _holding(self, x: State, u: Control) -> Scalar:
-        """The friction that lets the mass move with the belt."""
+        """The friction that keeps the mass on the moving belt."""
         return self.stiffness * x[0] + self.damping * self.belt - u[0]
 
     def guards(self, t: Time, x: State, u: Control) -> Sequence[Scalar]:
@@ -166,7 +189,7 @@ class StickSlip(AbstractHybridSystem):
         return mode == 0, mode == 0, mode == 1, mode == 2
 
     def resets(self, t: Time, x: State, u: Control) -> Sequence[State]:
-        # Where it cannot stick it passes to the other side of the belt's velocity.
+        # If the mass cannot stick, its velocity passes that of the belt.
         sticks = jnp.abs(self._holding(x, u)) <= self.static
         modes = 1, 2, jnp.where(sticks, 0, 2), jnp.where(sticks, 0, 1)
         belt = self.belt + 0 * x[1]
@@ -174,7 +197,10 @@ class StickSlip(AbstractHybridSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """At rest, with the belt slipping under it."""
+        """The mass at rest, with the belt slipping under it.
+
+        **Returns:** the state, shape `(3,)`, and a zero control, shape `(1,)`.
+        """
         way = xp.sign(self.belt)
         mode = xp.where(way < 0, 2.0, way)
         position = way * self.kinetic / self.stiffness
@@ -182,29 +208,34 @@ class StickSlip(AbstractHybridSystem):
 
 
 class ValveWithStops(AbstractHybridSystem):
-    r"""A valve on a spring between two stops, off which it bounces:
+    r"""A valve on a spring that bounces between two stops, closed and open.
 
-    `mass d2(position)/dt2 = force - stiffness (position - neutral) - damping velocity`
+    $$m \ddot p = F - k (p - p_0) - c \dot p, \qquad 0 \le p \le 1$$
 
-    between 0, closed, and 1, open. At a stop `velocity+ = -restitution velocity-`, or
-    the valve stays there, in a mode of its own, if it would leave more slowly than
-    `rest_speed`. It leaves a stop where the push off it exceeds `adhesion`. The state
-    is (position, velocity [1/s], mode), the control is (force [N]); lengths are in
-    units of the valve's travel.
+    The position $p$ is 0 where the valve is closed and 1 where it is open. At a stop
+    the valve bounces, $\dot p^+ = -e\, \dot p^-$. If it would leave more slowly than
+    `rest_speed`, it stays at the stop, in the mode `"closed"` or `"open"`. It leaves
+    again when the force away from the stop exceeds `adhesion`.
+
+    The state is (position, velocity [1/s], mode), the control is (force [N]). The modes
+    are `"free"`, `"closed"` and `"open"`. The unit of length is the travel of the
+    valve.
 
     **Arguments:**
 
-    - `mass`: 1 by default.
-    - `stiffness`: of the spring, 40 by default.
-    - `damping`: 1 by default.
-    - `neutral`: where the spring is relaxed, 0.5 by default, as with two springs that
-        act against each other; below 0 for a valve that the spring closes.
-    - `restitution`: the share of its speed that the valve keeps, 0.3 by default.
-    - `adhesion`: what a stop holds back, 0.5 by default.
-    - `rest_speed`: 0.02 by default.
+    - `mass`: $m$ [N s^2], 1 by default.
+    - `stiffness`: $k$, of the spring [N], 40 by default.
+    - `damping`: $c$ [N s], 1 by default.
+    - `neutral`: $p_0$, the position where the spring is relaxed. The default, 0.5, is
+        that of two springs that push against each other. Take a value below 0 for a
+        valve that the spring closes.
+    - `restitution`: $e$, the fraction of its speed that the valve keeps, 0.3 by
+        default.
+    - `adhesion`: the force that a stop holds back [N], 0.5 by default.
+    - `rest_speed`: [1/s], 0.02 by default.
 
-    **Raises:** `ValueError` if the mass, the restitution, the adhesion or the speed is
-    not positive, or a number is not finite.
+    **Raises:** `ValueError` if the mass, the restitution, the adhesion or `rest_speed`
+    is not positive, or a number is not finite.
 
     Source: Hoffmann, Peterson and Stefanopoulou, 2003 (the valve of an engine);
     Brogliato, 2016 (impacts).
@@ -217,7 +248,15 @@ class ValveWithStops(AbstractHybridSystem):
 
         valve = dlx.systems.ValveWithStops(neutral=-0.1)
         dynamics = dlx.Discretized(valve, dt=0.02)
-        dlx.open_loop(dynamics, jnp.array([0.8, 0.0, 0.0]), jnp.zeros((100, 1)))
+        dlx.open_loop(dynamics, jnp.array([0.8, 0.0, 0.0]), jnp.zeros((100, 1)))[::25]
+        ```
+
+        ```text
+        Array([[ 0.8  ,  0.   ,  0.   ],
+               [ 0.113, -0.738,  0.   ],
+               [ 0.   ,  0.   ,  1.   ],
+               [ 0.   ,  0.   ,  1.   ],
+               [ 0.   ,  0.   ,  1.   ]], dtype=float32)
         ```
     """
 
@@ -233,7 +272,7 @@ class ValveWithStops(AbstractHybridSystem):
     control_names, control_units = ("force",), ("N",)
     mode_names = ("free", "closed", "open")
     event_names = ("close", "open", "leave closed", "leave open")
-    # A valve that rests on a stop is moved by the control alone.
+    # Urgent, because only a jump of the control moves a valve that rests on a stop.
     urgent_events = ("leave closed", "leave open")
 
     def _push(self, position: Scalar | int, u: Control) -> Scalar:
@@ -268,7 +307,10 @@ class ValveWithStops(AbstractHybridSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """Where the spring is relaxed, or on the stop that it pushes to."""
+        """The position where the spring is relaxed, or the stop that it pushes towards.
+
+        **Returns:** the state, shape `(3,)`, and a zero control, shape `(1,)`.
+        """
         place = xp.clip(self.neutral, 0, 1)
         mode = xp.where(self.neutral <= 0, 1.0, xp.where(self.neutral >= 1, 2.0, 0.0))
         return xp.stack([place, xp.zeros_like(place), mode]), xp.zeros(1)
@@ -277,7 +319,7 @@ class ValveWithStops(AbstractHybridSystem):
 def _check_order(
     where: str, lower: str, low: Scalar, higher: str, high: Scalar
 ) -> None:
-    """Raise unless one number is below another, as far as they are known."""
+    """Raise unless `low` is below `high`. Traced numbers are skipped."""
     known = is_concrete(low) and is_concrete(high)
     if known and not np.all(np.asarray(low) < np.asarray(high)):
         raise ValueError(

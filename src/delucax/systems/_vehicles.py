@@ -15,32 +15,34 @@ from ._base import AbstractSystem
 
 
 class SlungLoad(AbstractSystem):
-    r"""A load on a cable under a quadrotor, in a vertical plane:
+    r"""A quadrotor in a vertical plane that carries a load on a cable.
 
-    ```
-    (M + m) (a + g e_y) = (F . q - M l swing_rate^2) q
-    M l d(swing_rate)/dt = -F . dq/d(swing)
-    J d(rate)/dt = arm (right - left)
-    ```
+    $$\begin{aligned}
+    (M + m) (a + g e_y) &= (F \cdot q - M l \dot\alpha^2)\, q \\
+    M l \ddot\alpha &= -F \cdot \frac{\mathrm{d} q}{\mathrm{d} \alpha} \\
+    J \ddot\theta &= d\, (u_\mathrm{right} - u_\mathrm{left})
+    \end{aligned}$$
 
-    with the acceleration a of the load, the thrust
-    `F = (left + right) (-sin(angle), cos(angle))` and the direction of the cable from
-    the quadrotor to the load, `q = (sin(swing), -cos(swing))`. The cable has no mass
-    and is taut: like a rod, it pushes where a slack one would fold.
+    Here $a$ is the acceleration of the load and
+    $F = (u_\mathrm{left} + u_\mathrm{right}) (-\sin\theta, \cos\theta)$ the thrust. The
+    unit vector $q = (\sin\alpha, -\cos\alpha)$ points from the quadrotor to the load.
+    The cable has no mass and stays taut: where a real cable would go slack, this one
+    pushes like a rod.
 
-    The state is (x [m], y [m], angle [rad], swing [rad], vx [m/s], vy [m/s], rate
-    [rad/s], swing_rate [rad/s]), x and y being the position of the load. The control is
-    (left [N], right [N]), the thrusts of the two rotors. At `swing = 0` the load hangs
-    straight below. The vector field is smooth, and takes thrusts of either sign.
+    The state is (x [m], y [m], angle $\theta$ [rad], swing $\alpha$ [rad], vx [m/s], vy
+    [m/s], rate [rad/s], swing_rate [rad/s]), where x and y are the position of the
+    load. The control is (left [N], right [N]), the thrusts of the two rotors. At
+    `swing = 0` the load hangs straight below. The vector field is smooth. Thrusts may
+    have either sign.
 
     **Arguments:**
 
-    - `mass`: M, of the quadrotor [kg], 0.5 by default.
-    - `load`: m, its mass [kg], 0.1 by default.
-    - `cable`: l, its length [m], 0.5 by default.
-    - `arm`: from the centre to a rotor [m], 0.2 by default.
-    - `inertia`: J [kg m^2], 0.005 by default.
-    - `gravity`: g [m/s^2], 9.81 by default.
+    - `mass`: $M$, mass of the quadrotor [kg], 0.5 by default.
+    - `load`: $m$, mass of the load [kg], 0.1 by default.
+    - `cable`: $l$, length of the cable [m], 0.5 by default.
+    - `arm`: $d$, distance from the centre to a rotor [m], 0.2 by default.
+    - `inertia`: $J$ [kg m^2], 0.005 by default.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
 
     **Raises:** `ValueError` if a mass, length or inertia is not positive, or a number
     is not finite.
@@ -55,8 +57,12 @@ class SlungLoad(AbstractSystem):
 
         carrier = dlx.systems.SlungLoad(load=0.2)
         x, u = carrier.equilibrium()
-        carrier.vector_field(0.0, x.at[3].set(0.1), u, None)
-        carrier.quadrotor(x)
+        slope = carrier.vector_field(0.0, x.at[3].set(0.1), u, None)
+        slope[4:]
+        ```
+
+        ```text
+        Array([-0.974, -0.098,  0.   , -2.742], dtype=float32)
         ```
     """
 
@@ -75,9 +81,9 @@ class SlungLoad(AbstractSystem):
     def quadrotor(self, x: State) -> Vector:
         """The position of the quadrotor.
 
-        **Arguments:** `x`: state.
+        **Arguments:** `x`: state, shape `(8,)`.
 
-        **Returns:** shape `(2,)` [m].
+        **Returns:** the position [m], shape `(2,)`.
         """
         s, c = sin(x[3]), cos(x[3])
         return jnp.stack([x[0] - self.cable * s, x[1] + self.cable * c])
@@ -85,8 +91,8 @@ class SlungLoad(AbstractSystem):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, s, c = u[0] + u[1], sin(x[3]), cos(x[3])
         fx, fy = -thrust * sin(x[2]), thrust * cos(x[2])
-        # Along the cable, the load and the quadrotor are one; across it, neither feels
-        # the other.
+        # Along the cable, load and quadrotor move as one mass. Across it, they do not
+        # act on each other.
         along = fx * s - fy * c - self.mass * self.cable * (x[7] * x[7])
         pull = along / (self.mass + self.load)
         swing = -(fx * c + fy * s) / (self.mass * self.cable)
@@ -98,53 +104,62 @@ class SlungLoad(AbstractSystem):
     def equilibrium(self) -> tuple[State, Control]:
         """Hovering, with the load at the origin.
 
-        **Returns:** the zero state, and a half of the whole weight for each rotor.
+        **Returns:** the zero state, shape `(8,)`, and half of the whole weight for each
+            rotor, shape `(2,)`.
         """
         half = (self.mass + self.load) * self.gravity / 2
         return xp.zeros(8), xp.stack([half, half])
 
 
 class DriftingCar(AbstractSystem):
-    r"""A car that is driven at the rear, as a bicycle on Fiala's brush tyres, of which
-    the rear one shares its grip between driving and cornering:
+    r"""A car with rear-wheel drive that can drift: a bicycle model on Fiala's brush
+    tyres. The rear tyre shares its grip between driving and cornering.
 
-    `m d(vx)/dt = force - F_f sin(steering) + m vy rate`,
-    `m d(vy)/dt = F_f cos(steering) + F_r - m vx rate`,
-    `I d(rate)/dt = front F_f cos(steering) - rear F_r`,
+    $$\begin{aligned}
+    m \dot v_x &= F - F_f \sin\delta + m v_y r \\
+    m \dot v_y &= F_f \cos\delta + F_r - m v_x r \\
+    I \dot r &= l_f F_f \cos\delta - l_r F_r
+    \end{aligned}$$
 
-    `F = -C z (1 - s + s^2 / 3)` for each axle, `z` being the tangent of its slip angle
-    and `s = |z| / z*`. At `z* = 3 G / C` the tyre begins to slide, and from there on
-    `F = -G sign(z)`. The grip G is `mu N_f` in front and `sqrt((mu N_r)^2 - force^2)`
-    at the rear, with the loads N at rest.
+    The lateral force of each axle depends on the tangent $z$ of its slip angle:
 
-    The state is (vx [m/s], vy [m/s], rate [rad/s]), the velocities those of the centre
-    of mass along and across the car; the control is (force [N], steering [rad]), the
-    force being that of the rear tyre along the car. The derivative of the vector field
-    is continuous but where the force takes all of the grip of that tyre.
+    $$F_i = -C_i z_i \left(1 - s_i + s_i^2 / 3\right) \text{ with } s_i =
+    \frac{C_i |z_i|}{3 G_i} \text{ up to } 1, \qquad
+    F_i = -G_i \operatorname{sign}(z_i) \text{ beyond}$$
+
+    At $s_i = 1$ the tyre begins to slide. The grip $G$ is $\mu N_f$ in front and
+    $\sqrt{(\mu N_r)^2 - F^2}$ at the rear, with the loads $N$ of the car at rest.
+
+    The state is (vx [m/s], vy [m/s], rate $r$ [rad/s]), where vx and vy are the
+    velocities of the centre of mass along and across the car. The control is (force $F$
+    [N], steering $\delta$ [rad]), where the force is that of the rear tyre along the
+    car. The derivative of the vector field is continuous, except where the force takes
+    all of the rear tyre's grip.
 
     In a drift the rear tyre slides, and the car turns against its steering. This
-    equilibrium is unstable: it holds only with feedback.
+    equilibrium is unstable: only feedback holds it.
 
-    A slip angle has no value at rest: `z = v / sqrt(along^2 + standstill^2)`, v being
-    the velocity across the tyre. Nor does a tyre that drives with all its grip corner:
-    the rear one is left with a fiftieth of it.
+    Two changes keep the model defined everywhere. At rest a slip angle has no value, so
+    its tangent is $z = v / \sqrt{w^2 + v_0^2}$, with the velocities $v$ across and $w$
+    along the tyre. And a rear tyre that uses all its grip for driving keeps a fiftieth
+    of it for cornering.
 
     **Arguments:**
 
-    - `mass`: m [kg], 1724 by default.
-    - `inertia`: I, about the vertical axis [kg m^2], 1300 by default.
-    - `front`, `rear`: from the centre of mass to the axles [m], 1.35 and 1.15 by
-        default.
-    - `front_stiffness`, `rear_stiffness`: C of both tyres of an axle [N/rad], 120000
-        and 175000 by default.
-    - `grip`: mu, the coefficient of friction, 0.55 by default, of wet asphalt.
-    - `gravity`: g [m/s^2], 9.81 by default.
-    - `standstill`: a speed [m/s], 0.1 by default.
+    - `mass`: $m$ [kg], 1724 by default.
+    - `inertia`: $I$, about the vertical axis [kg m^2], 1300 by default.
+    - `front`, `rear`: $l_f$ and $l_r$, distances from the centre of mass to the axles
+        [m], 1.35 and 1.15 by default.
+    - `front_stiffness`, `rear_stiffness`: $C_f$ and $C_r$, of both tyres of an axle
+        together [N/rad], 120000 and 175000 by default.
+    - `grip`: $\mu$, the coefficient of friction, 0.55 by default, that of wet asphalt.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
+    - `standstill`: $v_0$ [m/s], 0.1 by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
-    Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014, who take
-    `cos(steering)` for 1.
+    Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014, who replace
+    $\cos\delta$ by 1.
 
     !!! example
 
@@ -152,8 +167,12 @@ class DriftingCar(AbstractSystem):
         import delucax as dlx
 
         car = dlx.systems.DriftingCar()
-        x, u = car.equilibrium(speed=8.0, steering=-0.2)
-        car.vector_field(0.0, x, u, None)
+        car.equilibrium(speed=8.0, steering=-0.2)
+        ```
+
+        ```text
+        (Array([ 8.   , -2.932,  0.602], dtype=float32),
+         Array([ 2.268e+03, -2.000e-01], dtype=float32))
         ```
     """
 
@@ -171,9 +190,9 @@ class DriftingCar(AbstractSystem):
     control_names, control_units = ("force", "steering"), ("N", "rad")
 
     def grips(self) -> tuple[Scalar, Scalar]:
-        """The largest force of each axle.
+        r"""The largest force of each axle.
 
-        **Returns:** `mu N_f` and `mu N_r` [N].
+        **Returns:** $\mu N_f$ and $\mu N_r$ [N], scalars.
         """
         whole = self.grip * self.mass * self.gravity / (self.front + self.rear)
         return whole * self.rear, whole * self.front
@@ -206,14 +225,15 @@ class DriftingCar(AbstractSystem):
     def equilibrium(
         self, speed: Any = 8.0, steering: Any = -12 * 2 * np.pi / 360
     ) -> tuple[State, Control]:
-        """The drift to the left at a speed and a steering angle.
+        """The drift to the left at a given speed and steering angle.
 
         **Arguments:**
 
-        - `speed`: vx, above 0 [m/s], 8 by default.
-        - `steering`: [rad], -12 degrees by default: to the right.
+        - `speed`: vx [m/s], above 0; 8 by default.
+        - `steering`: steering angle [rad], negative to the right; -12 degrees by
+            default.
 
-        **Returns:** `(x, u)`.
+        **Returns:** `(x, u)`, shapes `(3,)` and `(2,)`.
 
         **Raises:** `ValueError` if there is no such drift.
         """
@@ -225,8 +245,9 @@ class DriftingCar(AbstractSystem):
         ahead, whole = self.front, self.front + self.rear
         slides = 3 * grip_front / self.front_stiffness
 
-        # What balances the moments and the lateral forces, with the share 1 - y^3 of
-        # its grip in front; there y is how far the slip is from sliding.
+        # The rate, force and vy that balance the moments and the lateral forces, when
+        # the front tyre uses the share 1 - y^3 of its grip: y is how far its slip is
+        # from sliding.
         def balanced(y):
             used = (1 - y**3) * c
             rate = used * self.grip * self.gravity / v
@@ -240,7 +261,7 @@ class DriftingCar(AbstractSystem):
             along = (along * along + self.standstill**2) ** 0.5
             return rate * (moves * c - v * s - slip * along)
 
-        # Newton's method, by differences that are small enough.
+        # Newton's method with differences, which also runs on NumPy.
         y, h = xp.asarray(0.45, v.dtype), 1e-3
         for _ in range(6):
             y = y - 2 * h * miss(y) / (miss(y + h) - miss(y - h))

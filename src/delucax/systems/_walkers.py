@@ -1,4 +1,4 @@
-"""Walkers without knees that go down a slope by themselves."""
+"""Walkers without knees that walk down a slope without control."""
 
 from collections.abc import Sequence
 
@@ -12,20 +12,23 @@ from ._hybrid_base import AbstractHybridSystem
 
 
 class SimplestWalker(AbstractHybridSystem):
-    r"""Two straight legs with point feet far lighter than the hip, on a slope:
+    r"""The simplest walker: two straight legs on a slope, with point feet that are far
+    lighter than the hip.
 
-    `d2(stance)/dt2 = sin(stance - slope)` and
-    `d2(swing)/dt2 = d2(stance)/dt2 + (d(stance)/dt)^2 sin(swing)
-    - cos(stance - slope) sin(swing) + torque`
+    $$\ddot\theta = \sin(\theta - \gamma), \qquad
+    \ddot\phi = \ddot\theta + \dot\theta^2 \sin\phi - \cos(\theta - \gamma) \sin\phi
+    + \tau$$
 
-    in units of the leg and of `sqrt(length / gravity)`. The swing leg, at the angle
-    `swing` from the stance leg, strikes where `swing = 2 stance`, once the stance leg
-    has passed the normal of the slope: the legs' passing before is no event. The state
-    is (stance, stance rate, swing, swing rate), the control is (torque) at the hip.
+    Here $\theta$ is the angle of the stance leg, $\phi$ the angle of the swing leg from
+    the stance leg and $\tau$ the torque at the hip. Lengths are in units of the leg,
+    times in units of $\sqrt{l / g}$. The swing foot strikes at $\phi = 2 \theta$, once
+    the stance leg has passed the normal of the slope. The moment before, when the legs
+    pass each other, is no event. The state is (stance, stance rate, swing, swing rate),
+    the control is (torque).
 
     **Arguments:**
 
-    - `slope`: [rad], 0.009 by default.
+    - `slope`: $\gamma$ [rad], 0.009 by default.
 
     **Raises:** `ValueError` if the slope is not finite.
 
@@ -39,6 +42,10 @@ class SimplestWalker(AbstractHybridSystem):
         dynamics = dlx.Discretized(dlx.systems.SimplestWalker(), dt=0.1)
         start = [0.2003, -0.1998, 0.4006, -0.0158]
         dlx.analysis.poincare_map(dynamics, "step", start).time
+        ```
+
+        ```text
+        Array(3.884, dtype=float32)
         ```
     """
 
@@ -69,26 +76,28 @@ class SimplestWalker(AbstractHybridSystem):
 
 
 class CompassGait(AbstractHybridSystem):
-    r"""Two straight legs with masses and a mass at the hip, on a slope:
+    r"""The compass-gait walker: two straight legs on a slope, with a mass on each leg
+    and one at the hip.
 
-    `M(x) q'' + N(x) + G(x) = (-torque, torque)`, `q = (swing, stance)`,
+    $$M(q) \ddot q + N(q, \dot q) + G(q) = (-\tau, \tau), \qquad
+    q = (q_\mathrm{swing}, q_\mathrm{stance})$$
 
-    both angles from the vertical. The swing foot strikes where
-    `swing + stance = -2 slope` with the swing leg ahead; angular momentum of the whole
-    about the new foot, and of the trailing leg about the hip, are kept, and the legs
-    change their names. The state is (swing, stance, swing rate, stance rate) [rad,
-    rad/s], the control is (torque) at the hip [N m].
+    Both angles are measured from the vertical, and $\tau$ is the torque at the hip. The
+    swing foot strikes at $q_\mathrm{swing} + q_\mathrm{stance} = -2 \gamma$, with the
+    swing leg ahead. Two angular momenta are then conserved: that of the whole walker
+    about the new foot, and that of the trailing leg about the hip. The legs exchange
+    their names. The state is (swing [rad], stance [rad], swing rate [rad/s], stance
+    rate [rad/s]), the control is (torque [N m]).
 
     **Arguments:**
 
-    - `leg_mass`: m [kg], 5 by default, at `lower` from the foot.
-    - `hip_mass`: m_H [kg], 10 by default.
-    - `lower`, `upper`: a and b, from the foot to the leg's mass and from there to the
+    - `leg_mass`: mass of a leg [kg], 5 by default, at the distance `lower` from the
+        foot.
+    - `hip_mass`: mass at the hip [kg], 10 by default.
+    - `lower`, `upper`: distances from the foot to the leg's mass and from there to the
         hip [m], 0.5 by default.
-    - `gravity`: g [m/s^2], 9.81 by default.
-    - `slope`: [rad], of 3 degrees by default.
-
-    The numbers of the source are met with a gravity of 9.8.
+    - `gravity`: [m/s^2], 9.81 by default. The numbers in the source are for 9.8.
+    - `slope`: $\gamma$ [rad], 3 degrees by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
@@ -103,6 +112,10 @@ class CompassGait(AbstractHybridSystem):
         dynamics = dlx.Discretized(dlx.systems.CompassGait(), dt=0.02)
         start = [-0.3234, 0.2187, -0.3772, -1.0918]
         dlx.analysis.poincare_map(dynamics, "step", start).time
+        ```
+
+        ```text
+        Array(0.735, dtype=float32)
         ```
     """
 
@@ -133,11 +146,11 @@ class CompassGait(AbstractHybridSystem):
         return jnp.stack([swing_rate, stance_rate, first, second])
 
     def guards(self, t: Time, x: State, u: Control) -> Sequence[Scalar]:
-        # The height of the swing foot above the slope, in legs.
+        # The height of the swing foot above the slope, in lengths of a leg.
         return (cos(x[1] + self.slope) - cos(x[0] + self.slope),)
 
     def enabled(self, t: Time, x: State, u: Control) -> Sequence[BoolScalar]:
-        # The foot that scuffs the ground as the legs pass is let through.
+        # A leg without a knee scuffs the ground as the legs pass; that is no step.
         return (x[0] - x[1] > 0.1,)
 
     def resets(self, t: Time, x: State, u: Control) -> Sequence[State]:

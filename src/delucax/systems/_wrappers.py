@@ -17,15 +17,18 @@ from ._hybrid_base import AbstractHybridSystem
 def _forwarded(name: str) -> Any:
     """A property of the wrapped system."""
     return property(
-        lambda self: getattr(self.system, name), doc="That of the wrapped system."
+        lambda self: getattr(self.system, name), doc="As in the wrapped system."
     )
 
 
 class AbstractSystemWrapper(AbstractSystem):
-    """A system around another, in a field `system`, to which everything is forwarded
-    that a subclass does not override.
+    """A system around another system. It forwards everything that a subclass does not
+    override to the wrapped system, in a field `system`.
 
-    A subclass writes `vector_field`. A system with events has no such wrapper.
+    A subclass declares the field `system` and writes `vector_field`. Systems with
+    events cannot be wrapped.
+
+    **Raises:** `ValueError` at construction if `system` is not a system or has events.
 
     !!! example
 
@@ -43,6 +46,10 @@ class AbstractSystemWrapper(AbstractSystem):
 
         heavier = Heavier(dlx.systems.Pendulum())
         heavier.vector_field(0.0, jnp.ones(2), jnp.ones(1), None)
+        ```
+
+        ```text
+        Array([ 1.   , 14.122], dtype=float32)
         ```
     """
 
@@ -88,19 +95,20 @@ class AbstractSystemWrapper(AbstractSystem):
 
 
 class Calibrated(AbstractSystemWrapper):
-    """A system whose actuator and sensor have a scale and an offset,
+    r"""A system whose actuator and sensor have a scale and an offset.
 
-    `dx/dt = f(t, x, control_scale * u + control_offset, w)` and
-    `y = output_scale * h(t, x) + output_offset`,
+    $$\dot x = f(t, x, a_u u + b_u, w), \qquad y = a_y h(t, x) + b_y$$
 
-    such as a pump driven by a voltage and a level read in volts. All four may be
-    estimated by [`delucax.training.sysid.physical`][].
+    An example is a tank whose pump is driven by a voltage and whose level is read in
+    volts. [`delucax.training.sysid.physical`][] can estimate all four constants.
 
     **Arguments:**
 
-    - `system`: what is driven and read.
-    - `control_scale`, `control_offset`: a number or shape `(m,)`; 1 and 0 by default.
-    - `output_scale`, `output_offset`: a number or shape `(p,)`; 1 and 0 by default.
+    - `system`: the system inside, an [`delucax.AbstractSystem`][].
+    - `control_scale`, `control_offset`: $a_u$ and $b_u$, a number or shape `(m,)`; 1
+        and 0 by default.
+    - `output_scale`, `output_offset`: $a_y$ and $b_y$, a number or shape `(p,)`; 1 and
+        0 by default.
 
     **Raises:** `ValueError` on other shapes, or if `system` has events.
 
@@ -115,6 +123,10 @@ class Calibrated(AbstractSystemWrapper):
         )
         tank.observe(0.0, jnp.zeros(2))
         ```
+
+        ```text
+        Array([0.1, 0.1], dtype=float32)
+        ```
     """
 
     system: AbstractSystem
@@ -124,7 +136,7 @@ class Calibrated(AbstractSystemWrapper):
     output_offset: Float[Array, "..."] = parameter(0.0)
 
     def __check_init__(self):
-        # The other way round a wrong shape would fail in `observe`.
+        # First, so that a `system` of the wrong kind gets a clear error.
         super().__check_init__()
         system = self.system
         sizes = dict(control=system.control_size, output=system.observation_size)
@@ -141,24 +153,28 @@ class Calibrated(AbstractSystemWrapper):
 
 
 class Corrected(AbstractSystemWrapper):
-    """A system with a network for what its equations leave out,
+    r"""A grey-box model: a known system with a neural network for what its equations
+    leave out.
 
-    `dx/dt = f(t, x, u, w) + size * network((x - x_mean) / x_scale,
-    (u - u_mean) / u_scale)`.
+    $$\dot x = f(t, x, u, w) + s \cdot \mathrm{network}\left(
+    \frac{x - \bar x}{\sigma_x}, \frac{u - \bar u}{\sigma_u}\right)$$
 
-    The last layer of the network is zero at first, so that it begins as the system
-    itself. [`delucax.training.sysid.grey_box`][] fits both together.
+    The last layer of the network is initialised to zero, so the model starts as the
+    known system. [`delucax.training.sysid.grey_box`][] fits both together.
 
     **Arguments:**
 
-    - `system`: the known part.
-    - `width`, `depth`: of the network, 16 and 1 by default.
-    - `size`: the size of the correction of each state's derivative, shape `(n,)` or a
-        number; zero for a derivative that is known, such as that of a position. 1 by
+    - `system`: the known part, an [`delucax.AbstractSystem`][].
+    - `width`, `depth`: units in each hidden layer and number of hidden layers of the
+        network, 16 and 1 by default.
+    - `size`: $s$, the size of the correction to the derivative of each state, shape
+        `(n,)` or a number; 1 by default. Take 0 for a derivative that is known exactly,
+        such as that of a position.
+    - `x_mean`, `x_scale`: $\bar x$ and $\sigma_x$, shape `(n,)` or a number; 0 and 1 by
         default.
-    - `x_mean`, `x_scale`: shape `(n,)` or a number; 0 and 1 by default.
-    - `u_mean`, `u_scale`: shape `(m,)` or a number; 0 and 1 by default.
-    - `key`: a random key, for the first weights.
+    - `u_mean`, `u_scale`: $\bar u$ and $\sigma_u$, shape `(m,)` or a number; 0 and 1 by
+        default.
+    - `key`: a random key for the initial weights.
 
     **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
 
@@ -176,6 +192,10 @@ class Corrected(AbstractSystemWrapper):
         key = jax.random.key(0)
         grey = dlx.systems.Corrected(spring, width=8, size=[0.0, 1.0], key=key)
         grey.vector_field(0.0, jnp.ones(2), jnp.zeros(1), None)
+        ```
+
+        ```text
+        Array([ 1. , -1.1], dtype=float32)
         ```
     """
 
