@@ -255,12 +255,12 @@ def test_what_does_not_fit_is_named():
     for make, words in (
         (lambda: delay(plant, -0.1), "controls must be at least 0, got -0.1"),
         (lambda: delay(plant, sensor=np.nan), "sensor must be finite"),
-        (lambda: delay(plant, 0.3, control_memory=2), "within the memory of 2 steps"),
+        (lambda: delay(plant, 0.3, control_memory=2), "must be at most 2 steps of"),
         (lambda: delay(dlx.LinearDynamics(A, B)), "dynamics must be an Abstr"),
         (lambda: steps(Lag(delays=[0.0]), H), "delays must be positive"),
         (lambda: steps(Lag(delays=[]), H), "delays must be positive"),
-        (lambda: steps(Lag(), H, memory=3), "at most memory = 3 of them"),
-        (lambda: steps(Lag(delays=[0.05]), H, substeps=1), "at least a substep"),
+        (lambda: steps(Lag(), H, memory=3), "at most memory = 3 substeps"),
+        (lambda: steps(Lag(delays=[0.05]), H, substeps=1), "at least one substep"),
         (lambda: steps(Spring(), H), "system must be an AbstractDelaySystem"),
         (lambda: steps(Lag(), H, solver=diffrax.Kvaerno3()), "explicit Runge-Kutta"),
     ):

@@ -287,7 +287,7 @@ def test_bad_input():
         dlx.trim(Reactor(), **GUESS, fix="k0")
     with user_error(match="fix must leave a state or a control free"):
         dlx.trim(Reactor(), **GUESS, fix=("c", "T", "Tc"))
-    with user_error(match="fix must be a name, names or a dictionary"):
+    with user_error(match="fix must be a name, several names or a dictionary"):
         dlx.trim(Reactor(), **GUESS, fix=2)
     with user_error(match=r"fix\['c'\] must be a number"):
         dlx.trim(Reactor(), **GUESS, fix={"c": [0.5, 0.5]})

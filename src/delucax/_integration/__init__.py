@@ -1,4 +1,5 @@
-"""Integration code shared by `Discretized` and `simulate`."""
+"""Runge-Kutta steps, Diffrax solvers and events, as `Discretized` and `simulate` use
+them."""
 
 from ._events import (
     any_of as any_of,

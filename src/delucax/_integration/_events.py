@@ -1,4 +1,5 @@
-"""Where guards cross zero within a step: detection by cubics, location by steps."""
+"""Where guards cross zero within a step. A cubic through each guard detects a crossing;
+Newton's method on the length of the step locates it."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -12,20 +13,21 @@ from .._jax import by_components
 
 
 class Crossings(NamedTuple):
-    """What the guards do along a step, one entry for each event. Times are shares of
-    the step, and a guard times `sign` falls as it fires.
+    """The crossings of the guards along a step, one entry for each event. Times are
+    fractions of the step. Each guard is multiplied by its `sign`, so that it falls
+    where its event fires.
 
     - `sign`: 1 or -1.
-    - `expected`: whether it crosses zero.
-    - `low`, `high`: it falls between these, from positive to negative.
+    - `expected`: whether the guard is expected to cross zero.
+    - `low`, `high`: the guard falls between these, from positive to negative.
     - `guess`: where the cubic through its values and rates at both ends is zero.
-    - `at_once`: whether it starts at zero and crosses there, or is late.
+    - `at_once`: whether it starts at zero and crosses there, or is `late`.
     - `late`: whether it is urgent and starts beyond zero.
     - `beyond`: whether it starts beyond zero and is not urgent.
-    - `past_end`: whether the end of the step shows that it crosses; else only the cubic
-        does, which dips below zero and comes back.
+    - `past_end`: whether its value at the end of the step shows the crossing. If not,
+        the cubic dips below zero and comes back within the step.
     - `slope`: its change over the step, if the rate at the start were constant.
-    - `least_slope`: the slope below which it grazes.
+    - `least_slope`: below this slope the guard grazes zero.
     """
 
     sign: Array
@@ -42,7 +44,7 @@ class Crossings(NamedTuple):
 
 
 def pick(rows: Iterable[Array], index: Array) -> Array:
-    """The row of an index: by a choice for each, as a batch of gathers is slow."""
+    """The row `index`, by one `where` per row, because a batch of gathers is slow."""
     first, *others = rows
     for i, row in enumerate(others, 1):
         first = jnp.where(index == i, row, first)
@@ -55,7 +57,7 @@ def any_of(flags: Iterable[Array]) -> Array:
 
 
 def least(values: Iterable[Array]) -> tuple[Array, Array]:
-    """The least of a few values, and the first index that has it."""
+    """The smallest of a few values, and its first index."""
     value, *others = values
     index = jnp.asarray(0)
     for i, other in enumerate(others, 1):
@@ -80,36 +82,38 @@ def crossings(
 
     **Arguments:**
 
-    - `starts`, `ends`: the guards and their changes over the step, if their rates were
-        constant, at both ends.
-    - `slack`, `margin`: what counts as zero at the start, and at the end.
+    - `starts`, `ends`: at each end of the step, the guards and their rates times the
+        length of the step.
+    - `slack`, `margin`: a guard smaller than this counts as zero at the start, and at
+        the end.
     - `directions`: -1 falling, 1 rising, 0 both.
-    - `urgent`: which fire at the start of a step, too, where they start beyond zero.
-    - `passing`: which may start beyond zero and then do not fire.
-    - `enabled`: at both ends.
-    - `has_length`: whether the step is more than a rounding of its interval; if it is
-        not, nothing is expected in it, but at the start of the next.
-    - `noise`: the rounding of the guards.
+    - `urgent`: the events that also fire at the start of a step if they start beyond
+        zero.
+    - `passing`: the events that may start beyond zero, and then do not fire.
+    - `enabled`: which events are enabled at each end.
+    - `has_length`: whether the step is longer than a rounding of its interval. In a
+        shorter step no crossing is expected; the next step starts with it.
+    - `noise`: the rounding error of the guards.
     """
     (g0, r0), (g1, r1) = starts, ends
     on_guard = jnp.abs(g0) <= slack
     either = directions == 0
-    # A guard that may be crossed either way falls from where it starts.
+    # A guard that may cross either way gets the sign that makes it fall from its start.
     own = jnp.where(jnp.where(on_guard, r0, g0) < 0, -1, 1)
     sign = jnp.where(either, own, -directions).astype(g0.dtype)
     g0, r0, g1, r1 = (sign * a for a in (g0, r0, g1, r1))
     beyond = g0 < -slack
     late = beyond & urgent & enabled[0] & has_length
     at_once = on_guard & (r0 < 0) & ~passing & enabled[0] & has_length | late
-    # One that is not enabled and is already falling has to come back first.
+    # An event that is already past its guard cannot fire before the guard comes back.
     gone = beyond | on_guard & (r0 < 0)
-    # Where it grazes there is nothing to correct.
+    # A guard that grazes has no meaningful zero to correct to.
     near = -g0 / jnp.where(r0 < 0, r0, -1)
     small = jnp.abs(near) < jnp.finfo(g0.dtype).eps ** 0.25
     near = jnp.where(small & on_guard, near, 0)
     a = jnp.where(on_guard, 0, g0)
-    # Hermite's cubic a + r0 z + c z^2 + d z^3, and where it is least and largest. Of
-    # each pair of formulas one has no cancellation.
+    # Hermite's cubic a + r0 z + c z^2 + d z^3, and where it is smallest and largest. Of
+    # each pair of formulas, the one without cancellation is taken.
     c, d = 3 * (g1 - a) - 2 * r0 - r1, 2 * (a - g1) + r0 + r1
     discriminant = c * c - 3 * d * r0
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
@@ -125,10 +129,10 @@ def crossings(
 
     inside = lambda z, end: (discriminant > 0) & (z > 0) & (z < end)
     dips = inside(lowest, 1.0) & (cubic(lowest)[0] < 0)
-    # A guard that is zero at the end, as near as can be told, is left to the start of
-    # the next step: whether it is just below is rounding, which is another in another
-    # program. One that may be on either side fires, as that start could not tell.
-    # From the guard to the guard, as in a step of no length, nothing is crossed.
+    # A guard that is zero at the end, up to rounding, is left to the start of the next
+    # step: whether it is just below zero depends on how a program rounds. A guard that
+    # may be on either side fires here, because the next start could not tell. A step
+    # that starts and ends on the guard, as one of no length does, crosses nothing.
     margin = jnp.where(on_guard, jnp.maximum(slack, margin), margin)
     ends_on = (g1 <= margin) & (r1 < 0)
     ends_on &= either & ~on_guard | passing & (~on_guard | (r0 > 0))
@@ -137,8 +141,7 @@ def crossings(
     low = jnp.where(inside(highest, high), jnp.clip(highest, 0, 1), 0.0)
 
     expected = ~gone & (dips | ends_beyond) & (enabled[0] | enabled[1])
-    # A few of Newton's steps, from the chord and between the ends: the start of the
-    # search, if there is one, and else not computed.
+    # A few Newton steps from the chord give the start of the search.
     left, right, (v0, v1) = low, high, (cubic(low)[0], cubic(high)[0])
     guess = low + (high - low) * jnp.clip(v0 / jnp.where(v0 > v1, v0 - v1, 1), 0, 1)
     for _ in range(4):
@@ -148,7 +151,7 @@ def crossings(
         newton = guess - value / jnp.where(slope == 0, 1, slope)
         good = (newton >= left) & (newton <= right)
         guess = jnp.where(good, newton, (left + right) / 2)
-    # A parabola that is beyond zero by its rounding has this slope where it crosses.
+    # The slope at the crossing of a parabola that dips below zero by its rounding.
     curved = 2 * jnp.sqrt(jnp.abs(g1 - a - r0) * noise)
     size = jnp.abs(a) + jnp.abs(g1) + jnp.abs(r0) + jnp.abs(r1)
     least_slope = jnp.maximum(jnp.finfo(g0.dtype).eps ** 0.5 * size, curved)
@@ -170,23 +173,25 @@ def crossings(
 def locate(
     guards: Callable[[Array], tuple[Array, Array]], crossing: Crossings, active: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The first crossing of a step: Newton's method on the step itself, in a bracket.
+    """The first crossing in a step, by Newton's method on the length of the step within
+    a bracket.
 
     **Arguments:**
 
-    - `guards`: from a share of the step to the guards there, and their changes over the
-        step at the rates there.
-    - `crossing`: the crossings that are expected.
-    - `active`: whether there is one; else nothing is computed.
+    - `guards`: maps a fraction of the step to the guards there, and to their rates
+        there times the length of the step.
+    - `crossing`: the expected crossings.
+    - `active`: whether a crossing is expected. If not, nothing is computed.
 
-    **Returns:** `(share, event, crossed, grazes)`: where it is, which event's it is,
-    whether there is one (a cubic may dip below zero where the step does not; the share
-    is then 1), and whether it hardly crosses.
+    **Returns:** `(share, event, crossed, grazes)`: the fraction of the step at the
+    crossing; the index of the event; whether there is a crossing (a cubic may dip below
+    zero where the step does not, and `share` is then 1); and whether the guard only
+    grazes zero.
     """
     eps = jnp.finfo(crossing.guess.dtype).eps
-    # The first in the order of their names, of those that cross at the same time.
+    # If several guards cross at the same time, the first in order of names is taken.
     start, event = least(jnp.where(crossing.expected, crossing.guess, 2.0))
-    # What was expected elsewhere may, rounded otherwise, not be so here.
+    # Checked again, because the caller's program may have rounded the guards otherwise.
     active = active & any_of(crossing.expected)
     at_once = active & any_of(crossing.at_once)
     past_end = any_of(crossing.expected & crossing.past_end)
@@ -201,12 +206,12 @@ def locate(
         left, right = jnp.where(below, left, share), jnp.where(below, share, right)
         newton = share - g / jnp.where(rate < 0, rate, -1)
         newton = jnp.where(falling & (rate < 0), newton, 2.0)
-        # Those that do not yet fall here can cross only behind this point.
+        # A guard that does not fall yet can cross only later.
         after, event = least(
             jnp.where(crossing.expected & ~falling, crossing.guess, newton)
         )
         apart = jnp.abs(after - share)
-        # Newton's next error is about the square of its step.
+        # Close enough, because Newton's next error is about the square of this step.
         near = apart < 0.3 * eps**0.5
         done = near | (right - left < 2 * eps)
         inside = near | (after > left) & (after < right)
@@ -221,6 +226,6 @@ def locate(
     state = lax.while_loop(lambda state: state[0], look, state)
     _, _, _, share, event, slope, crossed, _ = state
     crossed = active & (crossed | at_once)
-    # It grazes where its slope is nothing beside what it changes along the step.
+    # A guard grazes if its slope is negligible beside its changes along the step.
     grazes = crossed & (-slope < pick(crossing.least_slope, event))
     return jnp.where(crossed, jnp.minimum(share, 1), 1), event, crossed, grazes

@@ -1,7 +1,7 @@
-"""Vector fields and other functions of time, as a solve evaluates them.
+"""Evaluation of vector fields and other functions of time within a solve.
 
-The shape of what a field returns is checked. At late times the sum `t + s` is rounded,
-which is corrected.
+The shape of the returned value is checked. At late times the sum `t + s` is rounded,
+and `TimeOffset` corrects for it.
 """
 
 from collections.abc import Callable
@@ -19,34 +19,34 @@ from ..systems import AbstractSystem
 
 
 def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:
-    """The vector field of `system`, with its shape checked."""
+    """The vector field of `system`, with a check of its shape."""
     dx = system.vector_field(t, x, u, w)
     check_returned(dx, x, system, "vector_field")
     return dx
 
 
 def check_returned(value: Any, x: Array, system: AbstractSystem, method: str) -> None:
-    """Raise unless what a method of `system` returned has the shape of the state."""
+    """Raise unless a method of `system` returned an array shaped like the state."""
     shape = getattr(value, "shape", None)
     if shape == x.shape:
         return
     got = f"a {type(value).__name__}" if shape is None else shape
     listed = isinstance(value, tuple | list)
-    hint = " (jnp.stack makes an array of a list)" if listed else ""
+    hint = " Use jnp.stack to make an array of a list." if listed else ""
     raise ValueError(
         f"{type(system).__name__}: {method} must return an array of shape {x.shape}, "
-        f"as the state has, got {got}{hint}."
+        f"the shape of the state, got {got}.{hint}"
     )
 
 
 class TimeOffset(eqx.Module):
-    """The start `t` of a solve that counts its own time `s` from 0, for one function of
-    time `f`.
+    """The start time `t` of a solve that counts its own time `s` from 0. It evaluates a
+    function of time `f` at `t + s`, corrected for rounding.
 
-    The sum `t + s` is rounded, and its rounding error `e` is known (in float32, at 1e5,
-    it is up to 0.004): `f` is evaluated as `f(t + s) + e f' + e^2 f'' / 2`. A function
-    that is constant in time, not twice forward-differentiable, or without finite
-    derivatives is evaluated without correction.
+    The sum `t + s` is rounded, by up to 0.004 in float32 at a time of 1e5. The rounding
+    error `e` can be computed, so `f` is evaluated as `f(t + s) + e f' + e^2 f'' / 2`.
+    There is no correction if `f` is constant in time, is not twice
+    forward-differentiable, or has derivatives that are not finite.
 
     Source: Knuth, 1969 (the error of a sum).
     """
@@ -56,19 +56,18 @@ class TimeOffset(eqx.Module):
 
     def __init__(self, t: Array, function: Callable[[Array], Array] | None = None):
         self.t = t
-        # In double precision a time of 1e9 is still known to 1e-7.
+        # Double precision needs no correction: it resolves a time of 1e9 to 1e-7.
         rounded = function is not None and _is_rounded(t.dtype)
         self.is_corrected = rounded and _varies(function, t)
 
     def evaluate(self, s: RealScalar, function: Callable[[Array], Array]) -> Array:
         """`function` at the time `s` after the start."""
         time = self.t + s
-        # An s that is a Python number is 0: the start itself.
+        # Callers pass a Python number only for the start, s = 0.
         if not self.is_corrected or not eqx.is_array(s) or not _is_rounded(time.dtype):
             return function(time)
-        # The error of a rounded sum is a number itself, found exactly by six additions
-        # (TwoSum). It is a constant: the derivative with respect to t and s is that of
-        # `time`, in which both stand.
+        # Six additions give the error of a rounded sum exactly (TwoSum). It is held
+        # constant, because the derivatives with respect to t and s go through `time`.
         t, s, total = lax.stop_gradient((self.t, s, time))
         part = total - t
         off = (t - (total - part)) + (s - part)
@@ -81,21 +80,22 @@ def _is_rounded(dtype: Any) -> bool:
 
 
 def _change(function, time, off):
-    """`function` at `time`, and by how much it is another at `time + off`: the terms of
-    first and second order, by a derivative along `off` of a derivative along it."""
+    """`function` at `time`, and its change from there to `time + off`, up to the second
+    order, by forward over forward differentiation."""
     slope = lambda time: jax.jvp(function, (time,), (off,))
     (value, first), (_, second) = jax.jvp(slope, (time,), (off,))
     return value, first + second / 2
 
 
 def _varies(function, t):
-    """Whether `function` has derivatives with respect to time that are not all zero.
+    """Whether `function` depends on time, with derivatives that can be computed.
 
-    They are traced, not compiled. A function that is not differentiable raises one of
-    many errors here; any other error of it is raised again when it is evaluated.
+    The derivatives are traced, not compiled. A function that is not differentiable
+    raises one of many errors here. Any other error is raised again when the function is
+    evaluated.
     """
-    # A derivative of zero is a constant of the program. (Values cannot tell, because a
-    # derivative may be zero at this time alone.)
+    # If the function does not depend on time, its traced change is a constant. Values
+    # would not tell, because a derivative may happen to be zero at this time.
     try:
         return not is_constant(lambda off: _change(function, t, off)[1], t)
     except Exception:

@@ -1,9 +1,9 @@
 """Explicit Runge-Kutta steps with their stages written out.
 
-A Diffrax solver runs its stages in a loop over arrays. For the small states of control
-it is several times faster, forward and in the gradient, to write the stages out and to
-combine the state one component at a time: each component of a batch is then a vector
-of its own that stays in registers.
+A Diffrax solver runs its stages in a loop over arrays. The states of control problems
+are small. For these it is several times faster, forward and in the gradient, to write
+the stages out and to combine the state one component at a time: each component of a
+batch is then a vector of its own, which stays in registers.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,13 +22,13 @@ from .._typing import RealScalar
 class RK4(diffrax.AbstractERK):
     """The classical Runge-Kutta method of order 4, as a Diffrax solver.
 
-    Has no error estimate, so it takes fixed steps. Uses cubic Hermite interpolation
-    where Diffrax asks for dense output.
+    It has no error estimate, so it takes fixed steps. For dense output it uses cubic
+    Hermite interpolation.
 
     **Arguments:**
 
-    - `scan_kind`: how Diffrax loops over the stages where it takes the steps itself, as
-        for every `diffrax.AbstractERK`; leave it out.
+    - `scan_kind`: how Diffrax loops over the stages when it takes the steps itself, as
+        for every `diffrax.AbstractERK`; `None` by default. Leave it out.
 
     Source: Kutta, 1901.
 
@@ -37,9 +37,8 @@ class RK4(diffrax.AbstractERK):
         ```python
         import delucax as dlx
 
-        dynamics = dlx.Discretized(
-            dlx.systems.Pendulum(), dt=0.05, solver=dlx.dynamics.RK4()
-        )
+        pendulum = dlx.systems.Pendulum()
+        dynamics = dlx.Discretized(pendulum, dt=0.05, solver=dlx.dynamics.RK4())
         ```
     """
 
@@ -75,7 +74,7 @@ def tableau_of(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau | None:
     """The tableau of an explicit Runge-Kutta solver; `None` for any other."""
     if type(solver) is diffrax.Euler:
         return _EULER
-    # `isinstance` is true of wrapped solvers, too, but they have no tableau.
+    # A wrapped solver is an instance too, but has no tableau.
     is_wrapped = isinstance(solver, diffrax.AbstractWrappedSolver)
     if is_wrapped or not isinstance(solver, diffrax.AbstractERK):
         return None
@@ -91,8 +90,8 @@ def runge_kutta_step(
     h: RealScalar,
 ) -> Array:
     """One explicit step of size `h` of `dx/dt = field(t, x)`."""
-    # Stages that the solution does not use belong to the error estimate, or are the
-    # slope at the end, with which the next step would begin.
+    # Stages without a weight in the solution are left out: they only serve the error
+    # estimate, or the first slope of the next step.
     used = max(np.flatnonzero(tableau.b_sol)) + 1
     rows = [(), *(tuple(map(float, row)) for row in tableau.a_lower)][:used]
     nodes = [0.0, *map(float, tableau.c)][:used]
@@ -102,9 +101,10 @@ def runge_kutta_step(
     slopes: list[Sequence[Array]] = []
     for row, node in zip(rows, nodes, strict=True):
         stage = join_state(_combine(base, row, slopes, h))
-        # A time without a sum is exact, and known to be the start of the interval.
+        # No sum at the start, so that the time is exact.
         slope = field(t + node * h if node else t, stage)
-        # Every component of the next stage needs the whole slope: it is stored once.
+        # Every component of the next stage needs the whole slope. The fence keeps XLA
+        # from computing it again for each.
         slopes.append(fence(*slope) if size <= COMPONENTS_UP_TO else (slope,))
     return join_state(_combine(base, weights, slopes, h)).astype(x.dtype)
 
@@ -116,8 +116,8 @@ def runge_kutta_step_in_loop(
     x: Array,
     h: RealScalar,
 ) -> Array:
-    """The same, with the stages in a loop: slower, and compiled in less time where the
-    field is large."""
+    """As `runge_kutta_step`, with the stages in a loop: slower to run, but quicker to
+    compile if the field is large."""
     stages = max(np.flatnonzero(tableau.b_sol)) + 1
     A = np.zeros((stages, stages))
     for i, row in enumerate(tableau.a_lower[: stages - 1], 1):
@@ -141,7 +141,7 @@ def _combine(base, weights, slopes, h):
         return base
     combined = []
     for j, start in enumerate(base):
-        # The sum before the product with h, so that one rounding of h is enough.
+        # The slopes are summed first, so that each product rounds only once.
         total = terms[0][0] * terms[0][1][j]
         for a, k in terms[1:]:
             total = total + a * k[j]

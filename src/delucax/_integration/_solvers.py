@@ -1,4 +1,4 @@
-"""Diffrax solvers: which of them fit, and implicit ones at fixed steps."""
+"""Checks of Diffrax solvers, and implicit solvers at fixed steps."""
 
 import operator
 from typing import Any
@@ -21,7 +21,7 @@ _KINDS: dict[str, tuple[type, str]] = {
     "stepsize_controller": (
         diffrax.AbstractAdaptiveStepSizeController,
         "adaptive, such as diffrax.PIDController(rtol=1e-6, atol=1e-8); for fixed "
-        "steps leave it out and give substeps. Got",
+        "steps leave it out and pass substeps. Got",
     ),
     "adjoint": (
         diffrax.AbstractAdjoint,
@@ -31,7 +31,7 @@ _KINDS: dict[str, tuple[type, str]] = {
 
 
 def check_kind(value: Any, name: str, where: str) -> None:
-    """Raise unless `value` is what Diffrax takes as its argument `name`."""
+    """Raise unless `value` fits Diffrax's argument `name`."""
     kind, words = _KINDS[name]
     if not isinstance(value, kind):
         raise ValueError(f"{where}: {name} must be {words} {value!r}.")
@@ -54,19 +54,19 @@ def check_method(
         if substeps != 1:
             raise ValueError(
                 f"{where}: substeps must be 1 with a stepsize_controller, which "
-                f"chooses the steps, got {substeps}."
+                f"chooses the steps itself, got {substeps}."
             )
     elif max_steps is not None:
         raise ValueError(
-            f"{where}: max_steps needs stepsize_controller; with fixed steps give "
-            "substeps."
+            f"{where}: max_steps needs a stepsize_controller. With fixed steps, pass "
+            "substeps instead."
         )
     elif isinstance(solver, diffrax.AbstractImplicitSolver) and not with_diffusion:
         _check_implicit(solver, where)
     elif tableau_of(solver) is None and not with_diffusion:
         raise ValueError(
             f"{where}: solver {type(solver).__name__} does not fit fixed steps of "
-            "dx/dt = f(t, x, u, w); use an explicit Runge-Kutta method "
+            "dx/dt = f(t, x, u, w). Use an explicit Runge-Kutta method "
             "(diffrax.Euler, Heun, Midpoint, Ralston, Bosh3, Tsit5, Dopri5, Dopri8, "
             "delucax.dynamics.RK4) or a diagonally implicit one "
             "(diffrax.ImplicitEuler, Kvaerno3, Kvaerno4, Kvaerno5)."
@@ -78,11 +78,11 @@ def check_adaptive(solver: diffrax.AbstractSolver, where: str) -> None:
     name = type(solver).__name__
     tableau = tableau_of(solver)
     no_error = tableau is not None and not tableau.b_error.any()
-    # Diffrax accepts a tableau whose error weights are all zero.
+    # Checked here, because Diffrax accepts a tableau whose error weights are all zero.
     if no_error or not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
-            f"{where}: solver {name} has no error estimate and cannot be used with a "
-            "stepsize_controller; use diffrax.Tsit5(), or wrap it: "
+            f"{where}: solver {name} has no error estimate, which a "
+            "stepsize_controller needs. Use diffrax.Tsit5(), or wrap it: "
             f"diffrax.HalfSolver({name}())."
         )
     if isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -93,28 +93,28 @@ def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
     if solver.term_structure is not diffrax.AbstractTerm:
         raise ValueError(
             f"{where}: solver {type(solver).__name__} needs a split into stiff and "
-            "non-stiff parts; use diffrax.ImplicitEuler, Kvaerno3, Kvaerno4 or "
+            "non-stiff parts. Use diffrax.ImplicitEuler, Kvaerno3, Kvaerno4 or "
             "Kvaerno5."
         )
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         raise ValueError(
-            f"{where}: solver {type(solver).__name__} wraps an implicit solver, whose "
-            "root finder cannot be reached; pass the inner solver itself."
+            f"{where}: solver {type(solver).__name__} wraps an implicit solver and "
+            "hides its root finder. Pass the inner solver itself."
         )
 
 
 def solve_result(solution: diffrax.Solution, controller: Any, dtype: Any) -> Result:
-    """The result of a solve with a step-size controller, or without one (`None`).
+    """The result of a solve; `controller` is its step-size controller or `None`.
 
-    If the maximal number of steps is reached and `rtol` is below the precision of the
-    state, it is `beyond_precision`.
+    The result is `beyond_precision` if the solve reached its maximal number of steps
+    with an `rtol` below the precision of the state.
     """
     result = promote(solution.result)
     if controller is None:
         return result
-    # A tolerance that is a Python number is known now, and most are far from rounding.
-    # An error estimate is itself rounded, to about eps of the state: below that, steps
-    # shrink without end.
+    # The error estimate is itself rounded, to about eps times the state. With a smaller
+    # tolerance, steps shrink without end. Most tolerances are Python numbers far above
+    # that, and need no program.
     is_fine = controller.rtol < 4 * float(jnp.finfo(dtype).eps)
     if is_fine is False:
         return result
@@ -134,7 +134,7 @@ class AbstractForwardingSolver(diffrax.AbstractWrappedSolver):
     term_structure = _forwarded("term_structure")
     term_compatible_contr_kwargs = _forwarded("term_compatible_contr_kwargs")
     interpolation_cls = _forwarded("interpolation_cls")
-    # Diffrax reads these after instance checks that a wrapper satisfies, too.
+    # A wrapper satisfies the instance checks after which Diffrax reads these.
     root_finder = _forwarded("root_finder")
     root_find_max_steps = _forwarded("root_find_max_steps")
     scan_kind = _forwarded("scan_kind")
@@ -146,23 +146,23 @@ class AbstractForwardingSolver(diffrax.AbstractWrappedSolver):
 
 
 class _Chord(diffrax.VeryChord):
-    """Diffrax's chord method, which iterates until it has converged.
+    """Diffrax's chord method, iterated until convergence.
 
-    Diffrax's own stops after two iterations, for a step-size controller to take a
-    shorter step. Fixed steps have none, so this one iterates until convergence.
+    Diffrax's own stops after two iterations and leaves it to the step-size controller
+    to take a shorter step. Fixed steps have no such controller.
     """
 
     atol: Any  # one for each entry, where Diffrax has a number for all
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        # Changes that shrink by `rate` are a geometric series, whose rest is the
-        # distance to the root (Hairer and Wanner, 1996, IV.8).
+        # The changes shrink by `rate`, so the distance to the root is the rest of a
+        # geometric series (Hairer and Wanner, 1996, IV.8).
         size = state.diffsize  # of the last change, in units of the tolerance
         rate = size / state.diffsize_prev
         left = size * rate / (1 - rate)
-        enough = state.step >= 2  # two changes, or there is no rate
-        # Close to the root rounding takes over, and the rate says nothing.
+        enough = state.step >= 2  # a rate needs two changes
+        # Close to the root, rounding dominates and the rate is meaningless.
         converged = enough & ((size < 0.1) | (rate < 1) & (left < 0.01))
         diverged = enough & ~converged & (~jnp.isfinite(size) | (rate > 2))
         result = optx.RESULTS.where(
@@ -174,11 +174,12 @@ class _Chord(diffrax.VeryChord):
 
 
 class _FixedStep(AbstractForwardingSolver):
-    """An implicit solver that needs no step-size controller for its tolerances.
+    """An implicit solver that sets the tolerances of its root finder itself, without a
+    step-size controller.
 
-    What is solved for is a slope, or its product with the step. Where the field is
-    stiff rounding of the state alone makes slopes rough, so the tolerance is that of
-    the state: relative to it, whatever the slope.
+    The unknown is a slope, or its product with the step. In a stiff field, the rounding
+    of the state alone makes slopes inaccurate. The tolerance is therefore relative to
+    the state, not to the slope.
     """
 
     solver: diffrax.AbstractSolver
@@ -188,21 +189,22 @@ class _FixedStep(AbstractForwardingSolver):
         return self._with_tolerances(1e-3, 1.0).root_finder
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # Some four digits above rounding, far below the error of any sensible step.
+        # Well above rounding, and far below the error of any sensible step.
         is_double = y0.dtype == jnp.float64
         rtol, atol = (1e-10, 1e-12) if is_double else (1e-5, 1e-6)
-        # A tolerance decides how many iterations there are, and has no derivative.
+        # No gradient: a tolerance only decides how many iterations there are.
         scale = lax.stop_gradient(atol + rtol * jnp.abs(y0))
         solver: Any = self.solver
         if isinstance(self.solver, diffrax.AbstractDIRK) and solver.tableau.fsal:
-            # Then Diffrax solves for the slope, and else for its product with the step.
+            # Here Diffrax solves for the slope, elsewhere for its product with the
+            # step.
             scale = scale / lax.stop_gradient(t1 - t0)
         solver = self._with_tolerances(rtol, scale)
         return solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _with_tolerances(self, rtol: float, atol: Any) -> Any:
         finder = self.solver.root_finder  # pyright: ignore
-        # Only tolerances that the user left to a step-size controller are set.
+        # Tolerances that the user gave are kept.
         values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
         if isinstance(finder, diffrax.VeryChord | optx.Chord):
             finder = _Chord(**values, linear_solver=finder.linear_solver)
@@ -225,10 +227,10 @@ def _unset(finder: optx.AbstractRootFinder) -> list[str]:
 
 def as_fixed_step_solver(solver: Any) -> Any:
     """An implicit solver that works without a step-size controller and outside of
-    `diffeqsolve`, and there supports forward- and reverse-mode differentiation.
+    `diffeqsolve`, in forward- and reverse-mode differentiation.
     """
-    # Diffrax's default loop over the stages is one that `diffeqsolve` sets for itself;
-    # this one has a reverse mode outside of it, too.
+    # `diffeqsolve` chooses the loop over the stages itself. Outside of it, the bounded
+    # loop has a reverse mode.
     if isinstance(solver, diffrax.AbstractDIRK) and solver.scan_kind is None:
         is_none = lambda leaf: leaf is None
         solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=is_none)
@@ -236,10 +238,10 @@ def as_fixed_step_solver(solver: Any) -> Any:
 
 
 def throwing_adjoint(adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractAdjoint:
-    """An adjoint that raises where a solve of its own fails.
+    """An adjoint that raises if its backward solve fails.
 
-    The backward solve of `BacksolveAdjoint` takes over `throw` from the forward one,
-    which is false to return a status. A gradient has no status.
+    The backward solve of `BacksolveAdjoint` inherits `throw` from the forward solve,
+    which is false because that returns a status. A gradient cannot return one.
     """
     if not isinstance(adjoint, diffrax.BacksolveAdjoint):
         return adjoint

@@ -1,4 +1,4 @@
-"""Discrete maps `x_next = F(t, x, u, w)`: discretised, linear and linearised
+"""Plants in discrete time, `x_next = F(t, x, u, w)`: discretised, linear and linearised
 systems."""
 
 from .._integration import RK4 as RK4

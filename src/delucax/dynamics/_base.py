@@ -1,7 +1,4 @@
-"""The discrete-time map that environments and planners step.
-
-What it is, the states that it leads to, and base classes of dynamics around a plant.
-"""
+"""The base classes of discrete-time dynamics, and the states that they lead to."""
 
 import abc
 from typing import Any, ClassVar, TYPE_CHECKING
@@ -22,9 +19,17 @@ from ..systems import AbstractPlant, AbstractSystem
 
 
 class AbstractDynamics(AbstractPlant):
-    """Dynamics in discrete time, `x_next = F(t, x, u, w)` over a step of `dt`.
+    r"""Dynamics in discrete time, $x_{k+1} = F(t_k, x_k, u_k, w_k)$.
 
-    Subclasses give `dt`, the names of states and controls, and `advance`.
+    Environments, planners and controllers step such dynamics. Subclass it, give `dt`
+    and the names of states and controls, and write `advance`.
+
+    **Attributes:**
+
+    - `dt`: the step, in units of time, a scalar.
+
+    **Raises:** `ValueError` at construction if `dt` is not a positive number, or if a
+    [`delucax.parameter`][] is not finite or violates its constraint.
 
     !!! example
 
@@ -34,6 +39,10 @@ class AbstractDynamics(AbstractPlant):
 
         dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         dynamics(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1))
+        ```
+
+        ```text
+        Array([0.102, 0.075], dtype=float32)
         ```
     """
 
@@ -48,9 +57,9 @@ class AbstractDynamics(AbstractPlant):
 
     @property
     def increments(self) -> int:
-        """How many Brownian increments of equal variance `w` holds one after the other,
-        each of `disturbance_size / increments` entries; by default 1 if `noise` is
-        `"brownian"`, else 0.
+        """The number of Brownian increments that `w` holds, one after the other, all of
+        the same variance. Each has `disturbance_size / increments` entries. By default
+        1 if `noise` is `"brownian"`, else 0.
         """
         return 1 if self.noise == "brownian" else 0
 
@@ -60,18 +69,19 @@ class AbstractDynamics(AbstractPlant):
     ) -> tuple[Array, Result]:
         """One step and its status.
 
-        `result` is that of the solver alone. The numbers are not checked: from NaN, or
-        from a finite state so large that it overflows, `x_next` is not finite although
+        `result` is the status of the solver alone. `x_next` is not checked: if the
+        state is NaN, or so large that it overflows, `x_next` is not finite although
         `result` is a success. [`delucax.rollout`][] checks for that.
 
         **Arguments:**
 
-        - `t`: time at the start of the step.
+        - `t`: time at the start of the step, a scalar.
         - `x`: state, shape `(state_size,)`.
         - `u`: control, shape `(control_size,)`, held over the step.
         - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
 
-        **Returns:** `(x_next, result)`, the latter one of `delucax.RESULTS`.
+        **Returns:** `(x_next, result)`: the next state, shape `(state_size,)`, and one
+        of `delucax.RESULTS`.
         """
 
     @property
@@ -82,31 +92,35 @@ class AbstractDynamics(AbstractPlant):
     def advance_with_events(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result, Any]:
-        """As `advance`, with the events of the step.
+        """One step, its status and its events.
 
-        A wrapper of dynamics that have `event_names` writes it beside `advance`.
+        If you wrap dynamics that have events, write it besides `advance`.
 
-        **Arguments:** `t`, `x`, `u`, `w`: as `advance`.
+        **Arguments:** `t`, `x`, `u`, `w`: as in `advance`.
 
-        **Returns:** `(x_next, result, events)`, the latter
-        [`delucax.dynamics.Events`][], or `None` without events.
+        **Returns:** `(x_next, result, events)`: as in `advance`, and
+        [`delucax.dynamics.Events`][], or `None` for dynamics without events.
+
+        **Raises:** `ValueError` if the dynamics have events and do not write it.
         """
         if self.event_names:
             raise ValueError(
-                f"{type(self).__name__}: events are reported by advance_with_events, "
-                "which it does not define."
+                f"{type(self).__name__}: advance_with_events must be defined for "
+                "dynamics with events. Write it besides advance."
             )
         return *self.advance(t, x, u, w), None
 
     def describe_fault(
         self, times: Array, states: Array, controls: Array, w: Array | None
     ) -> str:
-        """Where steps of a hybrid system fail, for the message of an error.
+        """A sentence that says where a step of a hybrid system failed, for an error
+        message.
 
         **Arguments:** `times`, `states`, `controls`, `w`: those at the start of each
-            step.
+            step, with a leading axis over the steps; `w` may be `None`.
 
-        **Returns:** a sentence about the first step that fails; empty if none does.
+        **Returns:** the sentence about the first step that failed; an empty string if
+        none did.
         """
         _, results, events = _each_step(self, times, states, controls, w)
         bad = np.asarray(results != RESULTS.successful)
@@ -124,7 +138,8 @@ class AbstractDynamics(AbstractPlant):
     ) -> Array:
         """The next state.
 
-        **Arguments:** as `advance`; shapes are checked.
+        **Arguments:** `t`, `x`, `u`, `w`: as in `advance`, with `w` zero by default.
+            Shapes are checked.
 
         **Returns:** `x_next`, shape `(state_size,)`.
 
@@ -137,7 +152,7 @@ class AbstractDynamics(AbstractPlant):
         if w is not None:
             w = as_vector(w, self.disturbance_size, "w (the disturbance)", where)
         x_next, result = self.advance(t, x, u, w)
-        # Explicit steps cannot fail, and their programs carry no check.
+        # Explicit steps cannot fail, so their programs need no check.
         if result is RESULTS.successful:
             return x_next
         return result.error_if(x_next, result != RESULTS.successful)
@@ -150,9 +165,12 @@ def open_loop(
     w: Numbers | None = None,
     t0: RealScalar = 0.0,
 ) -> Array:
-    """The states that given controls lead to, for planning and identification.
+    r"""The trajectory of states under given controls, without feedback.
 
-    `x_{k+1} = F(t0 + k dt, x_k, u_k, w_k)`.
+    $$x_{k+1} = F(t_0 + k\, \Delta t, x_k, u_k, w_k)$$
+
+    Use it for planning and identification. It is already compiled: call it directly. It
+    is differentiable with respect to every array.
 
     **Arguments:**
 
@@ -160,10 +178,9 @@ def open_loop(
     - `x0`: the first state, shape `(n,)`.
     - `controls`: shape `(T, m)`.
     - `w`: disturbances, shape `(T, k)`; zero by default.
-    - `t0`: the time of the first state, 0 by default.
+    - `t0`: the time of the first state, in units of time; 0 by default.
 
-    **Returns:** the states, shape `(T + 1, n)`. Already compiled; differentiable
-    with respect to every array.
+    **Returns:** the states, shape `(T + 1, n)`.
 
     **Raises:** `ValueError` on a wrong shape, and an error at run time if the solver
     fails or a state becomes NaN or infinite.
@@ -176,6 +193,11 @@ def open_loop(
 
         dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         states = dlx.open_loop(dynamics, jnp.zeros(2), 0.1 * jnp.ones((20, 1)))
+        states.shape, states[-1]
+        ```
+
+        ```text
+        ((21, 2), Array([0.459, 1.84 ], dtype=float32))
         ```
     """
     where = "open_loop"
@@ -197,7 +219,7 @@ def _each_step(dynamics, times, states, controls, w):
 def _open_loop(dynamics, x0, controls, w, t0):
     size = x0.shape[0]
 
-    # The gradient stores the states alone, and computes each step again.
+    # The gradient then stores only the states, and computes each step again.
     @jax.checkpoint
     @by_components
     def body(parts, inputs):
@@ -209,7 +231,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
     steps = jnp.arange(controls.shape[0])
     last, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
     states = stack_steps(parts, size, last)
-    # NaN propagates, so the last state tells of all.
+    # NaN propagates, so it is enough to check the last state.
     finite = jnp.all(jnp.isfinite(states[-1]))
     end = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)
@@ -219,7 +241,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
 def _forwarded(name: str) -> Any:
     """A property of the wrapped plant."""
     return property(
-        lambda self: getattr(self._inside, name), doc="That of the wrapped plant."
+        lambda self: getattr(self._inside, name), doc="As in the wrapped plant."
     )
 
 
@@ -230,7 +252,9 @@ def _forwarded_units(what: str) -> Any:
         same = getattr(self, f"{what}_names") == getattr(self._inside, f"{what}_names")
         return getattr(self._inside, f"{what}_units") if same else ()
 
-    return property(units, doc="Those of the wrapped plant if the names are, else ().")
+    return property(
+        units, doc="As in the wrapped plant if the names are the same, else ()."
+    )
 
 
 class Forwarding(AbstractDynamics):
@@ -252,14 +276,14 @@ class Forwarding(AbstractDynamics):
 
     @property
     def event_names(self) -> tuple[str, ...]:
-        """Those of the wrapped plant."""
+        """The event names of the wrapped plant."""
         return tuple(getattr(self._inside, "event_names", ()))
 
     @property
     def observes_state(self) -> bool:
         """Whether `observe` returns the state itself."""
-        # A sensor of the wrapper's own is traced; else the wrapped plant is asked,
-        # which may know without tracing.
+        # The sensor is traced only if the wrapper overrides it. The wrapped plant may
+        # know without tracing.
         own = type(self).observe is not Forwarding.observe
         if own or self.state_size != self._inside.state_size:
             return super().observes_state
@@ -276,12 +300,12 @@ class Forwarding(AbstractDynamics):
 
 
 class AbstractDiscretization(Forwarding):
-    """Dynamics that step a continuous-time system, in a field `system`, whose names,
-    units, sensor and equilibrium they have.
+    """Dynamics that step a continuous-time system, in a field `system`. Names, units,
+    sensor and equilibrium are those of the system.
 
-    A subclass gives `dt` and writes `advance`, whose `w` enters as the `noise` of the
-    system says. [`delucax.Discretized`][] is the one that takes any system and any
-    solver.
+    Subclass it, declare the fields `system` and `dt`, and write `advance`. There, `w`
+    has to act as the `noise` of the system says. You rarely need to:
+    [`delucax.Discretized`][] takes any system and any solver.
 
     !!! example
 
@@ -306,6 +330,10 @@ class AbstractDiscretization(Forwarding):
 
         Euler(dlx.systems.Pendulum())(0.0, jnp.array([0.1, 0.0]), jnp.ones(1))
         ```
+
+        ```text
+        Array([0.1  , 0.225], dtype=float32)
+        ```
     """
 
     if TYPE_CHECKING:  # as in AbstractPlant
@@ -319,11 +347,15 @@ class AbstractDiscretization(Forwarding):
 
 
 class AbstractWrapper(Forwarding):
-    """A wrapper around a field `dynamics`, to which everything is forwarded that a
-    subclass does not override.
+    """Dynamics around other dynamics. It forwards everything that a subclass does not
+    override to the wrapped dynamics, in a field `dynamics`.
 
-    A subclass writes `advance`. One whose state has more entries also gives
-    `state_names`, `observe`, `difference` and `equilibrium`.
+    Subclass it, declare the field `dynamics`, and write `advance`. If the wrapper adds
+    entries to the state, also give `state_names`, `observe`, `difference` and
+    `equilibrium`.
+
+    **Raises:** `ValueError` at construction if `dynamics` is not an
+    [`delucax.AbstractDynamics`][].
 
     !!! example
 
@@ -340,6 +372,10 @@ class AbstractWrapper(Forwarding):
 
         pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         Slippery(pendulum)(0.0, jnp.array([0.1, 0.0]), jnp.ones(1))
+        ```
+
+        ```text
+        Array([0.105, 0.196], dtype=float32)
         ```
     """
 

@@ -1,4 +1,4 @@
-"""Conversion of linear systems to their sampled form and back: c2d and d2c."""
+"""Conversion of linear systems from continuous to discrete time and back."""
 
 from typing import Any, TypeAlias
 
@@ -22,25 +22,33 @@ _METHODS = "zoh", "tustin"
 
 
 def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynamics:
-    """The sampled form of a continuous linear system.
+    r"""Convert a linear system from continuous to discrete time.
 
-    `"zoh"`, exact for a control held over the step, by one matrix exponential:
-    `A_d = exp(A dt)`, `B_d = (integral over [0, dt] of exp(A s) ds) B`.
-    `"tustin"`, the trapezoidal rule under a held control:
-    `A_d = (I - A dt/2)^-1 (I + A dt/2)`, `B_d = (I - A dt/2)^-1 B dt`.
+    `"zoh"` is exact for a control that is held over the step (zero-order hold). It
+    takes one matrix exponential:
+
+    $$A_d = e^{A \Delta t}, \qquad
+    B_d = \int_0^{\Delta t} e^{A s}\, \mathrm{d}s\; B$$
+
+    `"tustin"` is the trapezoidal rule, also with a held control:
+
+    $$A_d = \left(I - \tfrac{\Delta t}{2} A\right)^{-1}
+    \left(I + \tfrac{\Delta t}{2} A\right), \qquad
+    B_d = \left(I - \tfrac{\Delta t}{2} A\right)^{-1} B\, \Delta t$$
+
+    A disturbance that enters the vector field is held too.
 
     **Arguments:**
 
-    - `system`: the linear system (from [`delucax.linearize`][], for instance).
-    - `dt`: the step, a positive number.
+    - `system`: a [`delucax.systems.LinearSystem`][]. [`delucax.linearize`][] makes one.
+    - `dt`: the step $\Delta t$, in units of time, a positive number.
     - `method`: `"zoh"` (default) or `"tustin"`.
 
-    **Returns:** [`delucax.LinearDynamics`][] about the same operating point. A
-    disturbance that enters the vector field is held too.
+    **Returns:** [`delucax.LinearDynamics`][] about the same operating point.
 
     **Raises:** `ValueError` if `system` is not a `LinearSystem`, `dt` is not positive,
-    or `method` is unknown; for `"tustin"` `RuntimeError` (an error at run time under
-    `jax.jit`) if `2/dt` is an eigenvalue of `A`.
+    or `method` is unknown. For `"tustin"`, `RuntimeError` (an error at run time under
+    `jax.jit`) if $2 / \Delta t$ is an eigenvalue of $A$.
 
     Source: Van Loan, 1978 (`"zoh"`); Tustin, 1947.
 
@@ -52,39 +60,52 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
         upright = dlx.linearize(dlx.systems.Pendulum())
         dlx.c2d(upright, dt=0.05).A
         ```
+
+        ```text
+        Array([[1.019, 0.05 ],
+               [0.755, 1.019]], dtype=float32)
+        ```
     """
     check_instance(system, LinearSystem, "system", "c2d")
     check_step(dt, "c2d")
     check_choice(method, _METHODS, "method", "c2d")
     (A, B, E, x_next), failed = _sampled(system, dt, method)
-    A = raise_if(failed, A, "c2d: A has the eigenvalue 2/dt, where there is no rule.")
+    words = "c2d: A must not have the eigenvalue 2/dt, where Tustin's rule is singular."
+    A = raise_if(failed, A, words)
     about = _operating_point(system)
     return LinearDynamics(A, B, system.C, E, dt, x_next=x_next, **about)
 
 
 def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
-    """The continuous linear system of which `dynamics` is the sampled form.
+    r"""Convert a linear system from discrete to continuous time: the inverse of
+    [`delucax.c2d`][].
 
-    The inverse of [`delucax.c2d`][]: `"zoh"`, exact for a control held over the step,
-    by one matrix logarithm, `A = log(A_d) / dt`,
-    `B = (integral over [0, dt] of exp(A s) ds)^-1 B_d`.
-    `"tustin"`, `A = (2/dt) (A_d + I)^-1 (A_d - I)`, `B = (2/dt) (A_d + I)^-1 B_d`.
+    `"zoh"` is exact for a control that is held over the step. It takes one matrix
+    logarithm:
 
-    Of all systems with these samples `"zoh"` takes the one whose frequencies are below
-    `pi/dt`. Differentiable to any order, in either mode.
+    $$A = \frac{\log A_d}{\Delta t}, \qquad
+    B = \left(\int_0^{\Delta t} e^{A s}\, \mathrm{d}s\right)^{-1} B_d$$
+
+    `"tustin"` inverts the trapezoidal rule:
+
+    $$A = \tfrac{2}{\Delta t} (A_d + I)^{-1} (A_d - I), \qquad
+    B = \tfrac{2}{\Delta t} (A_d + I)^{-1} B_d$$
+
+    Several continuous-time systems have the same samples. `"zoh"` returns the one whose
+    frequencies are below $\pi / \Delta t$. The result is differentiable to any order,
+    in forward and reverse mode.
 
     **Arguments:**
 
-    - `dynamics`: time-invariant linear dynamics.
+    - `dynamics`: time-invariant [`delucax.LinearDynamics`][].
     - `method`: `"zoh"` (default) or `"tustin"`.
 
-    **Returns:** [`delucax.systems.LinearSystem`][] about the same operating point.
+    **Returns:** a [`delucax.systems.LinearSystem`][] about the same operating point.
 
-    **Raises:** `ValueError` if `dynamics` is not `LinearDynamics`, is time-varying, or
-    `method` is unknown. If there is no such system, `RuntimeError` (an error at run
-    time under `jax.jit`): for `"zoh"` if `A_d` has an eigenvalue that is zero or
-    negative, which sampled real systems have in pairs alone; for `"tustin"` if it has
-    the eigenvalue -1.
+    **Raises:** `ValueError` if `dynamics` is not `LinearDynamics` or is time-varying,
+    or `method` is unknown. `RuntimeError` (an error at run time under `jax.jit`) if no
+    such system exists: for `"zoh"` if $A_d$ has an eigenvalue that is zero or negative,
+    for `"tustin"` if it has the eigenvalue -1.
 
     Source: Cheng, Higham, Kenney and Laub, 2001 (the logarithm by square roots).
 
@@ -96,6 +117,11 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
         upright = dlx.linearize(dlx.make("pendulum").dynamics)
         dlx.d2c(upright).A
         ```
+
+        ```text
+        Array([[ 0.373,  0.994],
+               [14.907, -0.373]], dtype=float32)
+        ```
     """
     hint = " (see `delucax.linearize`)"
     check_instance(dynamics, LinearDynamics, "dynamics", "d2c", hint)
@@ -103,20 +129,21 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     check_choice(method, _METHODS, "method", "d2c")
     (A, B, E, drift), failed = _held(dynamics, method)
     _, distance, rule = _INVERSES[method]
-    # Of numbers that are known the eigenvalue at fault can be named.
+    # The message can name the eigenvalue only if the numbers are known.
     if not is_concrete(failed):
         A = eqx.error_if(A, failed, f"d2c: {rule}.")
     elif failed:
         values = np.linalg.eigvals(np.asarray(dynamics.A, np.float64))
         worst = values[np.argmin(distance(values))]
         shown = worst.real if worst.imag == 0 else worst
-        raise RuntimeError(f"d2c: {rule}; got {shown:.6g}.")
+        raise RuntimeError(f"d2c: {rule}, got {shown:.6g}.")
     about = _operating_point(dynamics)
     return LinearSystem(A, B, dynamics.C, E, dx_ref=drift, **about)
 
 
 def _inputs(model: LinearSystem | LinearDynamics, drift: Vector) -> Matrix:
-    """The input matrices side by side: of the control, a constant, the disturbance."""
+    """The input matrices of the control, of a constant and of the disturbance, side by
+    side."""
     columns = [model.B, drift[:, None], *([] if model.E is None else [model.E])]
     return xp.concatenate(columns, axis=1)
 
@@ -143,8 +170,8 @@ _Matrices: TypeAlias = tuple[Matrix, Matrix, Matrix | None, Vector]
 def _sampled(
     system: LinearSystem, dt: Any, method: str
 ) -> tuple[_Matrices, BoolScalar]:
-    """The matrices of `c2d`, the state after the one at the operating point, and
-    whether there is none."""
+    """The matrices of `c2d`, with the next state at the operating point, and whether
+    the conversion failed."""
     n, inputs = system.state_size, _inputs(system, system.dx_ref)
     dt = xp.asarray(dt, inputs.dtype)
     if method == "zoh":
@@ -169,9 +196,10 @@ def _sampled(
 @compiled_unless_on_host
 @full_precision
 def _held(dynamics: LinearDynamics, method: str) -> tuple[_Matrices, BoolScalar]:
-    """The matrices of `d2c`, the rate of change at the operating point, and whether
-    there are none."""
-    # Control, constant and disturbance are converted alike, as columns of one matrix.
+    """The matrices of `d2c`, with the rate of change at the operating point, and
+    whether the conversion failed."""
+    # Control, constant and disturbance are converted together, as columns of one
+    # matrix.
     inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
     A, inputs, failed = _INVERSES[method][0](dynamics.A, inputs, dynamics.dt)
     B, drift, E = _parts(inputs, dynamics)
@@ -181,7 +209,7 @@ def _held(dynamics: LinearDynamics, method: str) -> tuple[_Matrices, BoolScalar]
 def _from_hold(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
     n = A.shape[0]
     log, failed = logarithm(A)
-    # The integral of the exponential is one block of an exponential.
+    # The integral of the exponential is a block of the exponential of this matrix.
     eye, zero = xp.eye(n, dtype=A.dtype), xp.zeros_like(A)
     block = xp.block([[log, eye], [zero, zero]])
     held = exponential_less_one(block)[:n, n:]
@@ -191,7 +219,7 @@ def _from_hold(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array
 def _from_trapezium(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
     n = A.shape[0]
     eye = xp.eye(n, dtype=A.dtype)
-    # The least singular value, because rounding hides how near -1 an eigenvalue is.
+    # By the least singular value, because the eigenvalues themselves are rounded.
     sizes = xp.linalg.svd(stop_gradient(A + eye), compute_uv=False)
     failed = ~(sizes[-1] > n * xp.finfo(A.dtype).eps * sizes[0])
     matrix = xp.where(failed, eye, A + eye)
@@ -202,16 +230,16 @@ def _from_trapezium(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, 
 _INVERSES = {
     "zoh": (
         _from_hold,
-        # To the half-line of negative numbers.
+        # The distance to the half-line of negative numbers.
         lambda z: np.where(z.real > 0, np.abs(z), np.abs(z.imag)),
-        "A has an eigenvalue that is zero or negative (or next to it), so that no real "
-        "system has these samples under a held control",
+        "A must not have an eigenvalue that is zero or negative (up to rounding), "
+        "because no real system has these samples under a held control",
     ),
     "tustin": (
         _from_trapezium,
         lambda z: np.abs(z + 1),
-        "A has the eigenvalue -1, which the trapezoidal rule never gives",
+        "A must not have the eigenvalue -1, which the trapezoidal rule never gives",
     ),
 }
-"""The inverse of each method, how far eigenvalues are from those that it cannot have,
-and which these are."""
+"""For each method: its inverse, the distance of an eigenvalue from those that it cannot
+have, and the message about these."""

@@ -1,4 +1,4 @@
-"""Dynamics whose controls and observations arrive late."""
+"""Dynamics with delayed controls and observations."""
 
 import abc
 import math
@@ -17,19 +17,18 @@ from ._base import AbstractDiscretization, AbstractDynamics, AbstractWrapper
 
 
 _SLACK = 8
-"""In units of rounding, relative."""
+"""The relative error of a delay that counts as rounding, in units of eps."""
 
 
 class _AbstractDelay(AbstractWrapper):
-    """Dynamics whose state has pending controls and observations at its end,
-
+    """Dynamics whose state ends with the pending controls and observations,
     `(x, u[k - 1], ..., u[k - c], y[k - 1], ..., y[k - s])`, the newest first.
     """
 
     @property
     @abc.abstractmethod
     def _kept(self) -> tuple[int, int]:
-        """How many controls and observations are kept, `(c, s)`."""
+        """The numbers `(c, s)` of controls and observations that the state keeps."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -55,24 +54,24 @@ class _AbstractDelay(AbstractWrapper):
         return x[:n], x[n:m], x[m:]
 
     def inner(self, x: Array) -> Array:
-        """The plant's own state.
+        """The state of the plant inside.
 
-        **Arguments:** `x`: the state.
+        **Arguments:** `x`: the state of the delayed dynamics, shape `(state_size,)`.
 
-        **Returns:** its first entries.
+        **Returns:** its first entries, shape `(n,)`.
         """
         return self._cut(x)[0]
 
     def filled(self, x: Numbers, u: Numbers | None = None) -> Array:
-        """The state of a plant that has rested.
+        """The state after a past in which nothing changed. Use it as a first state.
 
         **Arguments:**
 
-        - `x`: the plant's own state.
-        - `u`: the pending control, zero by default.
+        - `x`: the state of the plant inside, shape `(n,)`.
+        - `u`: the control in the past, shape `(m,)`; zero by default.
 
-        **Returns:** the state, in which every pending control is `u` and every pending
-        observation that of `x`.
+        **Returns:** the state of the delayed dynamics, shape `(state_size,)`. Every
+        pending control is `u`, and every pending observation is that of `x`.
 
         **Raises:** `ValueError` on a wrong shape.
         """
@@ -90,11 +89,11 @@ class _AbstractDelay(AbstractWrapper):
 
     @property
     def observes_state(self) -> bool:
-        """True if nothing is kept and the plant observes its state."""
+        """Whether nothing is delayed and the plant inside observes its state."""
         return not any(self._kept) and self.dynamics.observes_state
 
     def difference(self, x: State, x_ref: State) -> State:
-        # Angles wrap in the plant's own state alone.
+        # Only the plant's own state has angles to wrap.
         n = self.dynamics.state_size
         own = self.dynamics.difference(x[:n], x_ref[:n])
         return jnp.concatenate([own, x[n:] - x_ref[n:]])
@@ -105,20 +104,20 @@ class _AbstractDelay(AbstractWrapper):
 
 
 class Delayed(_AbstractDelay):
-    """Dynamics with an input delay, an output delay or both, in whole steps,
+    r"""Dynamics with an input delay, an output delay or both, in whole steps.
 
-    `x_next = F(t, x, u[k - controls], w)`, `y = observe(t, x)[k - sensor]`.
+    $$x_{k+1} = F(t_k, x_k, u_{k-c}, w_k), \qquad y_k = h(t_{k-s}, x_{k-s})$$
 
-    Pending controls and observations are part of the state: `(x, u[k - 1], ...,
-    u[k - controls], y[k - 1], ..., y[k - sensor])`. It is a true transport delay,
-    differentiable like any other state. [`delucax.dynamics.TransportDelay`][] takes any
-    time in place of whole steps.
+    The state holds the pending controls and observations after the state of the plant:
+    $(x_k, u_{k-1}, \dots, u_{k-c}, y_{k-1}, \dots, y_{k-s})$. This is a true transport
+    delay, not an approximation, and differentiable like any other state. For delays
+    that are no whole number of steps, use [`delucax.dynamics.TransportDelay`][].
 
     **Arguments:**
 
-    - `dynamics`: the plant.
-    - `controls`: steps until a control acts, 0 by default.
-    - `sensor`: steps until an observation is read, 0 by default.
+    - `dynamics`: the plant, an [`delucax.AbstractDynamics`][].
+    - `controls`: $c$, the delay of the controls in steps, 0 by default.
+    - `sensor`: $s$, the delay of the observations in steps, 0 by default.
 
     **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or a delay is
     not a whole number of at least 0.
@@ -132,7 +131,14 @@ class Delayed(_AbstractDelay):
         plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         late = dlx.dynamics.Delayed(plant, controls=2)
         x0 = late.filled(jnp.array([0.1, 0.0]))
-        dlx.open_loop(late, x0, jnp.ones((5, 1)))
+        dlx.open_loop(late, x0, jnp.ones((3, 1)))
+        ```
+
+        ```text
+        Array([[0.1  , 0.   , 0.   , 0.   ],
+               [0.102, 0.075, 1.   , 0.   ],
+               [0.108, 0.154, 1.   , 1.   ],
+               [0.121, 0.388, 1.   , 1.   ]], dtype=float32)
         ```
     """
 
@@ -161,8 +167,8 @@ class Delayed(_AbstractDelay):
     def _advance(self, advance, t, x, u, w):
         own, controls, observed = self._cut(x)
         acting, late = u, []
-        # The newest comes first, and the oldest acts, or is read. Slices of no entries
-        # are left out, so that the state stays one of components.
+        # The newest comes first; the oldest acts, or is read. Empty slices are left
+        # out, so that the state is still split into components.
         if self.controls:
             m = u.shape[0]
             acting = controls[-m:]
@@ -183,36 +189,37 @@ class Delayed(_AbstractDelay):
 
 
 class TransportDelay(_AbstractDelay):
-    r"""A plant in continuous time whose controls act late, whose sensor is read late,
-    or both, by times that need not be multiples of `dt`,
+    r"""Dynamics with an input delay, an output delay or both, of any length. The delays
+    need not be multiples of `dt`.
 
-    `dx/dt = f(t, x, u(t - controls), w)`, `y(t) = observe(x(t - sensor))`,
+    $$\dot x = f(t, x, u(t - \tau_u), w), \qquad y(t) = h(t - \tau_y, x(t - \tau_y))$$
 
-    where `u` is held over each interval. So an interval begins with the control of one
-    interval and goes on with that of the next: it is integrated in two parts, which is
-    exact. Where the sensor is late, the part up to what it will read is integrated once
-    more.
+    The control is held over each control interval, so the delayed control switches once
+    within an interval. The interval is therefore integrated in two parts, which is
+    exact. If the sensor is late, the part up to the time that it reads is integrated
+    once more.
 
-    The state is `(x, u[k - 1], ..., y[k - 1], ...)`: pending controls, and what the
-    sensor read in the intervals before, the newest first. `filled` makes one.
-    Disturbances enter as in the plant; those that are added to its next state are added
-    at the end of the interval.
+    The state is $(x_k, u_{k-1}, \dots, y_{k-1}, \dots)$: the state of the plant, the
+    pending controls and the earlier readings of the sensor, the newest first. `filled`
+    makes one. Disturbances act as in the plant; additive ones are added at the end of
+    the interval.
 
-    The delays are differentiable, to the right where one is a whole number of steps.
-    How many controls and readings are kept is fixed when the dynamics are made. A delay
-    that is changed later, such as in `delucax.training.fit`, must stay within this
-    memory: the status is `delay_beyond_memory` if it does not.
+    The delays are differentiable. Where a delay is a whole number of steps, the
+    derivative is the one to the right. The number of controls and readings in the state
+    is fixed at construction. If you change a delay later, as `delucax.training.fit`
+    may, it must stay within this memory; otherwise the status is
+    `delay_beyond_memory`.
 
     **Arguments:**
 
     - `dynamics`: the plant, such as a [`delucax.Discretized`][], without a diffusion.
-    - `controls`: the time until a control acts, 0 by default.
-    - `sensor`: the age of what the sensor reads, 0 by default.
-    - `control_memory`, `sensor_memory`: the longest delay that can be set later, in
-        steps; as many as the delays need by default.
+    - `controls`: $\tau_u$, the delay of the controls, in units of time; 0 by default.
+    - `sensor`: $\tau_y$, the delay of the sensor, in units of time; 0 by default.
+    - `control_memory`, `sensor_memory`: the longest delays that you may set later, in
+        steps; by default as long as the given delays need.
 
-    **Raises:** `ValueError` if `dynamics` is no discretisation of a system or has a
-    diffusion, or a delay is negative, not finite, or longer than its memory.
+    **Raises:** `ValueError` if `dynamics` is not the discretisation of a system or has
+    a diffusion, or a delay is negative, not finite, or longer than its memory.
 
     Source: Åström and Wittenmark, 1997, section 2.3.
 
@@ -225,7 +232,12 @@ class TransportDelay(_AbstractDelay):
         plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         late = dlx.dynamics.TransportDelay(plant, controls=0.07, sensor=0.01)
         x0 = late.filled(jnp.array([0.1, 0.0]))
-        dlx.open_loop(late, x0, jnp.ones((5, 1)))
+        states = dlx.open_loop(late, x0, jnp.ones((3, 1)))
+        states.shape, states[-1, :2]
+        ```
+
+        ```text
+        ((4, 8), Array([0.127, 0.481], dtype=float32))
         ```
     """
 
@@ -250,23 +262,24 @@ class TransportDelay(_AbstractDelay):
             if memory is None:
                 if not known:
                     raise ValueError(
-                        f"{where}: {kind}_memory must be given where {name} or dt is "
-                        "not known in advance."
+                        f"{where}: {kind}_memory must be given if {name} or dt is "
+                        "traced by JAX."
                     )
                 memory = math.ceil(steps * slack)
             memory = check_count(memory, f"{kind}_memory", where, least=0)
             if steps * slack > memory:
                 raise ValueError(
-                    f"{where}: {name} must be within the memory of {memory} steps of "
-                    f"{self.dynamics.dt}, got {delay}."
+                    f"{where}: {name} must be at most {memory} steps of "
+                    f"{self.dynamics.dt}, got {delay}. For a longer delay, raise "
+                    f"{kind}_memory."
                 )
             setattr(self, f"{kind}_memory", memory)
 
     def __check_init__(self):
         if self.dynamics.noise == "brownian":
             raise ValueError(
-                "TransportDelay: dynamics must have no diffusion: the parts of an "
-                "interval would need increments of their own."
+                "TransportDelay: dynamics must have no diffusion, because an interval "
+                "is cut in parts, and each would need increments of its own."
             )
 
     @property
@@ -277,11 +290,11 @@ class TransportDelay(_AbstractDelay):
     def _in_steps(self, delay: Array) -> tuple[Array, Array]:
         """The whole steps of a delay, and the rest as a fraction of a step."""
         steps = delay / self.dynamics.dt
-        # A quotient that should be whole may be rounded.
+        # The slack absorbs the rounding of a quotient that should be whole.
         slack = _SLACK * float(jnp.finfo(float).eps) * steps
         whole = jnp.floor(steps + slack)
         rest = steps - whole
-        # Zero, with the derivative of the delay.
+        # A rest of zero keeps the derivative of the delay.
         return whole, jnp.where(rest < slack, rest - lax.stop_gradient(rest), rest)
 
     def _is_beyond(self, delay: Array, memory: int) -> Array:
@@ -289,7 +302,8 @@ class TransportDelay(_AbstractDelay):
         return (whole < 0) | (whole + (rest > 0) > memory)
 
     def _part(self, recorded: bool, t, x, u, w, h) -> tuple[Array, Result, Any]:
-        """A part `h` of an interval: the state after it, the status and the events."""
+        """A step over the part `h` of an interval: the state after it, the status and
+        the events."""
         part = eqx.tree_at(lambda inner: inner.dt, self.dynamics, h)
         if recorded:
             return part.advance_with_events(t, x, u, w)
@@ -317,7 +331,7 @@ class TransportDelay(_AbstractDelay):
             newest = jnp.concatenate([u.astype(x.dtype), pending])
             table, most = newest.reshape(-1, m), self._kept[0]
             whole, rest = self._in_steps(self.controls)
-            # The control of one interval, and then that of the next.
+            # Two controls act in the interval, one after the other.
             index = whole.astype(int)
             first = table[jnp.clip(index + 1, 0, most)]
             second = table[jnp.clip(index, 0, most)]
@@ -332,7 +346,7 @@ class TransportDelay(_AbstractDelay):
             pending = newest[:-m]
         if self._kept[1]:
             _, rest = self._in_steps(self.sensor)
-            # What is read later is the state `rest` steps before the end.
+            # The sensor will read the state `rest` steps before the end.
             at = (1 - rest) * dt
             before = at < switch
             start = jnp.where(before, own, middle)

@@ -1,4 +1,4 @@
-"""A continuous system integrated over one control interval."""
+"""A continuous-time system, integrated over one control interval at a time."""
 
 import dataclasses
 import functools
@@ -20,9 +20,7 @@ from .._integration import (
     RK4,
     runge_kutta_step,
     runge_kutta_step_in_loop,
-    solve_result,
     tableau_of,
-    throwing_adjoint,
     TimeOffset,
 )
 from .._jax import by_components, join_state, operations, split_state
@@ -33,14 +31,14 @@ from ..systems import AbstractHybridSystem, AbstractSystem
 from ._base import AbstractDiscretization
 from ._event_record import Events
 from ._hybrid import ahead_of_steps, HybridFlow, Intervals, Outcome
-from ._solver_steps import apply, BrownianTerm, field, solver_step
+from ._solver_steps import adaptive_solve, apply, BrownianTerm, field, solver_step
 
 
 _LARGE = 64
-"""Operations of a field above which a step to an event has its stages in a loop: there
-are five such steps in a program, and each would repeat them four times."""
-# Euler and ItoMilstein converge to the solution in Itô's sense, the others to that in
-# Stratonovich's: where g depends on x these are different processes.
+"""If a field has more operations than this, steps to an event loop over their stages. A
+program has five such steps, and each would otherwise repeat the field four times."""
+# Euler and ItoMilstein converge to the Itô solution, the others to the Stratonovich
+# solution. These differ if g depends on x.
 _SDE_SOLVERS = (
     diffrax.Euler,
     diffrax.EulerHeun,
@@ -53,75 +51,84 @@ _SDE_SOLVERS = (
 
 
 class Discretized(AbstractDiscretization):
-    r"""Zero-order-hold discretisation: a system is integrated over one control interval
-    with the control held.
+    r"""Discrete-time dynamics of a continuous-time system: each step integrates the
+    system over one control interval, with the control held (zero-order hold).
 
-    `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
-    disturbance that enters the field) held over the interval; then the system's
-    `project`; then, where the system names no disturbances, `+ w`, which may take the
-    state off the manifold of `project` until the next step.
+    $$x_{k+1} = x_k + \int_{t_k}^{t_k + \Delta t} f(s, x(s), u_k, w_k)\, \mathrm{d}s$$
 
-    With a fixed step (the default) `dt` is cut into `substeps` equal steps of `solver`:
-    explicit Runge-Kutta methods are written out stage by stage, diagonally implicit
-    ones take Diffrax `solver.step`s. With a `stepsize_controller` each interval is one
-    `diffrax.diffeqsolve`, whose gradient is taken as `adjoint` says.
+    After the integration, the system's `project` is applied. If the system has
+    `disturbance_names`, `w` enters the field and is held over the interval. If it has
+    none, `w` is added to the projected state, which may move the state off the manifold
+    of `project` until the next step.
 
-    The interval is integrated in its own time, from 0, so that an autonomous step is
-    the same at any `t`. A time-dependent field or diffusion is evaluated at `t + s`.
-    Below double precision that sum is rounded (by up to 5e-4 at 1e4 in float32), and
-    the field is then corrected by its first two derivatives with respect to time along
-    the rounding error. One without a second forward-mode derivative (a
-    `jax.custom_vjp` of time) is evaluated at the rounded time.
+    **Fixed steps** (the default): the interval is cut into `substeps` equal steps of
+    `solver`. Explicit Runge-Kutta methods and diagonally implicit ones work.
 
-    If the system has a `diffusion`, then `w` holds the Brownian increments of the
-    substeps one after the other, each with variance `dt / substeps`, and the solver is
-    one of Euler (Euler-Maruyama, Itô), ItoMilstein, EulerHeun, Heun, Midpoint, Ralston
-    or StratonovichMilstein (all Stratonovich).
+    **Adaptive steps** (with a `stepsize_controller`): each interval is one
+    `diffrax.diffeqsolve`, and `adjoint` decides how its gradient is computed.
 
-    A [`delucax.systems.AbstractHybridSystem`][] is integrated from event to event. A
-    crossing is found by the cubic through a guard and its rate at both ends of each
-    step, so that one there and back within a step is seen, and located on the step
-    itself, taken shorter, to rounding: states have the order of the solver. Up to
-    `max_events` events, and cuts where a guard that is not enabled crosses zero, may
-    fall in an interval. Of guards that cross together the first of `event_names` fires,
-    and the others are judged after its reset. Derivatives are those of the computed
-    trajectory in both modes and of any order: the event's time moves with the state
-    (the saltation matrix); under a batch members without an event are masked. What goes
-    wrong has a status:
+    **Late times:** the interval is integrated in its own time, from 0, so that an
+    autonomous step is the same at any `t`. A time-dependent field or diffusion is
+    evaluated at `t + s`. Below double precision this sum is rounded, by up to 5e-4 at a
+    time of 1e4 in float32. The field is then corrected for the rounding error with its
+    first two derivatives with respect to time. If the second forward-mode derivative
+    does not exist, as for a `jax.custom_vjp` of time, there is no correction.
 
-    - `RESULTS.too_many_events`: the state is held after the last that was handled, as
-        where events accumulate or a reset leaves its guard at zero.
-    - `RESULTS.beyond_guard`: at the start of the interval or after a reset the state is
-        beyond an enabled guard, whose event does not fire until it has come back.
+    **Diffusion:** if the system has a `diffusion`, `w` holds the Brownian increments of
+    all substeps, one after the other, each with the variance `dt / substeps`. Use one
+    of the solvers Euler (Euler-Maruyama) or ItoMilstein for Itô's interpretation, and
+    EulerHeun, Heun, Midpoint, Ralston or StratonovichMilstein for Stratonovich's.
+
+    **Events:** a [`delucax.systems.AbstractHybridSystem`][] is integrated from event to
+    event.
+
+    - *Detection.* A cubic through each guard and its rate at both ends of a step
+        detects crossings, also those that go there and back within the step. The event
+        is then located to rounding by shortening the step, so that states keep the
+        order of the solver.
+    - *Limits.* Up to `max_events` events may fall in one interval. Crossings of guards
+        that are not enabled count too. If several guards cross at once, the event that
+        is first in `event_names` fires; the others are checked after its reset.
+    - *Derivatives* are those of the computed trajectory, in both modes and to any
+        order. The time of an event moves with the state (the saltation matrix).
+
+    If something goes wrong, the status says so:
+
+    - `RESULTS.too_many_events`: events accumulate, or a reset leaves its guard at zero.
+        The state is held after the last event that was handled.
+    - `RESULTS.beyond_guard`: the state is beyond an enabled guard at the start of the
+        interval or after a reset. Its event does not fire until the guard has come
+        back.
     - `RESULTS.grazing`: a guard hardly crosses zero. The state is right, and
-        derivatives are NaN. A guard that is nearer to zero than the cubic's error, and
-        does not cross, may be missed or found.
-    - `RESULTS.unknown_mode`: the mode is not one of the system's.
+        derivatives are NaN. If a guard comes closer to zero than the error of the
+        cubic without crossing, the event may fire or not.
+    - `RESULTS.unknown_mode`: the mode is not one of the system's modes.
 
-    Additive disturbances jump the state at the end of an interval, which may take it
-    beyond a guard: name disturbances to hold them in the field instead. The field must
-    be defined a little beyond a guard.
+    Additive disturbances make the state jump at the end of an interval, possibly beyond
+    a guard. Give the system `disturbance_names` to hold them in the field instead. The
+    field must be defined a little beyond each guard.
 
     **Arguments:**
 
     - `system`: the continuous-time system.
-    - `dt`: the control interval, a positive number (an array leaf: changing it does not
-        compile again).
+    - `dt`: the control interval $\Delta t$, in units of time, a positive number. It is
+        an array leaf, so changing it does not compile again.
     - `solver`: a Diffrax solver; [`delucax.dynamics.RK4`][] by default, and
         `diffrax.Euler` for a system with a diffusion.
-    - `substeps`: solver steps per interval, 1 by default; fixed-step only.
+    - `substeps`: solver steps per interval, 1 by default; for fixed steps only.
     - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
-        `None` for fixed steps.
-    - `adjoint`: any `diffrax.AbstractAdjoint`; `diffrax.RecursiveCheckpointAdjoint()`
-        by default. Needs a `stepsize_controller`: fixed steps are differentiated as
-        they are written. `diffrax.BacksolveAdjoint()` has no gradient with respect to
-        `dt`, and raises if one is asked for.
-    - `max_steps`: the most adaptive steps in an interval, 256 by default.
-    - `max_events`: the most events in an interval, 16 by default; of a hybrid system.
+        `None` (default) for fixed steps.
+    - `adjoint`: any `diffrax.AbstractAdjoint`, for adaptive steps only;
+        `diffrax.RecursiveCheckpointAdjoint()` by default. Fixed steps are
+        differentiated directly. `diffrax.BacksolveAdjoint()` raises if you ask for a
+        gradient with respect to `dt`.
+    - `max_steps`: the largest number of adaptive steps in an interval, 256 by default.
+    - `max_events`: the largest number of events in an interval of a hybrid system, 16
+        by default.
 
     **Raises:** `ValueError` if `dt` is not positive, if `solver` does not fit the
-    system or the kind of step, or if `adjoint` or `max_steps` is given without a
-    `stepsize_controller`, or `max_events` without events.
+    system or the kind of step, if `adjoint` or `max_steps` is given without a
+    `stepsize_controller`, or if `max_events` is given for a system without events.
 
     Source: Hairer, Nørsett and Wanner, 1993; Kidger, 2021 (Diffrax); Aizerman and
     Gantmacher, 1958 (derivatives through events).
@@ -142,6 +149,10 @@ class Discretized(AbstractDiscretization):
             stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-8),
         )
         adaptive(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1))
+        ```
+
+        ```text
+        Array([0.102, 0.075], dtype=float32)
         ```
     """
 
@@ -176,22 +187,22 @@ class Discretized(AbstractDiscretization):
         hybrid = isinstance(system, AbstractHybridSystem)
         if self.max_events is not None and not hybrid:
             raise ValueError(
-                f"{where}: max_events needs a system with events, "
+                f"{where}: max_events needs a system with events, a "
                 f"delucax.systems.AbstractHybridSystem, got {type(system).__name__}."
             )
         if hybrid and isinstance(self.adjoint, diffrax.BacksolveAdjoint):
             raise ValueError(
-                f"{where}: adjoint BacksolveAdjoint does not fit a system with events, "
-                "whose steps are searched for them; use "
-                "diffrax.RecursiveCheckpointAdjoint()."
+                f"{where}: adjoint must not be BacksolveAdjoint for a system with "
+                "events. Use diffrax.RecursiveCheckpointAdjoint()."
             )
         fixed = self.stepsize_controller is None
         if fixed and self.adjoint is not None:
             raise ValueError(
-                f"{where}: adjoint is given without stepsize_controller. Fixed "
-                "steps are differentiated as they are written; give "
-                "stepsize_controller=diffrax.PIDController(rtol=..., atol=...), or "
-                "choose what `rollout` stores with its checkpoint= argument."
+                f"{where}: adjoint needs a stepsize_controller, because fixed steps "
+                "are differentiated directly. Pass "
+                "stepsize_controller=diffrax.PIDController(rtol=..., atol=...). To "
+                "choose what the gradient of a rollout stores, use the argument "
+                "checkpoint= of `rollout`."
             )
         method = solver, self.stepsize_controller, self.substeps, self.max_steps
         check_method(*method, where, with_diffusion=noisy)
@@ -199,20 +210,20 @@ class Discretized(AbstractDiscretization):
             check_kind(self.adjoint, "adjoint", where)
         if noisy and not fixed:
             raise ValueError(
-                f"{where}: stepsize_controller does not fit a system with a "
-                "diffusion, whose Brownian increments are drawn for fixed steps."
+                f"{where}: stepsize_controller must be left out for a system with a "
+                "diffusion, because its Brownian increments are drawn for fixed steps."
             )
         if noisy and not isinstance(solver, _SDE_SOLVERS):
             fitting = ", ".join(s.__name__ for s in _SDE_SOLVERS)
             raise ValueError(
                 f"{where}: solver {type(solver).__name__} does not fit a system "
-                f"with a diffusion; use one of {fitting}."
+                f"with a diffusion. Use one of {fitting}."
             )
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`: that of the system; with a diffusion times the substeps, as
-        `w` holds one increment of each Brownian motion per substep.
+        """The size of `w`: that of the system; with a diffusion, the number of Brownian
+        motions times the substeps.
         """
         return self.system.disturbance_size * (self.increments or 1)
 
@@ -235,7 +246,7 @@ class Discretized(AbstractDiscretization):
         elif increments is not None or self.substeps > 1:
             x_next, result = self._repeat(x, args, increments)
         else:
-            # Few frames lie between this and the field.
+            # Called directly, so that the traceback of an error in the field is short.
             x_next, result = self.flow(args)(0, x, self.dt)
         return self._finished(x, x_next, added), result
 
@@ -250,8 +261,8 @@ class Discretized(AbstractDiscretization):
         return x_next, outcome.result, outcome.events
 
     def _finished(self, x, x_next, added):
-        """The next state from that at the end of the interval."""
-        # Once per interval, not per substep: the field is also defined off the
+        """The next state, from the state at the end of the integration."""
+        # Once per interval, not per substep, because the field is also defined off the
         # manifold.
         x_next = self.system.project(x_next)
         check_returned(x_next, x, self.system, "project")
@@ -262,23 +273,23 @@ class Discretized(AbstractDiscretization):
     def until_event(
         self, t: RealScalar, x: Array, u: Array, w: Array | None, event: int
     ) -> Outcome:
-        """The interval of a system with events, which stops at one of them.
+        """An interval of a system with events, which stops at a given event.
 
-        **Arguments:** `t`, `x`, `u`, `w`: as `advance`. `event`: an index in
+        **Arguments:** `t`, `x`, `u`, `w`: as in `advance`. `event`: an index in
             `event_names`.
 
-        **Returns:** the state at the event or at the end, when that is, and whether it
-        is at the event.
+        **Returns:** the state at the event or at the end of the interval, the time
+        there, and whether it is at the event.
         """
         _, held, _ = self._parts_of(x, w)
         args = self._args(t, x, u, held)
         return self._hybrid(x, args, record=False, until=event)
 
     def _parts_of(self, x, w):
-        """What of `w` is added to the next state, is held in the field, and drives it
-        as increments. A system uses it in one of the three ways."""
+        """`w` as `(added, held, increments)`: added to the next state, held in the
+        field, or as increments of each substep. A system uses one of the three; the
+        others are `None`."""
         noise, given = self.noise, w
-        # Where the system names no disturbances, w is added to the next state.
         if w is None and noise != "additive":
             given = jnp.zeros(self.disturbance_size, x.dtype)
         added = given if noise == "additive" else None
@@ -287,8 +298,8 @@ class Discretized(AbstractDiscretization):
         return added, held, given.reshape(self.substeps, -1) if is_driven else None
 
     def _args(self, t, x, u, held):
-        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
-        # and so would the length of the interval be.
+        # Integrated from 0 to dt, because for a large t the sum t + dt is rounded, and
+        # so would be the length of the interval.
         system, t = self.system, jnp.asarray(t, x.dtype)
         start = TimeOffset(t, lambda t: evaluate_field(system, t, x, u, held))
         return system, start, u, held
@@ -298,7 +309,8 @@ class Discretized(AbstractDiscretization):
         system, start, u, _ = args
         guards = lambda t: jnp.stack(list(system.guards(t, x, u)))
         plant = HybridFlow(self, args, TimeOffset(start.t, guards))
-        # The first step is the one that is taken where nothing happens.
+        # The first step stays written out: it is the one that is taken if no event
+        # happens.
         look_ahead = plant.ahead
         if operations(lambda x: field(jnp.zeros_like(x[0]), x, args), x) > _LARGE:
             plant = dataclasses.replace(plant, in_loop=True)
@@ -309,9 +321,9 @@ class Discretized(AbstractDiscretization):
         return through(x, self.dt, self.substeps, record)
 
     def flow(self, args: Any, in_loop: bool = False) -> Any:
-        """One step of the solver, `(s, x, h) -> (x_next, result)`: of `h` from `x` at
-        `s` after the start of the interval. With `in_loop` its stages are in a
-        loop. `args` are those of the interval."""
+        """One step of the solver, as a function `(s, x, h) -> (x_next, result)`: a step
+        of length `h` from the state `x` at the time `s` after the start of the
+        interval. With `in_loop`, the stages are in a loop. `args` come from `_args`."""
         system, start, u, held = args
         assert self.solver is not None
         tableau = tableau_of(self.solver)
@@ -324,27 +336,27 @@ class Discretized(AbstractDiscretization):
             check_returned(dx, x, system, "vector_field")
             return dx
 
-        # The field itself is in the loop where nothing is to be corrected: fewer frames
-        # lie between it and an error that it raises.
+        # Without a correction the field is called directly, which makes the traceback
+        # of an error in it shorter.
         rhs = (lambda s, x: field(s, x, args)) if start.is_corrected else checked
         method = runge_kutta_step_in_loop if in_loop else runge_kutta_step
         step = functools.partial(method, tableau, rhs)
         return lambda s, x, h: (step(s, x, h), RESULTS.successful)
 
     def _noisy_step(self, x, args):
-        """A substep with an increment of the Brownian motions."""
+        """One substep with an increment of the Brownian motions."""
         system, start, u, _ = args
         h = self.dt / self.substeps
-        # The diffusion may depend on time where the field does not, so it has a check
-        # of its own.
+        # Another TimeOffset, because the diffusion may depend on time where the field
+        # does not.
         start = TimeOffset(start.t, lambda t: system.diffusion(t, x, u))
 
         def g(s, x):
             return start.evaluate(s, lambda t: system.diffusion(t, x, u))
 
         def step(s, x, dB):
-            # Euler and Maruyama's method; Diffrax's takes a term with a path of its
-            # own.
+            # The Euler-Maruyama method by hand, because Diffrax's Euler takes a term
+            # with a path of its own.
             if type(self.solver) is diffrax.Euler:
                 x_next = x + h * field(s, x, args) + apply(g(s, x), dB)
                 return x_next, RESULTS.successful
@@ -354,7 +366,7 @@ class Discretized(AbstractDiscretization):
         return step
 
     def _repeat(self, x, args, increments):
-        """`substeps` steps one after the other, the state carried by its components."""
+        """`substeps` steps one after the other. The state is carried in components."""
         h = self.dt / self.substeps
         if increments is not None:
             step = self._noisy_step(x, args)
@@ -367,45 +379,23 @@ class Discretized(AbstractDiscretization):
         @by_components
         def body(parts, index_and_increment):
             i, increment = index_and_increment
-            # By i h, and no running sum, whose rounding would grow with the substeps.
+            # By i h, because the rounding of a running sum would grow.
             x_next, result = step(i * h, join_state(parts), increment)
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
         xs = jnp.arange(self.substeps), increments
-        # The first failure of a substep is that of the interval.
+        # The interval has the status of the first substep that failed.
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts), first_of(results)
 
     def solve(
         self, s: Array, x: Array, end: Array, args: Any, every_step: bool = False
     ) -> tuple[diffrax.Solution, Result]:
-        """The solve by a step-size controller from `x` at `s` to `end`; its result.
+        """A solve with adaptive steps from `x` at `s` to `end`, and its result.
 
-        Its `ys` are those at the end; with `every_step` also those of all steps.
+        `ys` of the solution holds the state at the end. With `every_step` it also holds
+        the states of all steps.
         """
-        solver, adjoint = self.solver, self.adjoint
-        controller = self.stepsize_controller
-        assert solver is not None and controller is not None and adjoint is not None
-        saved: Any = dict(t1=True)
-        if every_step:
-            steps = diffrax.SubSaveAt(t0=True, steps=True)
-            saved = dict(subs=[diffrax.SubSaveAt(t1=True), steps])
-        # Without `dt0` Diffrax estimates a first step from the field (Hairer, Nørsett
-        # and Wanner, 1993, II.4): the last step of the interval before was cut off at
-        # its end and tells little. Without `throw`, because one member of a batch that
-        # fails must not stop the others.
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
-            solver,
-            s,
-            end,
-            dt0=None,
-            y0=x,
-            args=args,
-            saveat=diffrax.SaveAt(**saved),
-            stepsize_controller=controller,
-            adjoint=throwing_adjoint(adjoint),
-            max_steps=self.max_steps,
-            throw=False,
-        )
-        return solution, solve_result(solution, controller, x.dtype)
+        method: Any = dict(solver=self.solver, max_steps=self.max_steps)
+        method |= dict(stepsize_controller=self.stepsize_controller)
+        return adaptive_solve(s, x, end, args, every_step, self.adjoint, method)

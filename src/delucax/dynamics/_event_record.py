@@ -11,16 +11,18 @@ from jaxtyping import Array
 
 
 class Events(eqx.Module):
-    """The events of an interval, in the order in which they fired.
+    """The events of one control interval, in the order in which they fired.
 
     **Attributes:**
 
-    - `times`: shape `(max_events,)`, NaN behind the last.
-    - `kinds`: indices in `event_names`, shape `(max_events,)`, -1 behind the last.
-    - `before`, `after`: the states of the plant at each, before and after its reset,
-        shape `(max_events, n)`, NaN behind the last.
-    - `fault_time`, `fault_kind`: when and by which guard the interval first failed;
-        NaN and -1 where it did not.
+    - `times`: the time of each event, in units of time, shape `(max_events,)`; NaN
+        after the last event.
+    - `kinds`: which event each is, as an index in `event_names`, shape `(max_events,)`;
+        -1 after the last event.
+    - `before`, `after`: the states of the plant just before and just after each event,
+        shape `(max_events, n)`; NaN after the last event.
+    - `fault_time`, `fault_kind`: when the interval first failed, and by which guard, as
+        an index in `event_names`; NaN and -1 if it did not fail.
 
     !!! example
 
@@ -31,7 +33,13 @@ class Events(eqx.Module):
         dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=1.0)
         falling = 0.0, jnp.array([1.0, 0.0]), jnp.zeros(1), None
         _, _, events = dynamics.advance_with_events(*falling)
-        events.times[:2], events.kinds[:2], events.after[:2]
+        events.times[0], events.kinds[:3], events.after[0]
+        ```
+
+        ```text
+        (Array(0.452, dtype=float32),
+         Array([ 0, -1, -1], dtype=int32, weak_type=True),
+         Array([0.   , 3.544], dtype=float32))
         ```
     """
 
@@ -44,12 +52,12 @@ class Events(eqx.Module):
 
     @classmethod
     def none(cls, max_events: int, x: Array) -> "Events":
-        """No events yet.
+        """A record without events.
 
-        **Arguments:** `max_events`: how many there is room for. `x`: a state of the
-            plant.
+        **Arguments:** `max_events`: the number of events that it has room for. `x`: a
+            state of the plant, shape `(n,)`.
 
-        **Returns:** empty events.
+        **Returns:** the empty record.
         """
         nan, none = jnp.full((), jnp.nan, x.dtype), jnp.asarray(-1)
         states = jnp.full((max_events, x.size), nan)
@@ -57,12 +65,12 @@ class Events(eqx.Module):
         return cls(*rows, states, states, nan, none)
 
     def then(self, later: "Events") -> "Events":
-        """The events of two intervals, one after the other, of which as many are kept
-        as one of them has room for.
+        """The events of two intervals, one after the other. The record keeps its size:
+        events beyond it are dropped.
 
-        **Arguments:** `later`: those of the second.
+        **Arguments:** `later`: the events of the second interval.
 
-        **Returns:** all of them.
+        **Returns:** the joint record.
         """
         count = jnp.sum(self.kinds >= 0)
         behind = jnp.arange(self.kinds.size) - count
@@ -84,12 +92,12 @@ class Events(eqx.Module):
     def noted(
         self, fires: Array, time: Array, kind: Array, before: Array, after: Array
     ) -> "Events":
-        """These and one more.
+        """The record with one more event.
 
-        **Arguments:** `fires`: whether there is one. `time`, `kind`, `before`, `after`:
-            what is known of it.
+        **Arguments:** `fires`: whether there is one; if not, nothing is added. `time`,
+            `kind`, `before`, `after`: the new entries of the attributes.
 
-        **Returns:** all of them.
+        **Returns:** the new record.
         """
         row = jnp.sum(self.kinds >= 0)
         put = lambda a, b: a.at[row].set(jnp.where(fires, b, _blank(a.dtype)))
@@ -102,21 +110,21 @@ class Events(eqx.Module):
         )
 
     def unless(self, over: Array) -> "Events":
-        """These, or none.
+        """The record, emptied if a flag is set.
 
-        **Arguments:** `over`: whether there are none.
+        **Arguments:** `over`: whether to empty it.
 
-        **Returns:** the events.
+        **Returns:** the new record.
         """
         return jax.tree.map(lambda a: jnp.where(over, _blank(a.dtype), a), self)
 
     def with_fault(self, failed: Array, kind: Array, time: Array) -> "Events":
-        """These with the first fault.
+        """The record with a fault.
 
-        **Arguments:** `failed`: whether there is a fault. `kind`, `time`: by which
-            guard and when.
+        **Arguments:** `failed`: whether there is one; if not, nothing changes. `kind`,
+            `time`: its guard and its time.
 
-        **Returns:** the events.
+        **Returns:** the new record.
         """
         time = jnp.where(failed, lax.stop_gradient(time), self.fault_time)
         kind = jnp.where(failed, kind, self.fault_kind).astype(self.kinds.dtype)
@@ -124,6 +132,6 @@ class Events(eqx.Module):
 
 
 def _blank(dtype: DTypeLike) -> Array:
-    """What stands where there is no event: no number, or no kind."""
+    """The entry for no event: NaN, or -1 for integers."""
     is_number = jnp.issubdtype(dtype, jnp.inexact)
     return jnp.asarray(jnp.nan if is_number else -1, dtype)

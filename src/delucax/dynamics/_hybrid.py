@@ -1,4 +1,4 @@
-"""An interval of a hybrid system: steps that stop at events, and the jumps there."""
+"""One interval of a hybrid system: steps up to events, and the jumps at them."""
 
 import functools
 from collections.abc import Callable
@@ -27,15 +27,16 @@ from ._event_record import Events
 
 
 class Ahead(NamedTuple):
-    """What comes next: the first step along which a guard crosses zero, if there is one
-    before the end.
+    """The next step: the first along which a guard crosses zero, if there is one before
+    the end.
 
-    - `s`, `x`: the start of that step.
-    - `step`: its length and where it leads; `None` where it is all that is left.
-    - `x_end`: the state at the end, if nothing happens before it.
-    - `expected`, `beyond`: for each guard, whether it crosses zero in it, and whether
-        it is beyond zero at the start.
-    - `result`: of the solver, up to the end or to that step; `None` if it cannot fail.
+    - `s`, `x`: time and state at the start of the step.
+    - `step`: its length and the state after it; `None` if it goes to the end.
+    - `x_end`: the state at the end, if no event fires before.
+    - `expected`, `beyond`: for each guard, whether it crosses zero in the step, and
+        whether it is beyond zero at the start.
+    - `result`: the status of the solver up to the end or to that step; `None` if it
+        cannot fail.
     """
 
     s: Array
@@ -48,10 +49,10 @@ class Ahead(NamedTuple):
 
 
 class HybridFlow(eqx.Module):
-    """The steps, guards and resets of a hybrid system with a held control.
+    """The steps, guards and resets of a hybrid system under a held control.
 
-    `dynamics` give a step by `flow(args)`, whose `args` are the system, the start, the
-    control and the disturbance that is held.
+    `dynamics.flow(args)` makes the function of one step. `args` holds the system, the
+    start time, the control and the held disturbance.
     """
 
     dynamics: Any
@@ -99,17 +100,18 @@ class HybridFlow(eqx.Module):
         ends = ((s, x), (s + h, x_end))
         (g0, r0), (g1, r1) = (self.look(*end) for end in ends)
         enabled = self.enabled(*ends[0]), self.enabled(*ends[1])
-        # A start within rounding, or within the error of locating the event before, is
-        # on the guard.
+        # A start counts as on the guard if it is within rounding of it, or within the
+        # error of locating the previous event.
         eps = jnp.finfo(x.dtype).eps
-        # Each entry is moved by roundings of its own, so that they do not cancel.
+        # The rounding of a guard is estimated by moving each entry of the state by a
+        # different multiple of eps, so that the effects do not cancel.
         shares = jnp.asarray(1 + np.modf(np.arange(x.size) * 1.618)[0], x.dtype)
         moved = self.args[1].t + s, shares * x
         noise = 32 * eps * jnp.abs(jax.jvp(self.guards, (s, x), moved)[1])
         span = self.dynamics.dt / self.dynamics.substeps
         unit = eps**0.6 * span
         slack = noise + unit * (jnp.abs(r0) + jnp.abs(r1))
-        # Less than what counts at the start of the next step.
+        # Smaller than the slack, so that the next step starts on the guard.
         margin = unit / 2 * jnp.abs(r1)
         values = (g0, r0 * h), (g1, r1 * h)
         zero = slack, margin
@@ -121,7 +123,7 @@ class HybridFlow(eqx.Module):
         return crossings(*values, *zero, *kinds, enabled, long, noise)
 
     def ahead(self, s: Array, x: Array, end: Array) -> Ahead:
-        """What one step to `end` meets."""
+        """The next step, when the whole way to `end` is one step of the solver."""
         h = end - s
         x_end, result = self.step(s, x, h)
         crossing = frozen(self).crossings(*frozen((s, x, h, x_end)))
@@ -130,7 +132,7 @@ class HybridFlow(eqx.Module):
 
 
 def ahead_of_steps(plant: HybridFlow, s: Array, x: Array, end: Array) -> Ahead:
-    """What the steps of a step-size controller meet from `s` to `end`."""
+    """The next step from `s` to `end`, among those of a step-size controller."""
     solution, result = plant.dynamics.solve(s, x, end, plant.args, every_step=True)
     (_, times), (last, states) = solution.ts, solution.ys
     count = solution.stats["num_accepted_steps"]
@@ -143,7 +145,7 @@ def ahead_of_steps(plant: HybridFlow, s: Array, x: Array, end: Array) -> Ahead:
     def look(state):
         i, _, beyond = state
         crossing = crossings(i + 1)
-        # A start beyond a guard is that of the first step.
+        # Only the start of the first step is checked for being beyond a guard.
         return i + 1, crossing.expected, jnp.where(i < 0, crossing.beyond, beyond)
 
     none = jnp.zeros(len(plant.args[0].event_names), bool)
@@ -151,21 +153,21 @@ def ahead_of_steps(plant: HybridFlow, s: Array, x: Array, end: Array) -> Ahead:
     state = jnp.asarray(-1), none, none
     i, expected, beyond = lax.while_loop(more, look, state)
     i = jnp.maximum(i, 0)
-    # What the solver does behind an event is not used.
+    # The solve after the event is not used, and so neither is its status.
     result = choose(any_of(expected), RESULTS.successful, result)
     step = times[i + 1] - times[i], states[i + 1]
     return Ahead(times[i], states[i], step, last[0], expected, beyond, result)
 
 
 def frozen(tree: Any) -> Any:
-    """The same without derivatives, which the search for an event must not have."""
+    """`tree` without derivatives: the search for an event is not differentiated."""
     numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(numbers), rest)
 
 
 class Outcome(NamedTuple):
-    """An interval's end: the state, when it was reached, whether that was before the
-    end, what failed, and the events if they are recorded."""
+    """The end of an interval: the state, its time, whether the interval stopped before
+    its end, the status, and the events if they are recorded."""
 
     x: Array
     s: Array
@@ -175,8 +177,9 @@ class Outcome(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """A run on its way through events: what is ahead and whether that is an event, how
-    many there were, whether it stopped, what failed and what is recorded."""
+    """The progress through an interval: the next step and whether an event is expected
+    in it, the number of events so far, whether the interval stopped, the status and the
+    recorded events."""
 
     ahead: Ahead
     expected: Array
@@ -187,12 +190,12 @@ class _Run(NamedTuple):
 
 
 class Intervals(eqx.Module):
-    """Intervals of a hybrid system, from event to event.
+    """Integrates an interval of a hybrid system from event to event.
 
-    - `plant`: its steps, guards and resets.
-    - `look_ahead`: `(s, x, end)` to what is ahead.
-    - `max_events`: where an interval stops.
-    - `until`: an event at which it stops, too.
+    - `plant`: the steps, guards and resets.
+    - `look_ahead`: a function `(s, x, end)` that gives the next step.
+    - `max_events`: the interval stops after this number of events.
+    - `until`: the index of an event at which it also stops.
     """
 
     plant: HybridFlow
@@ -201,7 +204,8 @@ class Intervals(eqx.Module):
     until: int | None = eqx.field(static=True, default=None)
 
     def __call__(self, x: Array, dt: Array, substeps: int, record: bool) -> Outcome:
-        """`dt` from `x`, or less where it stops before; the state is held then."""
+        """The interval of length `dt` from `x`. If it stops early, the state is held.
+        """
         events = Events.none(self.max_events, x) if record else None
         known = _knows(self.plant.args[0], x)
         result = choose(known, RESULTS.successful, RESULTS.unknown_mode)
@@ -209,14 +213,14 @@ class Intervals(eqx.Module):
 
         def stretch(carry, i):
             before, count = carry
-            # By products, as a running sum would round anew at each substep.
+            # By i h, because the rounding of a running sum would grow.
             end = (i + 1) * h
             run = self._noted(self.look_ahead(i * h, before.x, end), count, *before[2:])
             turn = by_components(functools.partial(self._turn, end))
             run = bounded_while(lambda run: run.expected, turn, run, self.max_events)
             s, x_stop, _, x_end, *_, solved = run.ahead
             result = first_failure(run.result, _unless(run.stopped, solved))
-            # Where an earlier substep stopped, that is the end.
+            # If an earlier substep stopped, its time and state stay.
             s, x_stop = (
                 jnp.where(before.stopped, a, b)
                 for a, b in ((before.s, s), (before.x, x_stop))
@@ -235,7 +239,7 @@ class Intervals(eqx.Module):
         return lax.scan(stretch, carry, jnp.arange(substeps, dtype=x.dtype))[0][0]
 
     def _turn(self, end: Array, run: _Run) -> _Run:
-        """To the first crossing, the jump there, and what is ahead of it."""
+        """Go to the first crossing, jump there, and look ahead again."""
         plant, (s, x, step, x_end, *_) = self.plant, run.ahead
         h, x_step = (end - s, x_end) if step is None else step
         still, (fs, fx, fh, fx_step) = frozen((plant, (s, x, h, x_step)))
@@ -248,17 +252,17 @@ class Intervals(eqx.Module):
         share, event, crossed, grazes = locate(guards_at, crossing, run.expected)
         x_there, _ = still.step(fs, fx, share * fh)
         fires = crossed & pick(still.enabled(fs + share * fh, x_there), event)
-        # Where a late one fires does not depend on its guard.
+        # A late event fires at the start, so its time does not depend on its guard.
         crosses = fires & ~pick(crossing.late, event)
         grazes = crosses & grazes
 
         length = _length(plant, s, x, share * fh, (event, crosses, grazes))
-        # Where nothing fires the step is only cut there, or taken whole.
+        # If no event fires, the step is only cut at the crossing, or taken whole.
         length = jnp.where(crosses, length, jnp.where(crossed, share * fh, h))
         x_event, solved = plant.step(s, x, length)
         s_event = s + length
         x_after = jnp.where(fires, plant.reset(event, s_event, x_event), x_event)
-        # Located to rounding, it may be just before the step; its time is not.
+        # Rounding may put the event just before the step. The recorded time is not.
         early = lax.stop_gradient(jnp.maximum(s - s_event, 0))
         time, events = plant.args[1].t + (s_event + early), run.events
         result = first_failure(run.result, solved)
@@ -272,19 +276,20 @@ class Intervals(eqx.Module):
         stopped = run.stopped
         if self.until is not None:
             stopped = stopped | fires & (event == self.until)
-            # Where it stops, what is ahead is that state.
+            # After a stop, the state at the event is kept.
             s_stop = jnp.where(stopped, s_event, ahead.s)
             ahead = ahead._replace(s=s_stop, x=jnp.where(stopped, x_after, ahead.x))
         after = self._noted(ahead, run.count + 1, stopped, result, events)
-        # The other members of a batch stay as they are.
+        # Members of a batch without an event stay as they are.
         return jax.tree.map(lambda a, b: jnp.where(run.expected, a, b), after, run)
 
     def _noted(self, ahead, count, stopped, result, events) -> _Run:
-        """A run with what is ahead, in which what is wrong with that is noted."""
+        """The progress with a new next step, and the status of what is wrong with it.
+        """
         going = ~stopped
         over = going & any_of(ahead.expected) & (count >= self.max_events)
         beyond = going & any_of(ahead.beyond)
-        # What is wrong with the states comes before what is with derivatives.
+        # A fault of the states replaces one that only concerns derivatives.
         good = (result == RESULTS.successful) | (result == RESULTS.grazing)
         if events is not None:
             kind = jnp.argmax(jnp.where(beyond, ahead.beyond, ahead.expected))
@@ -293,15 +298,15 @@ class Intervals(eqx.Module):
         result = choose(good & over, RESULTS.too_many_events, result)
         result = choose(good & beyond, RESULTS.beyond_guard, result)
         expected = going & ~over & any_of(ahead.expected)
-        # Its flags have been used, and a loop carries what it must.
+        # The flags have been used; without them the loop carries less.
         ahead = ahead._replace(expected=None, beyond=None)
         return _Run(ahead, expected, count, stopped | over, result, events)
 
 
 def _length(plant, s, x, length, known):
-    """The length of a step to an event, with its derivatives, of any order.
+    """The length of the step to an event, with derivatives of any order.
 
-    The guard of the step itself is zero at its end (the implicit function theorem).
+    By the implicit function theorem: the guard is zero at the end of the step.
     """
     given, static = eqx.partition((plant, s, x), eqx.is_array)
 
@@ -330,14 +335,14 @@ def _length(plant, s, x, length, known):
 
 
 def _unless(stopped, result):
-    """The solver's result, of which nothing beyond a stop counts."""
+    """The result of the solver, or success after a stop."""
     if result is None:
         return RESULTS.successful
     return choose(stopped, RESULTS.successful, result)
 
 
 def _knows(system, x) -> Array:
-    """Whether the mode in `x` is one of the system's."""
+    """Whether the mode in `x` is one of the system's modes."""
     if not system.mode_names:
         return jnp.asarray(True)
     mode = x[system.state_names.index("mode")]

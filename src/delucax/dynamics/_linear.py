@@ -1,4 +1,4 @@
-"""Linear dynamics in discrete time, about their operating point."""
+"""Linear dynamics in discrete time."""
 
 from dataclasses import KW_ONLY
 from typing import Any
@@ -19,27 +19,29 @@ from ._base import AbstractDynamics
 
 
 class LinearDynamics(AbstractDynamics):
-    """Affine dynamics about an operating point,
+    r"""Linear dynamics in discrete time, or affine dynamics about an operating point.
 
-    `x_next = x_ref_next + A (x - x_ref) + B (u - u_ref) + E w`, `y = C x`,
+    $$x_{k+1} = x_\mathrm{next} + A (x_k - x_\mathrm{ref}) + B (u_k - u_\mathrm{ref})
+    + E w_k, \qquad y_k = C x_k$$
 
-    with `x_ref_next` given as the argument `x_next`. Time-invariant, or time-varying:
-    then `A` and `B` (and whichever of the rest) have a leading time axis, indexed by
-    `round(t / dt)`; before its start and beyond its end the next state is NaN, which a
+    The dynamics are time-varying if `A` has a leading time axis of length `T`. The
+    other arguments then may have one too. At time `t`, the entries at `round(t / dt)`
+    apply. Before the first and after the last entry, the next state is NaN, which a
     rollout reports.
 
     **Arguments:**
 
     - `A`: shape `(n, n)`, or `(T, n, n)`.
     - `B`: shape `(n, m)`, or `(T, n, m)`.
-    - `C`: shape `(p, n)`; the identity by default. Time-invariant.
+    - `C`: shape `(p, n)`, always time-invariant; the identity by default.
     - `E`: shape `(n, k)`, or `(T, n, k)`; the identity by default.
-    - `dt`: the step, 1 by default.
-    - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)` or with a leading
-        time axis; zero by default.
-    - `x_next`: where the operating point goes, shape `(n,)` or `(T, n)`; by default
-        `x_ref`, an equilibrium.
-    - `state_names`, `control_names`: `("x0", ...)` and `("u0", ...)` by default.
+    - `dt`: the step, in units of time; 1 by default.
+    - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`, or `(T, n)` and
+        `(T, m)`; zero by default.
+    - `x_next`: the state that follows the operating point, shape `(n,)` or `(T, n)`; by
+        default `x_ref`, for an equilibrium.
+    - `state_names`, `control_names`: tuples of `n` and `m` strings; `("x0", ...)` and
+        `("u0", ...)` by default.
 
     **Raises:** `ValueError` if shapes do not fit, entries are not finite, or `dt` is
     not positive.
@@ -54,6 +56,10 @@ class LinearDynamics(AbstractDynamics):
         B = jnp.array([[0.0], [1.0]])
         dynamics = dlx.LinearDynamics(A, B)
         dynamics(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+
+        ```text
+        Array([2., 1.], dtype=float32)
         ```
     """
 
@@ -74,8 +80,8 @@ class LinearDynamics(AbstractDynamics):
         A, B, *_ = parts = _checked_matrices(self.A, self.B, self.C, self.E)
         self.A, self.B, self.C, self.E = parts
         n, m = B.shape[-2:]
-        # What is constant is repeated along the time axis of A, so that one scan or one
-        # index serves all.
+        # Constant arguments are repeated along the time axis of A, so that one index
+        # serves all.
         x_ref = np.zeros(n, A.dtype) if self.x_ref is None else self.x_ref
         u_ref = np.zeros(m, A.dtype) if self.u_ref is None else self.u_ref
         x_next = x_ref if self.x_next is None else self.x_next
@@ -114,22 +120,22 @@ class LinearDynamics(AbstractDynamics):
 
     @property
     def observes_state(self) -> bool:
-        """Whether `C` is the identity; not, where it is traced."""
+        """Whether `C` is known to be the identity. A traced `C` is not."""
         if self.C is None:
             return True
         same = is_concrete(self.C) and self.C.shape == (self.state_size,) * 2
         return same and np.array_equal(self.C, np.eye(self.state_size))
 
     def at(self, t: Any) -> "LinearDynamics":
-        """The time-invariant dynamics that hold at time `t`.
+        """The time-invariant dynamics at time `t`.
 
         **Arguments:** `t`: time, a scalar.
 
-        **Returns:** `LinearDynamics` whose matrices have no time axis.
+        **Returns:** `LinearDynamics` without a time axis.
         """
         if not self.is_time_varying:
             return self
-        # Outside the horizon every row is NaN, and so is the next state.
+        # Outside of the horizon every entry is NaN, and so is the next state.
         k = step_at(t, self.dt, len(self.A), "LinearDynamics")
         pick = lambda s: [s.A, s.B, s.E, s.x_ref, s.u_ref, s.x_next]  # noqa: E731
         here = row_at(pick(self), k)
@@ -138,8 +144,8 @@ class LinearDynamics(AbstractDynamics):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        # Deviations are taken before they are multiplied: about a large operating point
-        # that keeps their precision.
+        # Deviations are taken before the products: far from zero, `A x - A x_ref`
+        # would lose digits.
         here = self.at(t)
         x_next = here.x_next + matvec(here.A, x - here.x_ref)
         x_next = x_next + matvec(here.B, u - here.u_ref)
@@ -156,7 +162,7 @@ class LinearDynamics(AbstractDynamics):
 
 
 def _checked_matrices(A: Any, B: Any, C: Any, E: Any) -> tuple[Array, Array, Any, Any]:
-    """`A`, `B`, `C`, `E` of fitting shapes, with the leading time axis that `A` has."""
+    """`A`, `B`, `C`, `E` with checked shapes, and with a time axis if `A` has one."""
     where = "LinearDynamics"
     A, B, E = as_float_array(A), as_float_array(B), as_float_array(E)
     if not eqx.is_array(A) or A.ndim != 3:
@@ -172,7 +178,7 @@ def _checked_matrices(A: Any, B: Any, C: Any, E: Any) -> tuple[Array, Array, Any
             if value.ndim != 3 or len(value) != len(A):
                 raise ValueError(
                     f"{where}: {name} must have 2 axes, or a leading time axis of "
-                    f"{len(A)} as A has, got shape {value.shape}."
+                    f"length {len(A)} like A, got shape {value.shape}."
                 )
         inputs.append(value)
     B, E = inputs
@@ -181,7 +187,7 @@ def _checked_matrices(A: Any, B: Any, C: Any, E: Any) -> tuple[Array, Array, Any
 
 
 def _over_time(array: Any, ndim: int, A: Array) -> Any:
-    """`array`, of `ndim` axes, at each time of `A`, if that has a time axis."""
+    """`array`, which has `ndim` axes, repeated along the time axis of `A`, if any."""
     if A.ndim == 2 or not eqx.is_array(array) or array.ndim != ndim:
         return array
     return jnp.broadcast_to(array, (len(A), *array.shape))

@@ -1,4 +1,4 @@
-"""First-order models, and the points that they are about."""
+"""Linearisation, and operating points."""
 
 from typing import Any, overload
 
@@ -18,19 +18,19 @@ from ._linear import LinearDynamics
 
 
 class OperatingPoint(eqx.Module):
-    """A state and a control at which a system or dynamics rest.
+    r"""An operating point: a state and a control at which a system or dynamics rest.
 
-    [`delucax.linearize`][] and [`delucax.controllers.LQR`][] take it as it is. Printed,
-    it shows its numbers.
+    [`delucax.trim`][] computes it. Pass it to [`delucax.linearize`][] or
+    [`delucax.controllers.LQR`][] as it is. Print it to see its numbers.
 
     **Attributes:**
 
     - `x`: the state, shape `(n,)`.
     - `u`: the control, shape `(m,)`.
-    - `residual`: the rate of change `f(t, x, u)` of a system, or `F(t, x, u) - x` of
-        dynamics; zero up to rounding where the result is a success.
-    - `result`: success; `RESULTS.no_equilibrium` if the residual has a minimum that is
-        not zero; `RESULTS.not_converged` or `RESULTS.diverged`.
+    - `residual`: $f(t, x, u)$ of a system, or $F(t, x, u) - x$ of dynamics, shape
+        `(n,)`; zero up to rounding if the result is a success.
+    - `result`: one of `delucax.RESULTS`: success; `no_equilibrium` if the residual has
+        a minimum that is not zero; `not_converged`; or `diverged`.
 
     !!! example
 
@@ -38,8 +38,12 @@ class OperatingPoint(eqx.Module):
         import delucax as dlx
 
         pendulum = dlx.systems.Pendulum()
-        point = dlx.trim(pendulum, x=[0.3, 0.0], u=[1.0], fix="angle", throw=False)
-        point.u, point.residual, dlx.RESULTS[point.result]
+        point = dlx.trim(pendulum, x=[0.3, 0.0], u=[1.0], fix="angle")
+        point.u
+        ```
+
+        ```text
+        Array([-1.478], dtype=float32)
         ```
     """
 
@@ -74,24 +78,28 @@ def linearize(
 def linearize(
     model: Any, t: RealScalar = 0.0, x: Any = None, u: Any = None
 ) -> LinearSystem | LinearDynamics:
-    """The first-order model about an operating point, by automatic differentiation.
+    r"""Linearise a system or dynamics about an operating point, by automatic
+    differentiation.
 
-    The operating point is kept, so that a regulator designed on the result acts on
-    deviations from it: `u = u_ref - K difference(x, x_ref)`.
+    $$f(x, u) \approx f(x_\mathrm{ref}, u_\mathrm{ref})
+    + A (x - x_\mathrm{ref}) + B (u - u_\mathrm{ref})$$
+
+    The result keeps the operating point. A regulator designed on it therefore acts on
+    deviations from this point: `u = u_ref - K difference(x, x_ref)`.
 
     **Arguments:**
 
     - `model`: an [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
-    - `t`: time, 0 by default.
-    - `x`, `u`: the state and control to linearise at; by default the `equilibrium` that
-        the model defines. The [`delucax.dynamics.OperatingPoint`][] that
-        [`delucax.trim`][] computes may be passed as `x`; it supplies both. Any point is
-        valid here, but regulators such as [`delucax.controllers.LQR`][] need an
-        equilibrium.
+    - `t`: time, a scalar, 0 by default.
+    - `x`, `u`: the state and control to linearise at, shapes `(n,)` and `(m,)`; by
+        default the `equilibrium` of the model. You may pass the
+        [`delucax.dynamics.OperatingPoint`][] that [`delucax.trim`][] computes as `x`:
+        it holds both. Any point works, but regulators such as
+        [`delucax.controllers.LQR`][] need an equilibrium.
 
-    **Returns:** [`delucax.LinearDynamics`][] of dynamics, with the same `dt`;
-    [`delucax.systems.LinearSystem`][] of a system. `E` is the derivative with respect
-    to the disturbance.
+    **Returns:** for dynamics, [`delucax.LinearDynamics`][] with the same `dt`; for a
+    system, a [`delucax.systems.LinearSystem`][]. The matrix `E` is the derivative with
+    respect to the disturbance.
 
     **Raises:** `ValueError` on a wrong shape, or if no point is given and the model
     defines no equilibrium.
@@ -105,14 +113,18 @@ def linearize(
         upright = dlx.linearize(dynamics)
         upright.A
         ```
+
+        ```text
+        Array([[1.019, 0.05 ],
+               [0.755, 1.019]], dtype=float32)
+        ```
     """
     hint = "for an environment, its `dynamics`"
     model, x, u = at_point(model, t, x, u, "linearize", hint)
     names = dict(state_names=model.state_names, control_names=model.control_names)
     C, value, (A, B, *E) = _first_order(model, jnp.asarray(t, x.dtype), x, u)
     E = E[0] if E else None
-    # The value is kept, because at a point that is no equilibrium the model is affine,
-    # f(x_ref, u_ref) + A (x - x_ref) + B (u - u_ref).
+    # The value is kept, because it is not zero at a point that is no equilibrium.
     if isinstance(model, AbstractSystem):
         return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=value, **names)
     return LinearDynamics(A, B, C, E, model.dt, x, u, value, **names)
@@ -120,17 +132,16 @@ def linearize(
 
 @eqx.filter_jit
 def _first_order(model: Any, t: Array, x: State, u: Control) -> Any:
-    """The derivative of the sensor, and the value and the derivatives of the field or
-    the step by state, control and disturbance."""
-    # The sensor is linearised, too, so that estimators can be designed on the result.
+    """The derivative of the sensor; the value of the field or the step; and its
+    derivatives with respect to state, control and disturbance."""
     C = jacobian(lambda x: model.observe(t, x))(x)
     is_system = isinstance(model, AbstractSystem)
 
     def f(x, u, w=None):
-        # Of dynamics the public call, whose solver failures raise, and not `advance`.
+        # Dynamics are called, because `advance` would not raise if the solver fails.
         return evaluate_field(model, t, x, u, w) if is_system else model(t, x, u, w)
 
-    # Where a system names no disturbances its field has no w, and so there is no E.
+    # Without disturbance names, w does not enter the field, and there is no E.
     if is_system and not model.disturbance_names:
         return C, *value_and_jacobians(f, x, u, in_loop=True)
     w = jnp.zeros(model.disturbance_size, x.dtype)
@@ -140,8 +151,8 @@ def _first_order(model: Any, t: Array, x: State, u: Control) -> Any:
 def at_point(
     model: Any, t: RealScalar, x: Any, u: Any, where: str, hint: str
 ) -> tuple[Any, State, Control]:
-    """`model` as it is at time `t`, with the state and control that are given, or else
-    those of its equilibrium."""
+    """`model` at time `t`, and the given state and control, or those of its
+    equilibrium."""
     if not isinstance(model, AbstractSystem | AbstractDynamics):
         raise ValueError(
             f"{where}: model must be an AbstractSystem or AbstractDynamics ({hint}), "
@@ -152,8 +163,8 @@ def at_point(
     if isinstance(x, OperatingPoint):
         if u is not None:
             raise ValueError(
-                f"{where}: u must be left out where x is an OperatingPoint, which has "
-                f"its own, got {shortened(u)}."
+                f"{where}: u must be left out if x is an OperatingPoint, which has its "
+                f"own control, got {shortened(u)}."
             )
         x, u = x.x, x.u
     if x is None or u is None:

@@ -1,4 +1,4 @@
-"""The matrix logarithm, and the exponential of which it is the inverse."""
+"""The matrix logarithm, and the exponential that it inverts."""
 
 import jax
 import numpy as np
@@ -20,10 +20,10 @@ from ..math._linear_solve import full_precision, solve
 _MAX_ROOTS = 40
 _MAX_ROOT_STEPS = 60
 _CLOSE = 0.25
-"""The distance from the identity up to which the quadrature is exact to rounding."""
+"""Within this distance from the identity, the quadrature is exact to rounding."""
 _SQUARINGS = 12
 _TERMS = 9
-"""The terms of the exponential's series: exact to rounding for norms up to 300."""
+"""The terms of the series of the exponential: exact to rounding for norms up to 300."""
 
 
 def logarithm(
@@ -31,19 +31,19 @@ def logarithm(
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """The principal logarithm, and whether it failed.
 
-    It is differentiated as the inverse of the exponential that it is: the derivative of
-    the exponential is linear, and the block logarithm below solves it.
+    It is differentiated as the inverse of the exponential: the derivative of the
+    exponential is a linear map, and the logarithm of a block matrix inverts it.
     """
-    # The iterations have no reverse mode, and are not differentiated: they are run on a
-    # constant, and the derivative is put beside their value.
+    # The iterations have no reverse mode. They run on a constant, and the derivative is
+    # defined separately.
     constant = stop_gradient(A)
     eye = xp.eye(A.shape[0], dtype=A.dtype)
     value, converged = _by_roots(constant)
     error = xp.linalg.norm(exponential_less_one(value) + eye - constant)
-    # The proof of the result: its exponential is A.
+    # The result is checked: its exponential must be A.
     close = error <= xp.finfo(A.dtype).eps ** 0.5 * xp.linalg.norm(constant)
     failed = ~(converged & close)
-    # The identity in the place of what failed, so that its derivatives are finite.
+    # A failed matrix is replaced by the identity, so that derivatives are finite.
     constant = xp.where(failed, eye, constant)
     value = xp.where(failed, 0, value)
     return _with_derivative(xp.where(failed, eye, A), constant, value), failed
@@ -63,9 +63,9 @@ def _with_derivative_jvp(primals, tangents):
     logarithm = _with_derivative(*primals)
 
     def inverse(M, right):
-        """The tangent of the logarithm: a block of that of a block matrix,
-        `log [[M, E], [0, M]] = [[log M, D], [0, log M]]` with `D` that along `E`."""
-        # D is linear in E, which is scaled so that the matrix stays as near to the
+        """The tangent `D` of the logarithm along `E`, as a block of the logarithm of a
+        block matrix: `log [[M, E], [0, M]] = [[log M, D], [0, log M]]`."""
+        # D is linear in E. E is scaled, so that the block matrix is as close to the
         # identity as M is.
         n = M.shape[0]
         size = xp.linalg.norm(right)
@@ -73,8 +73,8 @@ def _with_derivative_jvp(primals, tangents):
         block = xp.block([[M, right / size], [xp.zeros_like(M), M]])
         return _by_roots(block)[0][:n, n:] * size
 
-    # The derivative of a function of a matrix at M has the derivative at M' for its
-    # transpose, which makes the reverse mode (Higham, 2008).
+    # Reverse mode: the transpose of the derivative at M is the derivative at M'
+    # (Higham, 2008).
     tangent = lax.custom_linear_solve(
         lambda tangent: jax.jvp(exponential_less_one, (logarithm,), (tangent,))[1],
         tangents[0],
@@ -85,8 +85,8 @@ def _with_derivative_jvp(primals, tangents):
 
 
 def exponential_less_one(L: Array) -> Array:
-    """`exp(L) - I`, by a fixed number of squarings, whose derivatives stay small
-    programs. `P` becomes `(I + P)^2 - I`: nothing is lost beside the identity."""
+    """`exp(L) - I`. A fixed number of squarings keeps the programs of its derivatives
+    small. Each maps `P` to `(I + P)^2 - I`, so that a small `P` keeps its digits."""
     X = L / 2**_SQUARINGS
     eye = xp.eye(L.shape[0], dtype=L.dtype)
     # Horner's rule: X + X^2/2! + ... = X (I + X/2 (I + X/3 (I + ...))).
@@ -97,7 +97,8 @@ def exponential_less_one(L: Array) -> Array:
 
 
 def _by_roots(A: Array) -> tuple[Array, Array]:
-    """The logarithm of a root near the identity, times the order of the root."""
+    """The logarithm by inverse scaling and squaring: that of a root near the identity,
+    times the order of the root."""
     eye = xp.eye(A.shape[0], dtype=A.dtype)
 
     def proceeds(carry):
@@ -112,7 +113,7 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
 
     start = (A, xp.asarray(0), xp.asarray(True))
     root, k, converged = while_loop(proceeds, body, start)
-    # log A = 2^k log A^(1/2^k): inverse scaling and squaring.
+    # log A = 2^k log A^(1/2^k).
     X = root - eye
     converged = converged & (xp.linalg.norm(X) <= _CLOSE)
     X = xp.where(converged, X, 0)
@@ -132,18 +133,18 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
 def _square_root(A: Array) -> tuple[Array, Array]:
     """The principal square root, by the product form of Denman and Beavers' iteration.
 
-    `M` converges to the identity and `Y` to the root, and neither does if an eigenvalue
-    is on the closed negative real axis.
+    `M` converges to the identity and `Y` to the root, unless an eigenvalue is on the
+    closed negative real axis.
     """
     n, eps = A.shape[0], xp.finfo(A.dtype).eps
-    # Y_{k+1} = Y_k (I + M_k^-1) / 2, M_{k+1} = (I + (M_k + M_k^-1) / 2) / 2, which is
-    # Newton's method for Y^2 = A, in a form that stays stable under rounding.
+    # Y_{k+1} = Y_k (I + M_k^-1) / 2, M_{k+1} = (I + (M_k + M_k^-1) / 2) / 2. This is
+    # Newton's method for Y^2 = A, in a form that is stable under rounding.
     eye = xp.eye(n, dtype=A.dtype)
     small = 10 * n * eps
 
     def proceeds(carry):
         _, _, error, before, k = carry
-        # It converges quadratically: once close, what no longer shrinks is rounding.
+        # Convergence is quadratic: an error that no longer halves is rounding.
         going = (error > small) & ((error < before / 2) | (before > 0.1))
         return going & xp.isfinite(error) & (k < _MAX_ROOT_STEPS)
 
@@ -157,5 +158,5 @@ def _square_root(A: Array) -> tuple[Array, Array]:
     far = xp.asarray(xp.inf, A.dtype)
     start = (A, A, xp.asarray(xp.finfo(A.dtype).max, A.dtype), far, xp.asarray(0))
     _, root, error, *_ = while_loop(proceeds, body, start)
-    # Written so that NaN counts as no root.
+    # A NaN compares false, and so counts as no root.
     return root, error < eps**0.5 * n

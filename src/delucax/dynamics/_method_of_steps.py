@@ -1,4 +1,4 @@
-"""Systems with delayed states, integrated from one step to the next."""
+"""Discrete-time dynamics of systems with delayed states."""
 
 from collections.abc import Callable
 from typing import Any
@@ -24,38 +24,40 @@ _PARTS = "start", "slope_at_start", "end", "slope_at_end"
 
 
 class MethodOfSteps(Forwarding):
-    r"""Zero-order-hold discretisation of a system with delayed states.
+    r"""Discrete-time dynamics of a system with delayed states, by the method of steps,
+    with the control held over each interval (zero-order hold).
 
     Each control interval is cut into `substeps` equal steps of an explicit Runge-Kutta
-    method, none longer than the shortest delay, so that what is late is always known:
-    it is read off the cubic through the states and slopes at the ends of a past step,
-    whose error is of order 4 in the step. The control is held, and so is a disturbance
-    that enters the field; where the system names none, `w` is added to the next state.
+    method. No step is longer than the shortest delay, so the delayed states are always
+    known. They are interpolated by the cubic through the states and slopes at the ends
+    of a past step, with an error of order 4. If the system has `disturbance_names`, `w`
+    is held over the interval; otherwise it is added to the next state.
 
-    The state is `(x, history)`: of each past step within `memory` the state and the
-    slope at its start and at its end, the newest step first. `filled` makes one that
-    has rested, and `started` one from a function of time. It is a state like any other:
-    [`delucax.linearize`][] gives a matrix whose eigenvalues tell of stability, and
-    derivatives with respect to the delays go through the cubics.
+    The state is `(x, history)`. For each past step within `memory`, the history holds
+    the state and the slope at the start and at the end of that step, the newest step
+    first. `filled` makes a state after a constant past, `started` makes one from a
+    function of time. It is a state like any other. For example, you can
+    [`delucax.linearize`][] the dynamics, and the eigenvalues of the matrix decide about
+    stability. Derivatives with respect to the delays go through the cubics.
 
-    The slope jumps where a control switches, and where the history ends; a delay later
-    a higher derivative jumps. Order 4 is reached where delays are whole numbers of
-    substeps.
+    The slope of the state jumps where a control switches and where the history ends,
+    and a higher derivative jumps one delay later. The method has order 4 if the delays
+    are whole numbers of substeps.
 
     **Arguments:**
 
     - `system`: the system, a [`delucax.systems.AbstractDelaySystem`][].
-    - `dt`: the control interval, a positive number.
+    - `dt`: the control interval, in units of time, a positive number.
     - `solver`: an explicit Runge-Kutta method of Diffrax; [`delucax.dynamics.RK4`][] by
         default.
-    - `substeps`: steps in an interval; as many as the shortest delay asks for by
-        default, and at least 1.
-    - `memory`: the longest delay that can be set later, in substeps; that of the delays
-        by default.
+    - `substeps`: steps per interval; by default the smallest number that keeps a step
+        within the shortest delay.
+    - `memory`: the longest delay that you may set later, in substeps; by default the
+        longest delay of the system.
 
-    **Raises:** `ValueError` if a delay is not positive, shorter than a substep or
-    longer than `memory`, or if `solver` does not fit. Delays that change later have the
-    status `delay_beyond_memory` there.
+    **Raises:** `ValueError` if a delay is not positive, is shorter than a substep or
+    longer than `memory`, or if `solver` does not fit. If you change a delay later to a
+    value outside of this range, the status is `delay_beyond_memory`.
 
     Source: Hairer, Nørsett and Wanner, 1993, section II.17.
 
@@ -74,7 +76,11 @@ class MethodOfSteps(Forwarding):
                 return -late[0] + u
 
         dynamics = dlx.dynamics.MethodOfSteps(Lag(), dt=0.1)
-        dlx.open_loop(dynamics, dynamics.filled([1.0]), jnp.zeros((20, 1)))[:, 0]
+        dlx.open_loop(dynamics, dynamics.filled([1.0]), jnp.zeros((20, 1)))[::5, 0]
+        ```
+
+        ```text
+        Array([1.   , 0.505, 0.179, 0.048, 0.009], dtype=float32)
         ```
     """
 
@@ -91,12 +97,12 @@ class MethodOfSteps(Forwarding):
         known = is_concrete(delays) and is_concrete(self.dt)
         if not known and (self.substeps is None or self.memory is None):
             raise ValueError(
-                f"{where}: substeps and memory must be given where the delays or dt "
-                "are not known in advance."
+                f"{where}: substeps and memory must be given if the delays or dt are "
+                "traced by JAX."
             )
         if known and not (np.size(delays) and np.all(np.asarray(delays) > 0)):
             raise ValueError(f"{where}: delays must be positive, got {delays}.")
-        # A quotient that should be whole may be rounded up.
+        # The slack absorbs the rounding of a quotient that should be whole.
         up = lambda ratio: max(1, int(np.ceil(float(ratio) * (1 - 1e-6))))
         if self.substeps is None:
             self.substeps = up(self.dt / np.min(delays))
@@ -109,8 +115,8 @@ class MethodOfSteps(Forwarding):
         where, delays = "MethodOfSteps", jnp.asarray(self.system.delays)
         if is_concrete(delays) and is_concrete(self.dt) and self._is_beyond(delays):
             raise ValueError(
-                f"{where}: delays must be at least a substep, {self._step}, and at "
-                f"most memory = {self.memory} of them, got {delays}."
+                f"{where}: delays must be at least one substep, {self._step}, and at "
+                f"most memory = {self.memory} substeps, got {delays}."
             )
         check_method(self.solver, None, 1, None, where)
         if tableau_of(self.solver) is None:
@@ -119,7 +125,7 @@ class MethodOfSteps(Forwarding):
                 f"{type(self.solver).__name__}."
             )
         if self.system.noise == "brownian":
-            raise ValueError(f"{where}: system must have no Brownian noise.")
+            raise ValueError(f"{where}: system must have no diffusion.")
 
     @property
     def _inside(self):
@@ -140,30 +146,30 @@ class MethodOfSteps(Forwarding):
     @property
     def state_units(self) -> tuple[str, ...]:
         units = tuple(self.system.state_units)
-        # Those of the history are of values and of slopes, and are left out.
+        # The history mixes values and slopes, so it has no units.
         more = self.state_size - self.system.state_size
         return units + ("",) * more if units else ()
 
     def _cut(self, x: Array) -> tuple[Array, Array]:
-        """The system's own state, and the history, shape `(memory, 4, n)`."""
+        """The state of the system and the history, shape `(memory, 4, n)`."""
         n = self.system.state_size
         return x[:n], x[n:].reshape(-1, len(_PARTS), n)
 
     def inner(self, x: Array) -> Array:
-        """The system's own state.
+        """The state of the system inside.
 
-        **Arguments:** `x`: the state.
+        **Arguments:** `x`: the state with its history, shape `(state_size,)`.
 
-        **Returns:** its first entries.
+        **Returns:** its first entries, shape `(n,)`.
         """
         return self._cut(x)[0]
 
     def filled(self, x: Numbers) -> Array:
-        """The state of a system that has rested.
+        """The state after a constant past. Use it as a first state.
 
-        **Arguments:** `x`: the system's own state, now and before.
+        **Arguments:** `x`: the state of the system, now and in the past, shape `(n,)`.
 
-        **Returns:** the state.
+        **Returns:** the state with its history, shape `(state_size,)`.
 
         **Raises:** `ValueError` on a wrong shape.
         """
@@ -173,12 +179,12 @@ class MethodOfSteps(Forwarding):
         return jnp.concatenate([x, history.ravel()])
 
     def started(self, past: Callable[[Array], Array]) -> Array:
-        """The state after a given past.
+        """The state after a given past. Use it as a first state.
 
-        **Arguments:** `past`: the system's own state as a function of the time before
-        now, which is 0: it is called at negative times.
+        **Arguments:** `past`: the state of the system, shape `(n,)`, as a function of
+            time. Now is time 0, and `past` is called at negative times too.
 
-        **Returns:** the state.
+        **Returns:** the state with its history, shape `(state_size,)`.
 
         **Raises:** `ValueError` on a wrong shape.
         """
@@ -192,7 +198,7 @@ class MethodOfSteps(Forwarding):
 
     def _is_beyond(self, delays: Array) -> Array:
         ratio = delays / self._step
-        slack = 1e-6  # a delay that should be whole in substeps may be rounded
+        slack = 1e-6  # for the rounding of a ratio that should be whole
         most = (self.memory or 0) + slack
         return jnp.any((ratio < 1 - slack) | (ratio > most))
 
@@ -232,7 +238,7 @@ class MethodOfSteps(Forwarding):
         return self.system.observe(t, self.inner(x))
 
     def difference(self, x: State, x_ref: State) -> State:
-        # Angles wrap in the system's own state alone.
+        # Only the system's own state has angles to wrap.
         n = self.system.state_size
         own = self.system.difference(x[:n], x_ref[:n])
         return jnp.concatenate([own, x[n:] - x_ref[n:]])
@@ -243,7 +249,7 @@ class MethodOfSteps(Forwarding):
 
 
 def _at(history: Array, age: Array, h: Array) -> Array:
-    """The states `age` steps ago, by Hermite's cubic."""
+    """The states `age` substeps ago, by Hermite's cubic."""
     index = jnp.clip(jnp.floor(age).astype(int), 0, len(history) - 1)
     start, rise, end, fall = jnp.moveaxis(history[index], 1, 0)
     s = (1 - (age - index))[:, None]

@@ -35,45 +35,56 @@ def trim(
     fix: Any = (),
     throw: bool = True,
 ) -> OperatingPoint:
-    r"""An operating point: a state and a control with
+    r"""Find an operating point near a guess: a state and a control at which the model
+    rests.
 
-    `f(t, x, u) = 0` for a system, `F(t, x, u) = x` for dynamics.
+    $$f(t, x, u) = 0 \text{ for a system}, \qquad
+    F(t, x, u) = x \text{ for dynamics}$$
 
-    It is a root near the guess, not always the nearest. Where there are more free
-    unknowns than equations it is the least change among its neighbours, to first order.
-    The unit of each state is its guess, or where that is zero the largest guess of a
-    state, at most 1, and 1 if all are zero; so for controls. A guess counts as zero if
-    it is below 100 eps times the largest one, or times 1 if that is less: in float32,
-    1e-5 of it. Residuals are measured relative to these units, so scale states that are
-    much smaller than the others (use nmol, for instance). A free state or control below
-    4 eps of its unit is set to zero. Where there is no root it is a point of least
-    residual, each equation in units of the size of its terms, and the result says so.
-    At a multiple root the last digits may be missing, and the result be
+    Disturbances are zero. The point is a solution near the guess, but not always the
+    nearest one. If there are more unknowns than equations, there are many solutions
+    close to each other; you get the one with the smallest change from the guess, to
+    first order. If there is no solution, you get a point of smallest residual, and
+    `result` says so.
+
+    Changes and residuals are measured in units that follow from the guess:
+
+    - The unit of a state is its guess. If that is zero, the unit is the largest guess
+        of a state, at most 1; or 1 if all guesses are zero. The same holds for
+        controls.
+    - A guess counts as zero if it is below 100 eps times the largest guess or 1,
+        whichever is less. In float32, 100 eps is 1e-5. Scale states that are much
+        smaller than the others, for example by using nmol.
+    - A free state or control below 4 eps of its unit is set to zero.
+    - Each equation is measured in units of the size of its terms.
+
+    At a multiple root the last digits may be missing, and the result may be
     `no_equilibrium`.
 
-    Levenberg and Marquardt's method in a trust region, then Newton's on the conditions
-    of the nearest point. Differentiable in forward and reverse mode with respect to all
-    arrays in `model`, the guess and what is fixed, by the implicit function theorem.
-    Disturbances are zero.
+    The method is Levenberg-Marquardt in a trust region, followed by Newton's method on
+    the conditions of the nearest point. The result is differentiable in forward and
+    reverse mode with respect to all arrays in `model`, the guess and the fixed values,
+    by the implicit function theorem.
 
     **Arguments:**
 
-    - `model`: an [`delucax.AbstractSystem`][] or [`delucax.AbstractDynamics`][].
-        [`delucax.Discretized`][] dynamics rest where their system does.
-    - `t`: time, 0 by default.
-    - `x`, `u`: the guess, shapes `(n,)` and `(m,)`; by default the `equilibrium` that
-        the model defines. An `OperatingPoint` as `x` supplies both.
-    - `fix`: the states and controls that stay at the guess, by name: one, several, or a
-        dictionary from name to value, which replaces that of the guess. None by
+    - `model`: an [`delucax.AbstractSystem`][] or [`delucax.AbstractDynamics`][]. For
+        [`delucax.Discretized`][] dynamics, the operating point is that of the system.
+    - `t`: time, a scalar, 0 by default.
+    - `x`, `u`: the guess, shapes `(n,)` and `(m,)`; by default the `equilibrium` of the
+        model. You may pass an `OperatingPoint` as `x`: it holds both.
+    - `fix`: the states and controls to hold at the guess: a name, several names, or a
+        dictionary from names to values, which replace those of the guess. None by
         default.
-    - `throw`: raise if there is no operating point (default); if false, look at
-        `result`.
+    - `throw`: whether to raise if there is no operating point, true by default. With
+        `throw=False`, look at `result`.
 
-    **Returns:** [`delucax.dynamics.OperatingPoint`][].
+    **Returns:** a [`delucax.dynamics.OperatingPoint`][].
 
     **Raises:** `ValueError` on a wrong shape, an unknown name, a time or guess that is
-    not finite, if all is fixed, or if no guess is given and the model defines no
-    equilibrium; an error at run time as `throw` says.
+    not finite, if everything is fixed, or if there is no guess and the model has no
+    equilibrium. An error at run time if there is no operating point and `throw` is
+    true.
 
     Source: Nocedal and Wright, 2006.
 
@@ -81,12 +92,15 @@ def trim(
 
         ```python
         import delucax as dlx
-        import jax.numpy as jnp
 
         tanks = dlx.systems.TwoTank()
         point = dlx.trim(tanks, x=[8.0, 8.0], u=[5.0], fix={"lower": 12.0})
+        model = dlx.linearize(tanks, x=point)
         point.x, point.u
-        dlx.linearize(tanks, x=point).A
+        ```
+
+        ```text
+        (Array([12., 12.], dtype=float32), Array([10.894], dtype=float32))
         ```
     """
     where = "trim"
@@ -105,7 +119,7 @@ def trim(
     if not free:
         raise ValueError(f"{where}: fix must leave a state or a control free.")
     if isinstance(model, Discretized):
-        # Where the field is zero the state stays, by any method that integrates it.
+        # Every solver stays where the field is zero, and the field is quicker.
         model = model.system
     point = _solve(model, jnp.asarray(t, guess.dtype), guess, free)
     facts = lambda: f"The residual is {point.residual} at x {point.x}, u {point.u}."
@@ -113,15 +127,15 @@ def trim(
 
 
 def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
-    """The index of each state and control that is held, with its value if given."""
+    """The index of each fixed state and control, with its value or `None`."""
     if isinstance(fix, str):
         fix = (fix,)
     names = (*model.state_names, *model.control_names)
     known = isinstance(fix, Mapping | tuple | list | set | frozenset)
     if not known or not all(isinstance(name, str) for name in fix):
         raise ValueError(
-            f"{where}: fix must be a name, names or a dictionary from name to value, "
-            f"got {shortened(fix)}."
+            f"{where}: fix must be a name, several names or a dictionary from names to "
+            f"values, got {shortened(fix)}."
         )
     values = {}
     for name in fix:
@@ -139,7 +153,8 @@ def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
 
 
 class _Problem(eqx.Module):
-    """Unknowns are changes of what is free, relative to its units."""
+    """The equations. The unknowns `z` are the changes of the free states and controls,
+    in their units."""
 
     model: Any
     t: Array
@@ -154,55 +169,53 @@ class _Problem(eqx.Module):
     def at(self, z: Array) -> Array:
         free, units = jnp.array(self.free), self.units
         y = self.guess.at[free].add(units[free] * z)
-        # Set to zero where it is rounding alone; its derivative stays.
+        # A value that is mere rounding is set to zero. Its derivative stays.
         tiny = jnp.abs(y) <= ULPS * jnp.finfo(y.dtype).eps * units
         tiny = tiny & jnp.zeros(y.shape, bool).at[free].set(True)
         return y - lax.stop_gradient(jnp.where(tiny, y, 0))
 
     def drift(self, y: Array) -> Array:
-        """The rate of change of the state, or its change in a step."""
+        """The rate of change of the state, or its change over a step."""
         model, n = self.model, self.model.state_size
         x, u = y[:n], y[n:]
         if isinstance(model, AbstractSystem):
             w = jnp.zeros(model.disturbance_size, x.dtype)
             held = w if model.disturbance_names else None
-            # A state is at rest on its manifold: off it, there would be roots that no
-            # trajectory reaches.
+            # Projected, because there may be roots off the manifold that no trajectory
+            # reaches.
             return evaluate_field(model, self.t, model.project(x), u, held)
         return model.difference(model.advance(self.t, x, u, None)[0], x)
 
     def expansion(self, y: Array) -> tuple[Array, Array, Array]:
-        """The drift and its first and second derivatives, the last of these with
-        respect to what is free, from one copy of the model."""
+        """The drift, its first derivatives, and its second derivatives with respect to
+        the free entries. The program holds one copy of the model."""
         eye, k = jnp.eye(y.size, dtype=y.dtype), len(self.free)
 
         def along(pair):
-            # Forward over forward, along e_i and then e_j: F, dF/dy_i and d2F/dy_i dy_j
-            # in one pass.
+            # Forward over forward along e_i and e_j gives F, dF/dy_i and
+            # d2F/dy_i dy_j in one pass.
             first = lambda y: jax.jvp(self.drift, (y,), (pair[0],))
             (drift, slope), (_, curvature) = jax.jvp(first, (y,), (pair[1],))
             return drift, slope, curvature
 
-        # By `lax.map` over pairs of directions, because `jax.vmap` compiles for longer.
+        # By `lax.map` over pairs of directions, which compiles faster than `jax.vmap`.
         pairs = jnp.repeat(eye, k, 0), jnp.tile(eye[jnp.array(self.free)], (y.size, 1))
         drift, slopes, H = lax.map(along, pairs)
         return drift[0], slopes[::k].T, H.reshape(y.size, k, -1).transpose(2, 0, 1)
 
     def terms(self, J: Array) -> Array:
-        """The size of the terms of each equation at the guess, a unit of it."""
-        # Of J dz, entry by entry: a residual is small if it is beside these.
+        """The size of the terms of each equation at the guess, as its unit."""
         terms = jnp.abs(J) @ self.units
         return jnp.where(terms > 0, terms, 1)
 
 
 class _Point(eqx.Module):
-    """The conditions of the nearest point, expanded at one.
+    """The conditions of the nearest point, expanded about a point z.
 
-    With the residual r and its Jacobian J, the nearest point z is that of its own
-    linear model, `z = J^+ (J z - r)`: then `J' r = 0`, and z has no part in the null
-    space of J. That holds for as many equations as unknowns, for fewer, for more, and
-    where J has not full rank. `offset` is the difference of the two sides, and `slope`
-    its derivative.
+    With the residual r and its Jacobian J, the nearest point solves its own linear
+    model: `z = J^+ (J z - r)`. Then `J' r = 0`, and z has no part in the null space of
+    J. This holds for any number of equations and unknowns, and for any rank of J.
+    `offset` is the difference of the two sides, and `slope` its derivative.
     """
 
     drift: Array
@@ -216,23 +229,23 @@ class _Point(eqx.Module):
 
 
 def _expand(problem: _Problem, z: Array, terms: Array) -> _Point:
-    """The point at `z`, whose terms are those given, or if these are zero its own."""
+    """The expansion at `z`, with the given `terms`, or its own if those are zero."""
     free, units = jnp.array(problem.free), problem.units
     drift, jacobian, H = problem.expansion(problem.at(z))
     terms = jnp.where(terms > 0, terms, problem.terms(jacobian))
     unit = units[free]
-    # Rows in units of their terms and columns in those of the unknowns, so that neither
-    # cost nor rank depends on the units of the model.
+    # Rows are in units of their terms, columns in those of the unknowns, so that cost
+    # and rank do not depend on the units of the model.
     r, J = drift / terms, jacobian[:, free] * unit / terms[:, None]
     H = H[:, free] * unit[:, None] * unit / terms[:, None, None]
     rtol = float(100 * max(J.shape) * jnp.finfo(J.dtype).eps)
-    # Not by Lineax, whose solves raise in their derivative where there is NaN.
+    # Not by Lineax, because the derivatives of its solves raise on NaN.
     P = jnp.linalg.pinv(J, rtol=rtol)
     # The least solution of the linear model r + J (z' - z) = 0 is z' = P (J z - r).
     linear = J @ z - r
     near = P @ linear
     offset = z - near
-    # The derivative of P by that of J (Golub and Pereyra, 1973).
+    # The derivative of P follows from that of J (Golub and Pereyra, 1973).
     eye = jnp.eye(z.size, dtype=z.dtype)
     slope = eye - P @ jnp.einsum("ijk,j->ik", H, offset)
     slope -= P @ P.T @ jnp.einsum("ijk,i->jk", H, linear - J @ near)
@@ -245,9 +258,10 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     """The nearest point, the drift there and its Jacobian, and the size of the last
     step.
 
-    Levenberg and Marquardt's method within a trust radius, then Newton's, in one loop
-    that traces the model once, because compile time dominates. Where Newton's
-    does not converge, as where J loses rank, it is the point of least residual.
+    Levenberg-Marquardt within a trust radius, then Newton's method. Both run in one
+    loop that traces the model once, because compile time dominates. If Newton's method
+    does not converge, for example because J loses rank, the point of smallest residual
+    is returned.
     """
     dtype, n = problem.guess.dtype, problem.model.state_size
     eps = jnp.finfo(dtype).eps
@@ -266,16 +280,16 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
         step, newton, converged, _, z, d, damping, radius, old, best = carry
         new = _expand(problem, z + d, old.terms)
         finite = jnp.isfinite(jnp.sum(new.slope) + jnp.sum(new.gram))
-        # Newton's steps are all taken: towards a saddle of the cost, too.
+        # Every Newton step is taken, because it may lead to a saddle of the cost.
         better = newton | (finite & (new.cost < old.cost))
         z, new = select(better, (z + d, new), (z, old))
-        # Marquardt's rule. The radius bounds the step in the largest entry, because far
-        # from the guess the model may have other roots.
+        # Marquardt's rule. The radius bounds the largest entry of the step, because the
+        # model may have other roots far from the guess.
         damping = jnp.where(better, jnp.maximum(damping / 4, eps), damping * 4)
         radius = jnp.where(better, 2 * radius, jnp.max(jnp.abs(d)) / 4)
         diagonal = jnp.diagonal(new.gram)
-        # Scaled by the diagonal, so that units don't matter; unknowns that no equation
-        # has would make it singular.
+        # Scaled by the diagonal, so that units do not matter. The floor is for unknowns
+        # that appear in no equation.
         floor = eps * (jnp.max(diagonal) + eps)
         damped = new.gram + jnp.diag(damping * (diagonal + floor))
         matrix = jnp.where(newton, new.slope, damped)
@@ -289,28 +303,28 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
             *select(new.cost < best[0], here, best[:-1]),
             jnp.where(newton, best[-1], gap),
         )
-        # One more step after convergence, whose error is the square of the last one.
+        # After convergence one more step is taken, which squares the error.
         converged, done = newton & small, converged
         newton = newton | small | (step >= _MAX_STEPS)
         return step + 1, newton, converged, done, z, d, damping, radius, new, best
 
     no = jnp.array(False)
     best = inf, zero, blank.drift, blank.jacobian, inf
-    # The first step is zero: it expands the guess inside the loop, and counts as a
-    # success, after which the damping is 1/4 and the radius 1.
+    # The first step is zero, so that the guess is expanded inside the loop. It counts
+    # as a success, after which the damping is 1/4 and the radius 1.
     start = jnp.array(0), no, no, no, zero, zero, one, one / 2, blank, best
     end = lax.while_loop(proceeds, body, start)
     *_, z, d, _, _, point, (cost, *best) = end
     gap = jnp.max(jnp.abs(d))
-    # Newton's method may converge to another stationary point, of a larger residual
-    # than the best one visited.
+    # Newton's method may converge to a stationary point with a larger residual than the
+    # best point so far.
     good = _settled(gap, z) & (point.cost <= 1.01 * cost + eps)
     return select(good, (z, point.drift, point.jacobian, gap), tuple(best))
 
 
 def _settled(gap: Array, z: Array) -> Array:
-    """Whether a step was short: at a multiple root, where Newton's method is slow and
-    the root known to a part of its digits, too."""
+    """Whether a step was short. The bound is loose, because at a multiple root Newton's
+    method is slow and reaches only a part of the digits."""
     return gap <= jnp.finfo(z.dtype).eps ** (1 / 3) * (1 + jnp.max(jnp.abs(z)))
 
 
@@ -324,8 +338,7 @@ def _nearest_jvp(primals, tangents):
         return _expand(problem, z, problem.terms(jacobian)).offset
 
     _, change = eqx.filter_jvp(lambda problem: offset(problem, z), primals, tangents)
-    # The implicit function theorem for offset(problem, z) = 0: d offset/dz dz =
-    # -change.
+    # From offset(problem, z) = 0 follows d(offset)/dz dz = -change.
     dz = -jnp.linalg.solve(jax.jacfwd(offset, 1)(primals[0], z), change)
     drift_at = lambda problem, z: problem.drift(problem.at(z))
     _, drift = eqx.filter_jvp(drift_at, (*primals, z), (*tangents, dz))
@@ -343,7 +356,7 @@ def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
     x, u = y[:n], y[n:]
     is_system = isinstance(model, AbstractSystem)
     share = relative_drift(drift, jacobian, x, u, is_map=not is_system)
-    # Relative to the terms that cancel in the drift, which set its rounding.
+    # Relative to the terms that cancel in the drift, because these set its rounding.
     rests = lax.stop_gradient(share) <= eps**0.5
     settled = _settled(offset, z)
     failure = choose(settled, RESULTS.no_equilibrium, RESULTS.not_converged)

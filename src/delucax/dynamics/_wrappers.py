@@ -15,22 +15,23 @@ from ._base import AbstractDynamics, AbstractWrapper
 
 
 class WorstCase(AbstractWrapper):
-    """Dynamics with an adversary that measures the state and adds to the disturbance,
+    r"""Dynamics with an adversary, which adds to the disturbance by state feedback.
 
-    `x_next = F(t, x, u, w + L difference(x, x_ref))`,
+    $$x_{k+1} = F(t_k, x_k, u_k, w_k + L (x_k - x_\mathrm{ref}))$$
 
-    about the operating point that the dynamics define. With the `L` of
-    [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][] it is the
-    worst disturbance of the H-infinity game; a `bound` keeps it within what a
-    disturbance can be.
+    Here $x_\mathrm{ref}$ is the equilibrium of the dynamics, and their `difference`
+    measures the deviation. With the `L` of [`delucax.controllers.HInfinity`][] or of
+    [`delucax.riccati.hinf_dare`][], the adversary plays the worst disturbance of the
+    H-infinity game. Use `bound` to keep it realistic.
 
     **Arguments:**
 
-    - `dynamics`: the plant, which defines an equilibrium.
-    - `L`: the adversary's gain, shape `(k, n)`.
-    - `bound`: what it adds is scaled back to this Euclidean norm; none by default.
+    - `dynamics`: the plant, an [`delucax.AbstractDynamics`][] with an `equilibrium`.
+    - `L`: the gain of the adversary, shape `(k, n)`.
+    - `bound`: the largest Euclidean norm of the adversary's disturbance; a larger one
+        is scaled back. None by default.
 
-    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics` or defines no
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics` or has no
     equilibrium, `L` does not fit it, or `bound` is not positive.
 
     Source: Basar and Bernhard, 1995.
@@ -49,6 +50,10 @@ class WorstCase(AbstractWrapper):
         env = dlx.Environment(attacked, dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)))
         x0 = jnp.ones(2)
         dlx.rollout(env, robust, key=jax.random.key(0), x0=x0, horizon=50).total_cost
+        ```
+
+        ```text
+        Array(22.54, dtype=float32)
         ```
     """
 
@@ -74,9 +79,9 @@ class WorstCase(AbstractWrapper):
     def attack(self, x: Array) -> Array:
         """The adversary's part of the disturbance.
 
-        **Arguments:** `x`: the state.
+        **Arguments:** `x`: the state, shape `(n,)`.
 
-        **Returns:** shape `(k,)`.
+        **Returns:** the disturbance, shape `(k,)`.
         """
         x_ref, _ = self.dynamics.equilibrium()
         added = matvec(self.L, self.dynamics.difference(x, x_ref)).astype(x.dtype)
@@ -95,7 +100,6 @@ class WorstCase(AbstractWrapper):
         return self.dynamics.advance_with_events(t, x, u, self._attacked(x, w))
 
     def _attacked(self, x, w):
-        # Added to the environment's own disturbance, which the adversary does not
-        # replace.
+        # The adversary adds to the environment's own disturbance.
         added = self.attack(x)
         return added if w is None else w + added
