@@ -95,13 +95,13 @@ def test_weights_are_differentiable():
             lambda: dlx.costs.Tracking(Q, R, lambda t: jnp.ones(3))(
                 0.0, jnp.ones(2), jnp.ones(1)
             ),
-            "must fit",
+            "must have the same size",
         ),
         (
             lambda: dlx.costs.Tracking(Q, Q, lambda t: jnp.ones(2))(
                 0.0, jnp.ones(2), jnp.ones(1)
             ),
-            r"Tracking: R has shape \(2, 2\) but the control has shape \(1,\)",
+            r"Tracking: R has shape \(2, 2\), but the control has shape \(1,\)",
         ),
         (
             lambda: dlx.costs.Tracking(Q, R, lambda t: jnp.ones(2), final=jnp.eye(3)),
@@ -180,7 +180,7 @@ def test_what_cannot_be_added():
         cost * "2"  # pyright: ignore
     with user_error(match="factor must be a number"):
         jnp.ones(2) * cost
-    with user_error(match="Sum: at least one"):
+    with user_error(match="Sum: terms must be at least one cost"):
         dlx.costs.Sum()
     with user_error(match="every term must be an AbstractCost"):
         dlx.costs.Sum(cost, 1.0)  # pyright: ignore

@@ -1,4 +1,4 @@
-"""Stage and final costs; a cost is minus a reward."""
+"""Stage and final costs. A cost is minus a reward."""
 
 from typing import TYPE_CHECKING
 

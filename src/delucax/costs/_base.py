@@ -1,4 +1,4 @@
-"""Stage and final costs, and costs made of functions and of other costs."""
+"""The base class of costs, and costs made of functions or of other costs."""
 
 import abc
 import functools
@@ -23,13 +23,17 @@ from ..systems import AbstractPlant
 
 
 class AbstractCost(eqx.Module):
-    """A stage cost `c(t, x, u)` and a final cost.
+    r"""A cost: a stage cost $c(t, x, u)$ and a final cost.
 
-    A cost is minus a reward. The stage cost is charged at the current state and the
-    control that was applied, once per step; the final cost once, at the last state or
-    on entering a terminated one.
+    A cost is minus a reward. The stage cost is charged once per step, at the current
+    state and the control that was applied. The final cost is charged once: at the last
+    state, or at the state that terminates the episode.
 
-    Add two with `+`, and multiply one by a number with `*`.
+    Subclass it and write `__call__`; override `final` for a final cost. Add two costs
+    with `+`, and multiply a cost by a number with `*`.
+
+    **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
+    or violates its constraint.
 
     !!! example
 
@@ -43,6 +47,10 @@ class AbstractCost(eqx.Module):
 
         Effort()(0.0, jnp.zeros(2), jnp.ones(1))
         ```
+
+        ```text
+        Array(1., dtype=float32)
+        ```
     """
 
     def __check_init__(self):
@@ -50,29 +58,32 @@ class AbstractCost(eqx.Module):
 
     @property
     def targets(self) -> tuple[Array | None, Array | None] | None:
-        """The target of the state and that of the control, each `None` where there is
-        none; `None` alone, as by default, for a cost without a fixed target.
+        """The targets `(x, u)` of the cost: the state and the control at which it is
+        smallest. Each is `None` if the cost has no such target. The default, for a cost
+        without any fixed target, is a single `None`.
 
-        A cost made of others has the first target of each that they have. Planners use
-        it for their default start; see [`delucax.planning.Start.default`][].
+        A cost made of other costs takes the first target that one of them has. Planners
+        use the targets for their default start; see
+        [`delucax.planning.Start.default`][].
         """
         named = [part.targets for part in parts_of(self, AbstractCost)]
         pairs = [pair for pair in named if pair is not None]
         if not pairs:
             return None
-        # The first term that has a target decides, so that a penalty may be added.
+        # The first term with a target decides, so that a penalty may be added to it.
         first = lambda values: next((a for a in values if a is not None), None)
         return first(x for x, _ in pairs), first(u for _, u in pairs)
 
     def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
-        """The state and the control to regulate a plant about: the `targets` where
-        there are both, else the equilibrium of the plant, else the target that is
-        given, with zeros for the other.
+        """The state and the control about which to regulate a plant.
+
+        These are the `targets` if the cost has both, else the equilibrium of the plant,
+        else the one target of the cost, with zeros for the other.
 
         **Arguments:** `plant`: a system or dynamics.
 
-        **Returns:** `(x, u)`; `None` if none of these is defined, or the sizes do not
-        fit.
+        **Returns:** `(x, u)`, shapes `(n,)` and `(m,)`; or `None` if none of these
+        exists, or the sizes do not fit the plant.
         """
         x, u = targets = self.targets or (None, None)
         if x is None or u is None:
@@ -87,11 +98,11 @@ class AbstractCost(eqx.Module):
                     for at, size in zip(targets, sizes, strict=True)
                 )
         x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
-        # Whoever uses the point reports a size that does not fit.
+        # None, not an error: the caller reports what it needs the point for.
         fits = x.shape == (plant.state_size,) and u.shape == (plant.control_size,)
         return (x, u) if fits else None
 
-    # So that a NumPy number times a cost is left to `__rmul__`.
+    # Without this, a NumPy number times a cost would not call `__rmul__`.
     __array_ufunc__: ClassVar = None
 
     def __add__(self, other: "AbstractCost") -> "AbstractCost":
@@ -114,7 +125,8 @@ class AbstractCost(eqx.Module):
     def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
         """The stage cost.
 
-        **Arguments:** `t`: time. `x`: state. `u`: control that was applied.
+        **Arguments:** `t`: time, a scalar. `x`: state, shape `(n,)`. `u`: control that
+            was applied, shape `(m,)`.
 
         **Returns:** a scalar.
         """
@@ -122,7 +134,7 @@ class AbstractCost(eqx.Module):
     def final(self, t: RealScalar, x: State) -> Array:
         """The final cost; 0 by default.
 
-        **Arguments:** `t`: time. `x`: the last state.
+        **Arguments:** `t`: time, a scalar. `x`: the last state, shape `(n,)`.
 
         **Returns:** a scalar.
         """
@@ -131,12 +143,14 @@ class AbstractCost(eqx.Module):
 
 
 class Function(AbstractCost):
-    """A cost from functions.
+    """A cost made of functions.
 
     **Arguments:**
 
-    - `stage`: `(t, x, u) -> scalar`.
-    - `final_cost`: `(t, x) -> scalar`; zero by default.
+    - `stage`: the stage cost, a function `(t, x, u) -> scalar`.
+    - `final_cost`: the final cost, a function `(t, x) -> scalar`; zero by default.
+
+    **Raises:** `ValueError` if one is not a function.
 
     !!! example
 
@@ -146,6 +160,10 @@ class Function(AbstractCost):
 
         cost = dlx.costs.Function(lambda t, x, u: jnp.sum(x**2) + jnp.sum(u**2))
         cost(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(2., dtype=float32)
         ```
     """
 
@@ -162,12 +180,14 @@ class Function(AbstractCost):
 
 
 class Sum(AbstractCost):
-    """The sum of several costs, `c_1(t, x, u) + ... + c_n(t, x, u)`, and of their final
-    costs. `cost + other` makes it.
+    r"""The sum of several costs, $c_1(t, x, u) + \dots + c_n(t, x, u)$. Final costs are
+    summed too. `cost + other` makes one.
 
-    **Arguments:** `*terms`: the costs, at least one.
+    **Arguments:**
 
-    **Raises:** `ValueError` if no cost is given, or one is not an `AbstractCost`.
+    - `*terms`: the costs, at least one.
+
+    **Raises:** `ValueError` if there is no cost, or one is not an `AbstractCost`.
 
     !!! example
 
@@ -179,6 +199,10 @@ class Sum(AbstractCost):
         cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)) + 0.1 * effort
         cost(0.0, jnp.ones(2), jnp.ones(1))
         ```
+
+        ```text
+        Array(3.1, dtype=float32)
+        ```
     """
 
     terms: tuple[AbstractCost, ...]
@@ -188,7 +212,7 @@ class Sum(AbstractCost):
 
     def __check_init__(self):
         if not self.terms:
-            raise ValueError("Sum: at least one cost must be given.")
+            raise ValueError("Sum: terms must be at least one cost, got none.")
         for term in self.terms:
             check_instance(term, AbstractCost, "every term", "Sum")
 
@@ -200,22 +224,29 @@ class Sum(AbstractCost):
 
 
 class Scaled(AbstractCost):
-    """A cost times a number, `factor c(t, x, u)`, and so its final cost.
-    `factor * cost` makes it.
+    r"""A cost times a number, $a\, c(t, x, u)$. The final cost is scaled too.
+    `factor * cost` makes one.
 
     **Arguments:**
 
-    - `cost`: the cost.
-    - `factor`: a number; it can be differentiated.
+    - `cost`: the cost, an [`delucax.AbstractCost`][].
+    - `factor`: $a$, a number. You can differentiate with respect to it.
 
-    **Raises:** `ValueError` if `cost` is not one, or `factor` is not a finite number.
+    **Raises:** `ValueError` if `cost` is not a cost, or `factor` is not a finite
+    number.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
 
         doubled = 2 * dlx.costs.PendulumCost()
+        doubled(0.0, jnp.array([0.5, 0.0]), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(0.5, dtype=float32)
         ```
     """
 
@@ -234,24 +265,30 @@ class Scaled(AbstractCost):
 
 
 class Rate(AbstractCost):
-    """A cost per second, charged for a step of `dt`: `c(t, x, u) dt`.
+    r"""A cost per unit of time, charged for a step: $c(t, x, u)\, \Delta t$.
 
-    The sum approximates the integral over time, so that weights need not change with
-    `dt`. The final cost is unchanged.
+    The sum over the steps approximates an integral over time, so you can change `dt`
+    without changing the weights. The final cost is unchanged.
 
     **Arguments:**
 
-    - `cost`: the cost per second.
-    - `dt`: the step.
+    - `cost`: the cost per unit of time, an [`delucax.AbstractCost`][].
+    - `dt`: the step $\Delta t$, in units of time.
 
-    **Raises:** `ValueError` if `dt` is not positive.
+    **Raises:** `ValueError` if `cost` is not a cost, or `dt` is not positive.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
 
         cost = dlx.costs.Rate(dlx.costs.PendulumCost(), dt=0.05)
+        cost(0.0, jnp.array([0.5, 0.0]), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(0.0125, dtype=float32)
         ```
     """
 

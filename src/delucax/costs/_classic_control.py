@@ -1,4 +1,4 @@
-"""Costs of Gym's classic control, and smooth ones in their place."""
+"""The costs of Gym's classic control tasks, and a smooth alternative."""
 
 from collections.abc import Callable
 
@@ -12,19 +12,19 @@ from ._base import AbstractCost
 
 
 class Arrival(AbstractCost):
-    """`step_cost + control_weight u'u` per step, and `arrival_cost` once, if the last
-    state is a goal.
+    r"""A sparse cost: a constant $a$ and an effort $b\, u^\top u$ per step, and a final
+    cost $c$ if the last state is a goal.
 
-    The costs of most Gym tasks. It is sparse: the gradient with respect to the state is
-    0 almost everywhere.
+    Most Gym tasks have such a cost. Its gradient with respect to the state is 0 almost
+    everywhere, so gradient-based planners and policy gradients learn nothing from it.
 
     **Arguments:**
 
-    - `reached`: `(t, x) -> bool`, whether the state is a goal; usually the `terminated`
-        of the environment. Never by default.
-    - `step_cost`: 1 by default.
-    - `control_weight`: 0 by default.
-    - `arrival_cost`: 0 by default; a reward is negative.
+    - `reached`: whether the state is a goal, a function `(t, x) -> bool`. Usually it is
+        the `terminated` of the environment. Never by default.
+    - `step_cost`: $a$, 1 by default.
+    - `control_weight`: $b$, 0 by default.
+    - `arrival_cost`: $c$, 0 by default. Give a negative number for a reward.
 
     **Raises:** `ValueError` if a number is not finite.
 
@@ -36,6 +36,10 @@ class Arrival(AbstractCost):
 
         cost = dlx.costs.Arrival(lambda t, x: x[0] > 1, arrival_cost=-100.0)
         cost.final(0.0, jnp.array([1.5, 0.0]))
+        ```
+
+        ```text
+        Array(-100., dtype=float32)
         ```
     """
 
@@ -51,19 +55,24 @@ class Arrival(AbstractCost):
     def final(self, t: RealScalar, x: State) -> Scalar:
         if self.reached is None:
             return super().final(t, x)
-        # Once, at the end: the goal terminates the episode.
+        # A final cost is charged once, because the goal terminates the episode.
         return jnp.where(self.reached(t, x), self.arrival_cost, 0.0).astype(x.dtype)
 
 
 class PendulumCost(AbstractCost):
-    """`wrap(angle)^2 + velocity_weight velocity^2 + torque_weight torque^2`.
+    r"""The cost of Gym's pendulum.
 
-    Smooth but for the jump of the slope where the pendulum hangs straight down.
+    $$\operatorname{wrap}(\theta)^2 + a\, \dot\theta^2 + b\, \tau^2$$
+
+    Here $\theta$ is the angle from upright and $\tau$ the torque. The cost is smooth,
+    except that its slope jumps where the pendulum hangs straight down.
 
     **Arguments:**
 
-    - `velocity_weight`: 0.1 by default.
-    - `torque_weight`: 0.001 by default.
+    - `velocity_weight`: $a$, 0.1 by default.
+    - `torque_weight`: $b$, 0.001 by default.
+
+    **Raises:** `ValueError` if a number is not finite.
 
     Source: Gymnasium (Towers et al., 2023), minus the reward of `Pendulum-v1`.
 
@@ -74,6 +83,10 @@ class PendulumCost(AbstractCost):
         import jax.numpy as jnp
 
         dlx.costs.PendulumCost()(0.0, jnp.array([0.5, 0.0]), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(0.25, dtype=float32)
         ```
     """
 
@@ -90,27 +103,36 @@ class PendulumCost(AbstractCost):
 
 
 class AcrobotHeight(AbstractCost):
-    """The squared height deficit of the tip of the acrobot:
+    r"""A smooth cost for the acrobot: the squared distance in height of its tip from
+    upright.
 
-    `(2 + cos(angle_1) + cos(angle_1 + angle_2))^2 + velocity_weight (velocity_1^2 +
-    velocity_2^2) + torque_weight torque^2`, and at the end `final_weight` times the
-    part that is of the state.
+    $$q(x) + b\, \tau^2, \qquad q(x) = (2 + \cos\theta_1 + \cos(\theta_1 + \theta_2))^2
+    + a\, (\dot\theta_1^2 + \dot\theta_2^2)$$
 
-    Smooth; 0 upright and at rest, 16 where both links hang at rest. The reward of
-    Gym's Acrobot-v1 has no gradient, so this is for planning and policy gradients.
+    The final cost is $c\, q(x)$. The cost $q$ is 0 upright and at rest, and 16 where
+    both links hang at rest. Use this cost for planning and policy gradients, because
+    the reward of Gym's Acrobot-v1 has no gradient.
 
     **Arguments:**
 
-    - `velocity_weight`: 0.01 by default.
-    - `torque_weight`: 0.01 by default.
-    - `final_weight`: 0 by default.
+    - `velocity_weight`: $a$, 0.01 by default.
+    - `torque_weight`: $b$, 0.01 by default.
+    - `final_weight`: $c$, 0 by default.
+
+    **Raises:** `ValueError` if a number is not finite.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
 
         env = dlx.make("acrobot", cost=dlx.costs.AcrobotHeight(), terminated=None)
+        env.cost(0.0, jnp.zeros(4), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(16., dtype=float32)
         ```
     """
 

@@ -27,7 +27,7 @@ from ._base import AbstractCost
 
 
 class _AbstractQuadratic(AbstractCost):
-    """Quadratic in an error of the state and one of the control."""
+    """A cost that is quadratic in an error of the state and one of the control."""
 
     Q: eqx.AbstractVar[Matrix | Vector]
     R: eqx.AbstractVar[Matrix | Vector]
@@ -56,7 +56,7 @@ class _AbstractQuadratic(AbstractCost):
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         if u.shape != self.R.shape[:1]:
             raise ValueError(
-                f"{type(self).__name__}: R has shape {self.R.shape} but the control "
+                f"{type(self).__name__}: R has shape {self.R.shape}, but the control "
                 f"has shape {u.shape}."
             )
         du = self._control_error(u)
@@ -69,17 +69,21 @@ class _AbstractQuadratic(AbstractCost):
 
 
 class Quadratic(_AbstractQuadratic):
-    """`(x - x*)' Q (x - x*) + (u - u*)' R (u - u*)`, and `(x - x*)' Qf (x - x*)`.
+    r"""A quadratic cost about a target.
+
+    $$(x - x^*)^\top Q (x - x^*) + (u - u^*)^\top R (u - u^*)$$
+
+    The final cost is $(x - x^*)^\top Q_f (x - x^*)$. There is no factor 1/2.
 
     **Arguments:**
 
     - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`.
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
-    - `final`: final weight Qf, as `Q`; none by default.
-    - `state_target`: x*, shape `(n,)`; zero by default.
-    - `control_target`: u*, shape `(m,)`; zero by default.
-    - `difference`: `(x, x*) -> deviation`, such as `system.difference`, which wraps
-        angles; subtraction by default.
+    - `final`: final weight $Q_f$, of a shape like `Q`; no final cost by default.
+    - `state_target`: $x^*$, shape `(n,)`; zero by default.
+    - `control_target`: $u^*$, shape `(m,)`; zero by default.
+    - `difference`: a function `(x, x_target) -> deviation` that replaces $x - x^*$,
+        such as `system.difference`, which wraps angles; subtraction by default.
 
     **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if a
     target does not fit.
@@ -93,6 +97,10 @@ class Quadratic(_AbstractQuadratic):
         cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1), final=10 * jnp.eye(2))
         same = dlx.costs.Quadratic(jnp.ones(2), jnp.ones(1), final=10 * jnp.ones(2))
         cost(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(2., dtype=float32)
         ```
     """
 
@@ -118,7 +126,7 @@ class Quadratic(_AbstractQuadratic):
         self.difference = difference
 
     def __check_init__(self):
-        # A weight that is no array is reported by the base class.
+        # The base class reports a weight that is not an array.
         for name, weight in (("state_target", self.Q), ("control_target", self.R)):
             target = getattr(self, name)
             if target is not None and jnp.ndim(weight) > 0:
@@ -131,12 +139,12 @@ class Quadratic(_AbstractQuadratic):
     def _state_error(self, t: RealScalar, x: State) -> Vector:
         if x.shape != self.Q.shape[:1]:
             raise ValueError(
-                f"Quadratic: Q has shape {self.Q.shape} but the state has shape "
+                f"Quadratic: Q has shape {self.Q.shape}, but the state has shape "
                 f"{x.shape}."
             )
         target = self.state_target
         if self.difference is not None:
-            # From zero, and not x itself, because the difference wraps angles.
+            # Also for a zero target, because the difference may wrap angles.
             return self.difference(x, jnp.zeros_like(x) if target is None else target)
         return x if target is None else x - target
 
@@ -145,19 +153,22 @@ class Quadratic(_AbstractQuadratic):
 
 
 class Tracking(_AbstractQuadratic):
-    """`e' Q e + u' R u` with `e = h(x) - r(t)`, and `e' Qf e` at the end.
+    r"""A quadratic cost on the error from a reference that moves.
 
-    It has no `targets`, as the reference moves.
+    $$e^\top Q e + u^\top R u, \qquad e = h(x) - r(t)$$
+
+    The final cost is $e^\top Q_f e$. The cost has no `targets`, because the reference
+    moves.
 
     **Arguments:**
 
     - `Q`: error weight, shape `(p, p)`, symmetric; or its diagonal, shape `(p,)`.
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
-    - `reference`: any function of time to a vector of size p, such as those in
+    - `reference`: $r$, a function of time to a vector of shape `(p,)`, such as those in
         `delucax.references`.
-    - `final`: final weight Qf, as `Q`; none by default.
-    - `output`: h, from the state to the vector that follows the reference; the state
-        itself by default.
+    - `final`: final weight $Q_f$, of a shape like `Q`; no final cost by default.
+    - `output`: $h$, a function of the state to the vector that should follow the
+        reference, shape `(p,)`; the state itself by default.
 
     **Raises:** `ValueError` if a weight is not square, symmetric and finite, or does
     not fit what it weighs.
@@ -171,6 +182,10 @@ class Tracking(_AbstractQuadratic):
         circle = lambda t: jnp.stack([jnp.cos(t), jnp.sin(t)])
         cost = dlx.costs.Tracking(jnp.eye(2), jnp.eye(1), circle)
         cost(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+
+        ```text
+        Array(1., dtype=float32)
         ```
     """
 
@@ -200,17 +215,16 @@ class Tracking(_AbstractQuadratic):
         r = self.reference(t)
         if jnp.shape(r) != y.shape or y.shape != self.Q.shape[:1]:
             raise ValueError(
-                f"Tracking: Q has shape {self.Q.shape}, the output {y.shape} and the "
-                f"reference {jnp.shape(r)}; these must fit."
+                "Tracking: Q, the output and the reference must have the same size, "
+                f"got shapes {self.Q.shape}, {y.shape} and {jnp.shape(r)}."
             )
         return y - r
 
 
 def _form(weight: Matrix | Vector, d: Vector) -> Scalar:
-    """`d' weight d`, the weight a matrix or its diagonal."""
-    # Written out for small sizes, which fuses in the loop of a rollout.
-    # Without the factor 1/2 of some textbooks: the Hessian is twice the weight, and the
-    # weights are those of the Riccati equations as they are.
+    """`d' weight d`, where the weight is a matrix or its diagonal."""
+    # Without the factor 1/2 of some textbooks, so that the weights are those of the
+    # Riccati equations.
     if weight.ndim == 2:
         return quadratic_form(weight, d)
     return dot(weight * d, d)

@@ -1,4 +1,4 @@
-"""Sequences of disturbances, drawn for a whole horizon at once."""
+"""Disturbances: sequences that are drawn for a whole episode at once."""
 
 from ._base import AbstractDisturbance as AbstractDisturbance, Sum as Sum
 from ._deterministic import (

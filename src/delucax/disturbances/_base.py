@@ -1,4 +1,4 @@
-"""Sequences of disturbances, drawn for a whole horizon at once."""
+"""The base class of disturbances, their sums and windows."""
 
 import abc
 import dataclasses
@@ -22,9 +22,18 @@ Rows: TypeAlias = Float[Array, "steps size"]
 
 
 class AbstractDisturbance(eqx.Module):
-    """A sequence `w[0], ..., w[T - 1]`, drawn at once for the whole horizon.
+    r"""A disturbance: a sequence $w_0, \dots, w_{T-1}$, drawn for the whole episode at
+    once.
 
-    Add two with `+`; confine one to a part of the time with `between`.
+    Subclass it, give `size` and write `sequence`. Add two disturbances with `+`, and
+    limit one to a window of time with `between`.
+
+    **Attributes:**
+
+    - `size`: entries per step.
+
+    **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
+    or violates its constraint.
 
     !!! example
 
@@ -36,6 +45,11 @@ class AbstractDisturbance(eqx.Module):
         noise = dlx.disturbances.Gaussian(0.1, size=2)
         gust = dlx.disturbances.Sinusoid(0.2, frequency=1.0, size=2).between(3.0, 6.0)
         w = (noise + gust).sequence(jax.random.key(0), 0.05 * jnp.arange(100))
+        w.shape
+        ```
+
+        ```text
+        (100, 2)
         ```
     """
 
@@ -49,9 +63,8 @@ class AbstractDisturbance(eqx.Module):
 
     @property
     def recorded_steps(self) -> int | None:
-        """The most steps that `sequence` gives; `None` for any number.
-
-        By default those of the shortest disturbance among its fields.
+        """The largest number of steps that `sequence` can give, or `None` if there is
+        no limit. By default, that of the shortest disturbance among the fields.
         """
         steps = [part.recorded_steps for part in parts_of(self, AbstractDisturbance)]
         return min((n for n in steps if n is not None), default=None)
@@ -62,10 +75,10 @@ class AbstractDisturbance(eqx.Module):
 
         **Arguments:**
 
-        - `key`: a random key; deterministic disturbances also take `None`.
-        - `times`: the start of each step, shape `(T,)`, increasing. A rollout gives
-            `0, dt, ...` in the precision of the state, so a time of `k dt` is rounded:
-            compare it with another to the nearest step, not exactly.
+        - `key`: a random key, or `None` for a deterministic disturbance.
+        - `times`: the start of each step, shape `(T,)`, increasing. A rollout passes
+            `0, dt, 2 dt, ...`, rounded to the precision of the state. Compare times to
+            the nearest step, not exactly.
 
         **Returns:** shape `(T, size)`.
         """
@@ -75,17 +88,17 @@ class AbstractDisturbance(eqx.Module):
 
         **Arguments:**
 
-        - `key`: of `sequence`.
-        - `dt`: the control interval.
+        - `key`: a random key, or `None`; passed to `sequence`.
+        - `dt`: the control interval, a scalar.
         - `steps`: the number of steps.
-        - `dtype`: the precision of the times.
+        - `dtype`: the dtype of the times.
 
         **Returns:** shape `(steps, size)`.
 
         **Raises:** `ValueError` if `sequence` returns another shape.
         """
-        # Two times at least, because Brownian motion infers the interval from them; but
-        # no more than are recorded.
+        # At least two times, because Brownian motion infers the interval from them,
+        # unless a recording has only one.
         recorded = self.recorded_steps
         count = max(steps, 2 if recorded is None else min(recorded, 2))
         w = self.sequence(key, (jnp.arange(count) * dt).astype(dtype))
@@ -99,17 +112,19 @@ class AbstractDisturbance(eqx.Module):
         return w[:steps]
 
     def between(self, start: ArrayLike, stop: ArrayLike) -> "AbstractDisturbance":
-        """The disturbance inside a time window, `start <= t < stop`, and zero outside.
+        r"""This disturbance inside a window of time, $\mathrm{start} \le t <
+        \mathrm{stop}$, and zero outside.
 
-        An end within rounding error of the time of a step is snapped to it, so that a
-        window of 5 steps acts on 5.
+        An end of the window that is within rounding of a step is moved to that step, so
+        that a window of 5 steps acts on 5 steps.
 
         **Arguments:** `start`, `stop`: the ends of the window, in units of time.
 
         **Returns:** the disturbance.
 
-        **Raises:** `ValueError` if `stop` is before `start`; or for a horizon of more
-        than 2^22 steps in single precision, whose times are too coarse for the steps.
+        **Raises:** `ValueError` if `stop` is before `start`. Also if the horizon has
+        more than 2^22 steps in single precision, because its times are then too coarse
+        for the steps.
         """
         return _Window(self, start, stop)
 
@@ -124,22 +139,31 @@ class AbstractDisturbance(eqx.Module):
 
 
 class Sum(AbstractDisturbance):
-    """The sum of several disturbances, each drawn with a key of its own.
+    """The sum of several disturbances. Each term is drawn with a key of its own.
+    `disturbance + other` makes one.
 
-    **Arguments:** `*terms`: disturbances of one size.
+    **Arguments:**
 
-    **Raises:** `ValueError` if none is given, if one is not an
-    `AbstractDisturbance`, or if sizes differ.
+    - `*terms`: disturbances of the same size, at least one.
+
+    **Raises:** `ValueError` if there is none, if one is not an `AbstractDisturbance`,
+    or if sizes differ.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
 
-        both = dlx.disturbances.Sum(
-            dlx.disturbances.Gaussian(0.1, size=2),
-            dlx.disturbances.Constant(0.5, size=2),
-        )
+        offset = dlx.disturbances.Constant(0.5, size=2)
+        wave = dlx.disturbances.Sinusoid(jnp.array([0.0, 1.0]), frequency=0.25)
+        dlx.disturbances.Sum(offset, wave).sequence(None, jnp.arange(3.0))
+        ```
+
+        ```text
+        Array([[0.5, 0.5],
+               [0.5, 1.5],
+               [0.5, 0.5]], dtype=float32)
         ```
     """
 
@@ -153,7 +177,9 @@ class Sum(AbstractDisturbance):
             check_instance(term, AbstractDisturbance, "every term", "Sum")
         sizes = [term.size for term in self.terms]
         if len(set(sizes)) != 1:
-            raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
+            raise ValueError(
+                f"Sum: terms must have the same size, got sizes {sizes}."
+            )
 
     @property
     def size(self) -> int:
@@ -164,8 +190,7 @@ class Sum(AbstractDisturbance):
         n = len(self.terms)
         if key is not None:
             check_key(key, "Sum")
-        # A key for each term: with one key for all, equal terms would draw the same
-        # noise.
+        # With one key for all, equal terms would draw the same noise.
         keys = [None] * n if key is None else list(jr.split(key, n))
         drawn = (w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True))
         return functools.reduce(operator.add, drawn)
@@ -193,14 +218,14 @@ class _Window(AbstractDisturbance):
     def _cut(self, w: Rows, times: Vector, dt: Any) -> Rows:
         inside = reached(times, self.start, dt) & ~reached(times, self.stop, dt)
         w = jnp.where(inside[:, None], w, jnp.zeros((), w.dtype))
-        # A step of NaN says that the times are too coarse: the result is then NaN too,
-        # and not a window at the wrong place.
+        # A step of NaN means that the times are too coarse. The result is then NaN too,
+        # not a window in the wrong place.
         return w if dt is None else jnp.where(jnp.isnan(dt), jnp.nan, w)
 
 
 class AbstractEntrywise(AbstractDisturbance):
-    """A disturbance whose arguments are numbers, the same for each entry, or vectors of
-    `size` entries.
+    """A disturbance whose arguments are vectors of `size` entries, or numbers that hold
+    for every entry.
     """
 
     def __post_init__(self):
@@ -218,23 +243,23 @@ class AbstractEntrywise(AbstractDisturbance):
             if array.ndim == 1:
                 if size is not None and array.shape[0] != size:
                     raise ValueError(
-                        f"{where}: {name} has {array.shape[0]} entries where {size} "
-                        "are expected."
+                        f"{where}: {name} must have {size} entries, got "
+                        f"{array.shape[0]}."
                     )
                 size = array.shape[0]
         if size is None:
             raise ValueError(
-                f"{where}: size must be given when every other argument is a number, "
-                f"such as {where}(..., size=2)."
+                f"{where}: size must be given if every other argument is a number, as "
+                f"in {where}(..., size=2)."
             )
         return check_count(size, "size", where)
 
     def _rows(self, w: Array, times: Vector) -> Array:
-        """`w`, of one step or of all, for all `times`."""
+        """`w`, for one step or for all, broadcast to all `times`."""
         return jnp.broadcast_to(w, (len(times), self.size)).astype(times.dtype)
 
 
 def as_size(size: int | None) -> int | None:
-    """The size as given: a converter, so that `None` may stand for what the other
-    fields say."""
+    """The size unchanged. As a converter, it lets a field of type `int` be `None` until
+    the other fields have given the size."""
     return size

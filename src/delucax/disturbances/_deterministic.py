@@ -16,9 +16,13 @@ from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 
 
 class Zero(AbstractDisturbance):
-    """No disturbance.
+    """No disturbance: zeros.
 
-    **Arguments:** `size`: entries per step.
+    **Arguments:**
+
+    - `size`: entries per step.
+
+    **Raises:** `ValueError` if `size` is below 1.
 
     !!! example
 
@@ -27,6 +31,12 @@ class Zero(AbstractDisturbance):
         import jax.numpy as jnp
 
         dlx.disturbances.Zero(2).sequence(None, jnp.arange(3.0))
+        ```
+
+        ```text
+        Array([[0., 0.],
+               [0., 0.],
+               [0., 0.]], dtype=float32)
         ```
     """
 
@@ -40,11 +50,11 @@ class Zero(AbstractDisturbance):
 
 
 class Constant(AbstractEntrywise):
-    """`w[k] = value`.
+    """A constant disturbance, the same at every step.
 
     **Arguments:**
 
-    - `value`: a number, or a vector of `size` entries.
+    - `value`: a number, or shape `(size,)`.
     - `size`: entries per step; follows from `value` if that is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
@@ -56,6 +66,12 @@ class Constant(AbstractEntrywise):
         import jax.numpy as jnp
 
         dlx.disturbances.Constant(0.5, size=2).sequence(None, jnp.arange(3.0))
+        ```
+
+        ```text
+        Array([[0.5, 0.5],
+               [0.5, 0.5],
+               [0.5, 0.5]], dtype=float32)
         ```
     """
 
@@ -69,12 +85,13 @@ class Constant(AbstractEntrywise):
 def shock(
     value: Any, start: Any, duration: Any, *, size: int | None = None
 ) -> AbstractDisturbance:
-    """A constant push for a while: a `Constant`, `between` two times.
+    """A push: a constant disturbance for a while, and zero before and after.
 
     **Arguments:**
 
-    - `value`: a number, or a vector of `size` entries.
-    - `start`, `duration`: in units of time.
+    - `value`: a number, or shape `(size,)`.
+    - `start`: when it starts, in units of time.
+    - `duration`: how long it lasts, in units of time.
     - `size`: entries per step; follows from `value` if that is a vector.
 
     **Returns:** the disturbance.
@@ -88,7 +105,15 @@ def shock(
         import delucax as dlx
         import jax.numpy as jnp
 
-        push = dlx.disturbances.shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
+        push = dlx.disturbances.shock(jnp.array([0.0, 0.5]), start=1.0, duration=2.0)
+        push.sequence(None, jnp.arange(4.0))
+        ```
+
+        ```text
+        Array([[0. , 0. ],
+               [0. , 0.5],
+               [0. , 0.5],
+               [0. , 0. ]], dtype=float32)
         ```
     """
     check_range(duration, "duration", "shock")
@@ -97,14 +122,16 @@ def shock(
 
 
 class Sinusoid(AbstractEntrywise):
-    """`w[k] = amplitude sin(2 pi frequency t_k + phase) + offset`.
+    r"""A sine wave.
 
-    **Arguments:** each a number or a vector of `size` entries.
+    $$w_k = a \sin(2 \pi f t_k + \phi) + b$$
 
-    - `amplitude`.
-    - `frequency`: in hertz if time is in seconds.
-    - `phase`: in radians, 0 by default.
-    - `offset`: 0 by default.
+    **Arguments:** each is a number or has shape `(size,)`.
+
+    - `amplitude`: $a$.
+    - `frequency`: $f$, in hertz if time is in seconds.
+    - `phase`: $\phi$ [rad], 0 by default.
+    - `offset`: $b$, 0 by default.
     - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
@@ -117,6 +144,14 @@ class Sinusoid(AbstractEntrywise):
 
         wind = dlx.disturbances.Sinusoid(jnp.array([0.0, 0.2]), frequency=0.5)
         wind.sequence(None, 0.1 * jnp.arange(5))
+        ```
+
+        ```text
+        Array([[0.   , 0.   ],
+               [0.   , 0.062],
+               [0.   , 0.118],
+               [0.   , 0.162],
+               [0.   , 0.19 ]], dtype=float32)
         ```
     """
 
@@ -136,22 +171,23 @@ class Sinusoid(AbstractEntrywise):
 
 
 class Square(AbstractEntrywise):
-    """`w[k] = amplitude` in the first part of each period and `-amplitude` in the rest.
+    """A square wave: `+amplitude` in the first part of each period, `-amplitude` in the
+    rest.
 
-    **Arguments:** each a number or a vector of `size` entries.
+    A period that is within rounding of a whole number of steps lasts that number of
+    steps; the same holds for its first part. The gradient with respect to `period` and
+    `duty` is zero almost everywhere.
 
-    - `amplitude`.
+    **Arguments:** each is a number or has shape `(size,)`.
+
+    - `amplitude`: half of the distance between the two values.
     - `period`: in units of time, positive.
-    - `duty`: the part of a period at `+amplitude`, from 0 to 1; 0.5 by default.
+    - `duty`: the fraction of the period at `+amplitude`, from 0 to 1; 0.5 by default.
     - `size`: entries per step; follows from the others if one is a vector.
 
-    A period, or a part of one, within rounding of a whole number of steps is that
-    number of steps. The gradient with respect to `period` and `duty` is zero almost
-    everywhere.
-
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
-    positive, or `duty` is not between 0 and 1; or for a horizon of more than 2^22 steps
-    in single precision, whose times are too coarse for the steps.
+    positive, or `duty` is not between 0 and 1. Also if the horizon has more than 2^22
+    steps in single precision, because its times are then too coarse for the steps.
 
     !!! example
 
@@ -160,6 +196,13 @@ class Square(AbstractEntrywise):
         import jax.numpy as jnp
 
         dlx.disturbances.Square(0.3, period=2.0, size=1).sequence(None, jnp.arange(4.0))
+        ```
+
+        ```text
+        Array([[ 0.3],
+               [-0.3],
+               [ 0.3],
+               [-0.3]], dtype=float32)
         ```
     """
 
@@ -176,13 +219,14 @@ class Square(AbstractEntrywise):
 
     @eqx.filter_jit
     def _wave(self, times: Vector, dt: Any) -> Rows:
-        # In steps where the grid begins at 0; late times give their step less exactly.
+        # A grid that starts at 0 is counted in steps, which is exact. The step of a
+        # later grid is only known to rounding.
         unit = self.period if dt is None else jnp.where(times[0] == 0, dt, self.period)
         eps = coarsest(times, self.period, self.duty)
         at, period = (
             sum(position(t, unit, 0.0, eps)) for t in (times[:, None], self.period)
         )
-        # `slack` absorbs rounding error: steps are whole numbers.
+        # `slack` absorbs the rounding of whole numbers of steps.
         slack = jnp.minimum(2 * eps * (jnp.abs(at) + 1), 0.25)
         phase = at - period * jnp.floor((at + slack) / period)
         w = jnp.where(
@@ -195,11 +239,12 @@ class Square(AbstractEntrywise):
 class FromArray(AbstractDisturbance):
     """A recorded or hand-made sequence: `w[k] = values[k]`.
 
-    **Arguments:** `values`: shape `(steps, size)`, at least as many steps as the
-    horizon it is used for.
+    **Arguments:**
 
-    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or has too
-    few steps for the horizon.
+    - `values`: shape `(steps, size)`, with at least as many steps as the horizon.
+
+    **Raises:** `ValueError` at construction if `values` is not a matrix of finite
+    numbers, and in `sequence` if it has fewer steps than the horizon.
 
     !!! example
 
@@ -207,8 +252,13 @@ class FromArray(AbstractDisturbance):
         import delucax as dlx
         import jax.numpy as jnp
 
-        recorded = dlx.disturbances.FromArray(jnp.ones((100, 2)))
-        recorded.sequence(None, 0.05 * jnp.arange(50))
+        recorded = dlx.disturbances.FromArray([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]])
+        recorded.sequence(None, 0.05 * jnp.arange(2))
+        ```
+
+        ```text
+        Array([[0. , 0.1],
+               [0.2, 0.3]], dtype=float32)
         ```
     """
 
@@ -231,7 +281,7 @@ class FromArray(AbstractDisturbance):
         steps = times.shape[0]
         if self.values.shape[0] < steps:
             raise ValueError(
-                f"FromArray: values has {self.values.shape[0]} steps, fewer than the "
-                f"horizon of {steps}."
+                f"FromArray: values must have at least {steps} steps, the length of "
+                f"the horizon, got {self.values.shape[0]}."
             )
         return self.values[:steps].astype(times.dtype)

@@ -18,12 +18,12 @@ from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 
 
 class Gaussian(AbstractEntrywise):
-    """Independent normal noise, `w[k] ~ N(mean, std^2)`.
+    r"""Independent normal noise, $w_k \sim \mathcal{N}(\mu, \sigma^2)$.
 
-    **Arguments:** each a number or a vector of `size` entries.
+    **Arguments:** each is a number or has shape `(size,)`.
 
-    - `std`: standard deviation.
-    - `mean`: 0 by default.
+    - `std`: the standard deviation $\sigma$.
+    - `mean`: $\mu$, 0 by default.
     - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` is
@@ -37,7 +37,11 @@ class Gaussian(AbstractEntrywise):
         import jax.numpy as jnp
 
         noise = dlx.disturbances.Gaussian(0.1, size=2)
-        noise.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        noise.sequence(jax.random.key(0), 0.05 * jnp.arange(10)).shape
+        ```
+
+        ```text
+        (10, 2)
         ```
     """
 
@@ -58,11 +62,11 @@ class Gaussian(AbstractEntrywise):
 
 
 class Uniform(AbstractEntrywise):
-    """Independent uniform noise, `w[k] ~ U(low, high)`.
+    r"""Independent uniform noise, $w_k \sim \mathcal{U}(\mathrm{low}, \mathrm{high})$.
 
-    **Arguments:** each a number or a vector of `size` entries.
+    **Arguments:** each is a number or has shape `(size,)`.
 
-    - `low`, `high`: the ends.
+    - `low`, `high`: the ends of the interval.
     - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `high` is
@@ -76,7 +80,11 @@ class Uniform(AbstractEntrywise):
         import jax.numpy as jnp
 
         noise = dlx.disturbances.Uniform(-0.1, 0.1, size=2)
-        noise.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        noise.sequence(jax.random.key(0), 0.05 * jnp.arange(10)).shape
+        ```
+
+        ```text
+        (10, 2)
         ```
     """
 
@@ -97,13 +105,15 @@ class Uniform(AbstractEntrywise):
 
 
 class RandomWalk(AbstractEntrywise):
-    """A Gaussian random walk kept inside a bound:
-    `w[k + 1] = clip(w[k] + std e[k], -bound, bound)`, `e[k] ~ N(0, 1)`, `w[-1] = 0`.
+    r"""A Gaussian random walk that stays inside a bound.
 
-    **Arguments:** each a number or a vector of `size` entries.
+    $$w_k = \operatorname{clip}(w_{k-1} + \sigma e_k, -b, b), \qquad
+    e_k \sim \mathcal{N}(0, 1), \qquad w_{-1} = 0$$
 
-    - `std`: standard deviation of a step, 0.3 by default.
-    - `bound`: 1 by default.
+    **Arguments:** each is a number or has shape `(size,)`.
+
+    - `std`: $\sigma$, the standard deviation of a step, 0.3 by default.
+    - `bound`: $b$, 1 by default.
     - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` or
@@ -117,7 +127,11 @@ class RandomWalk(AbstractEntrywise):
         import jax.numpy as jnp
 
         walk = dlx.disturbances.RandomWalk(size=2)
-        walk.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        walk.sequence(jax.random.key(0), 0.05 * jnp.arange(10)).shape
+        ```
+
+        ```text
+        (10, 2)
         ```
     """
 
@@ -135,7 +149,7 @@ class RandomWalk(AbstractEntrywise):
     @eqx.filter_jit
     def _draw(self, key: PRNGKey, times: Vector) -> Rows:
         e = normal(key, (times.shape[0], self.size), times.dtype)
-        # In the precision of the times, as the carry of a scan must keep its type.
+        # In the precision of the times, because the carry of a scan must keep its type.
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
         def step(w, e):
@@ -146,20 +160,22 @@ class RandomWalk(AbstractEntrywise):
 
 
 class Brownian(AbstractDisturbance):
-    """Brownian increments for a system with a diffusion, `w[k] ~ N(0, dt / substeps)`.
+    r"""Brownian increments for a system with a diffusion,
+    $w_k \sim \mathcal{N}(0, \Delta t / \mathrm{substeps})$.
 
-    An environment whose system has a diffusion uses it by default.
+    It is the default disturbance of an environment whose system has a diffusion.
 
     **Arguments:**
 
-    - `size`: Brownian motions.
-    - `dt`: the control interval; by default the distance between the times of the
-        sequence, of which there must be two then.
-    - `substeps`: solver steps an interval, 1 by default; the increments of all of them
-        follow one another in `w`.
+    - `size`: the number of Brownian motions.
+    - `dt`: the control interval $\Delta t$, in units of time. By default it is the
+        distance between the times of the sequence, which then needs at least two.
+    - `substeps`: solver steps per interval, 1 by default. `w` holds the increments of
+        all substeps, one after the other.
 
-    **Raises:** `ValueError` if `dt` is not positive or `substeps` is below 1, or if
-    `dt` is left out and the precision of late times is too coarse for it.
+    **Raises:** `ValueError` if `size` or `substeps` is below 1 or `dt` is not positive.
+    If `dt` is left out, also if there are fewer than two times, or if late times are
+    too coarse to give it.
 
     !!! example
 
@@ -169,7 +185,11 @@ class Brownian(AbstractDisturbance):
         import jax.numpy as jnp
 
         increments = dlx.disturbances.Brownian(1, dt=0.05)
-        increments.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        increments.sequence(jax.random.key(0), 0.05 * jnp.arange(10)).shape
+        ```
+
+        ```text
+        (10, 1)
         ```
     """
 
@@ -189,8 +209,8 @@ class Brownian(AbstractDisturbance):
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         if self.dt is None and times.shape[0] < 2:
             raise ValueError(
-                f"Brownian: dt must be given for {times.shape[0]} times, which do not "
-                "define it."
+                "Brownian: dt must be given, because it does not follow from fewer "
+                f"than two times, got {times.shape[0]}."
             )
         dt = step_between(times, "Brownian") if self.dt is None else self.dt
         return self._increments(check_key(key, "Brownian"), times, dt)
@@ -198,5 +218,5 @@ class Brownian(AbstractDisturbance):
     @eqx.filter_jit
     def _increments(self, key: PRNGKey, times: Vector, dt: Any) -> Rows:
         e = normal(key, (times.shape[0], self.size), times.dtype)
-        # Increments of each substep: their variance is its length.
+        # The variance of an increment is the length of its substep.
         return (jnp.sqrt(dt / self.substeps) * e).astype(times.dtype)

@@ -1,4 +1,4 @@
-"""Reference signals `r(t)`: a few examples, as any function of time will do."""
+"""Reference signals `r(t)`. These are a few examples; any function of time works."""
 
 from ._signals import (
     Constant as Constant,

@@ -1,4 +1,4 @@
-"""Signals to follow, as functions of time."""
+"""Reference signals, as functions of time."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,11 +13,13 @@ from ..math._steps import step_at
 
 
 class Constant(eqx.Module):
-    """`r(t) = value`.
+    """A constant reference.
 
-    **Arguments:** `value`: a vector.
+    **Arguments:**
 
-    **Raises:** `ValueError` if `value` is not a finite vector.
+    - `value`: shape `(p,)`.
+
+    **Raises:** `ValueError` if `value` is not a vector of finite numbers.
 
     !!! example
 
@@ -26,6 +28,10 @@ class Constant(eqx.Module):
         import jax.numpy as jnp
 
         dlx.references.Constant(jnp.array([1.0, 0.0]))(0.3)
+        ```
+
+        ```text
+        Array([1., 0.], dtype=float32)
         ```
     """
 
@@ -41,13 +47,14 @@ class Constant(eqx.Module):
 
 
 class Sequence(eqx.Module):
-    """`r(t) = values[round(t / dt)]`; the last value is held after the end, and the
-    first one before the start.
+    """A reference from an array: `r(t) = values[round(t / dt)]`.
+
+    The first value is held before the start, and the last value after the end.
 
     **Arguments:**
 
     - `values`: shape `(steps, p)`.
-    - `dt`: the time between values.
+    - `dt`: the time between two values, in units of time.
 
     **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or `dt` is
     not positive.
@@ -60,6 +67,10 @@ class Sequence(eqx.Module):
 
         steps = dlx.references.Sequence(jnp.array([[0.0], [1.0]]), dt=0.5)
         steps(0.5)
+        ```
+
+        ```text
+        Array([1.], dtype=float32)
         ```
     """
 
@@ -75,19 +86,21 @@ class Sequence(eqx.Module):
         """The signal at time `t`."""
         count = self.values.shape[0]
         k = step_at(t, self.dt, count, "Sequence")
-        # Indexed, not interpolated: a rollout asks at the steps alone.
+        # Indexed, not interpolated, because a rollout only evaluates it at its steps.
         return self.values[jnp.clip(k, 0, count - 1)]
 
 
 class FigureEight(eqx.Module):
-    """The curve of Gerono: `r(t) = centre + (width sin(s), height sin(2 s))`,
-    `s = 2 pi t / period`.
+    r"""A figure of eight in the plane, Gerono's curve.
+
+    $$r(t) = c + (a \sin s, b \sin 2 s), \qquad s = 2 \pi t / T$$
 
     **Arguments:**
 
-    - `period`: the period of the curve.
-    - `width`, `height`: half the extent to each side, 1 by default.
-    - `centre`: shape `(2,)`, the origin by default.
+    - `period`: $T$, in units of time.
+    - `width`, `height`: $a$ and $b$, the extent from the centre to each side, 1 by
+        default.
+    - `centre`: $c$, shape `(2,)`, the origin by default.
 
     **Raises:** `ValueError` if the period is not positive.
 
@@ -97,6 +110,10 @@ class FigureEight(eqx.Module):
         import delucax as dlx
 
         dlx.references.FigureEight(period=8.0)(1.0)
+        ```
+
+        ```text
+        Array([0.707, 1.   ], dtype=float32)
         ```
     """
 
