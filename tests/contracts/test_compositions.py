@@ -660,9 +660,9 @@ def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     calm = dlx.Discretized(Spring(), dt=0.1)
     cost = dlx.costs.Quadratic(np.eye(2), np.eye(1))
     make = lambda dynamics: dlx.Environment(dynamics, cost)
-    with user_error(match="increments must be at least 1.*AbstractWrapper"):
+    with user_error(match="increments of Says must be at least 1.*AbstractWrapper"):
         make(Says(noisy))
-    hidden = "Environment: ByHand does not forward `noise` of the {} that it.*"
+    hidden = "Environment: ByHand must forward `noise` of the {} that it.*"
     hidden += "AbstractWrapper, or define `noise` in ByHand"
     with user_error(match=hidden.format("Discretized")):
         make(ByHand(noisy))
@@ -670,7 +670,7 @@ def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
         make(ByHand(dlx.dynamics.Delayed(noisy)))
     with user_error(match=hidden.format("Discretized")):
         make(Weak(Forwards(ByHand(noisy))))
-    with user_error(match="Euler does not forward `noise` of the Shaky"):
+    with user_error(match="Euler must forward `noise` of the Shaky"):
         make(Euler({"system": [Shaky()]}))
     with user_error(match=hidden.format("Discretized")):
         dlx.replace(make(calm), {"dynamics": ByHand(noisy)})

@@ -242,15 +242,15 @@ def test_a_smooth_acrobot_has_gradients(key):
                 torque_noise=0.1,
                 disturbance=dlx.disturbances.Gaussian(0.1, size=1),
             ),
-            "acrobot: give torque_noise or a disturbance, not both",
+            "acrobot: pass torque_noise or a disturbance, not both",
         ),
         (
             lambda: dlx.make("acrobot", solver=diffrax.Heun(), max_velocity_1=1.0),
-            "acrobot: max_velocity_1 applies to Gym's.*one of max_velocity_1 and",
+            "acrobot: max_velocity_1 applies only to Gym's.*max_velocity_1 or a solver",
         ),
         (
             lambda: dlx.make("cartpole", solver=diffrax.Heun(), semi_implicit=True),
-            "cartpole: semi_implicit applies to Gym's integrator",
+            "cartpole: semi_implicit applies only to Gym's",
         ),
         (lambda: dlx.make("cartpole", semi_implicit=1), "must be True or False, got 1"),
         (lambda: dlx.make("cartpole", half_length=0.0), "half_length must be positive"),

@@ -35,7 +35,7 @@ def test_register():
     assert_close(dlx.make("tests/pendulum", length=2.0).dynamics.system.length, 2.0)
     with user_error(match="entry_point must be 'module:function'"):
         dlx.register("tests/other", "delucax.environments.pendulum")
-    with user_error(match="is already"):
+    with user_error(match="already registered"):
         dlx.register("tests/pendulum", "delucax.environments:lds")
 
 
@@ -181,7 +181,7 @@ def test_replace_checks_and_converts():
         dlx.replace(env, {"control_bounds": (2.0, -2.0)})
     with user_error(match="cost must be an AbstractCost"):
         dlx.replace(env, {"cost": 3.0})
-    with user_error(match="disturbance has size 2 where 3 is expected"):
+    with user_error(match="disturbance must have size 3, got size 2"):
         dynamics = dlx.LinearDynamics(jnp.eye(3), jnp.ones((3, 1)))
         noise = dlx.disturbances.Gaussian(0.1, size=2)
         dlx.replace(env, {"dynamics": dynamics, "disturbance": noise})

@@ -208,7 +208,7 @@ def test_a_task_takes_a_system_or_its_arguments(name, constants):
     task = getattr(dlx.environments, name)
     assert eqx.tree_equal(task(system, horizon=3), by_name)
     constant = next(iter(constants))
-    with user_error(match=f"{name}: give a system or its {constant}, not both"):
+    with user_error(match=f"{name}: pass a system or its {constant}, not both"):
         task(system, **{constant: constants[constant]})
     with user_error(match=f"{name}: system must be an? {type(system).__name__}, got V"):
         task(dlx.systems.VanDerPol())
@@ -309,7 +309,7 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
             dict(wind="tornado"),
             "one of 'dissipative'.*got 'tornado",
         ),
-        ("planar_quadrotor", dict(wind_strength=1.0), "needs a wind that is named"),
+        ("planar_quadrotor", dict(wind_strength=1.0), "needs the name of a wind"),
         ("planar_quadrotor", dict(mass=0.0), "mass must be positive"),
         ("reacher", dict(goal=[1.0]), r"goal must have shape \(2,\), got shape \(1,\)"),
         ("reacher", dict(goal=[1.0, np.nan]), "goal must be finite"),
@@ -325,21 +325,21 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         ("thermostat", dict(low=21.0), "low must be below high, got 21.0 and 21.0"),
         ("lorenz", dict(max_control=-1.0), "max_control must be at least 0"),
         ("quadrotor", dict(inputs="motors"), "inputs must be 'rotors' or 'wrench'"),
-        ("neural", {}, "give a system, or a key .* got neither"),
+        ("neural", {}, "pass a system, or a key .* got neither"),
         (
             "neural",
             dict(system=dlx.systems.VanDerPol(), key=jax.random.key(0)),
-            "neural: give a system or its key, not both",
+            "neural: pass a system or its key, not both",
         ),
         (
             "neural",
             dict(system=dlx.systems.VanDerPol(), states=2),
-            "neural: give a system or its states, not both",
+            "neural: pass a system or its states, not both",
         ),
         ("lds", dict(system=PLANT, dt=0.1), "dt must be left out"),
         ("lds", dict(system=FLOW), "dt must be given"),
-        ("lds", dict(system=FLOW, A=jnp.eye(1)), "give A or a system, not both"),
-        ("lds", dict(system="plant.mat"), "read_linear` of a file\\), got str"),
+        ("lds", dict(system=FLOW, A=jnp.eye(1)), "pass A or a system, not both"),
+        ("lds", dict(system="plant.mat"), "read_linear` from a file\\), got str"),
         ("van_der_pol", dict(dt=-0.1), "dt must be positive"),
         ("double_integrator", dict(substeps=0), "substeps must be a whole number"),
     ],

@@ -1,4 +1,4 @@
-"""Environments, and the named tasks."""
+"""Environments: control tasks, and the ready-made tasks by name."""
 
 from typing import TYPE_CHECKING
 

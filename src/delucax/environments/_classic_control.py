@@ -1,4 +1,4 @@
-"""Gym's Pendulum-v1, CartPole-v1, Acrobot-v1 and the two mountain cars."""
+"""Gym's classic control: Pendulum-v1, CartPole-v1, Acrobot-v1, two mountain cars."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,21 +22,23 @@ def pendulum_features(x: State) -> Vector:
 
 @task(Pendulum, gym=GymPendulum, dt=0.05, horizon=200)
 def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Limit = 2.0) -> Fields:
-    """Swing up a pendulum and hold it upright with a torque too weak to lift it at
-    once.
+    r"""Swing up a pendulum and hold it upright, with a torque that is too weak to lift
+    it in one go.
 
-    State (angle, velocity) with angle 0 upright; control (torque). Starts with the
-    angle uniform over the circle and the velocity in +-1. Cost
-    `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` per step. Never terminates.
-    `encode` gives the cosine and the sine of the angle, and the velocity.
+    - *State:* angle [rad], 0 upright; velocity [rad/s]. *Control:* torque [N m].
+    - *Start:* the angle uniform over the circle, the velocity in +-1 rad/s.
+    - *Cost:* `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` per step.
+    - *End:* never terminates.
+    - *Features:* `encode` gives the cosine and sine of the angle, and the velocity.
 
-    Not smooth where the speed meets the limit of Gym's integrator; a `solver` gives the
-    smooth variant. The slope of the cost jumps where the pendulum hangs straight down.
+    The dynamics are not smooth where the speed meets the limit of Gym's integrator.
+    Pass a `solver` for smooth dynamics. The slope of the cost jumps where the pendulum
+    hangs straight down.
 
     **Arguments:**
 
-    - `max_torque`: 2 by default.
-    - `max_speed`: of Gym's integrator, 8 by default.
+    - `max_torque`: the bound of the torque [N m], 2 by default.
+    - `max_speed`: the speed limit of Gym's integrator [rad/s], 8 by default.
 
     Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
 
@@ -76,24 +78,27 @@ def cartpole(
     max_position: Positive = 2.4,
     max_angle: Positive = 12 * 2 * np.pi / 360,
 ) -> Fields:
-    """Keep a pole upright on a cart that a force pushes to and fro.
+    r"""Keep a pole upright on a cart that a force pushes back and forth.
 
-    State (position, velocity, angle, spin), upright at 0; control (force), continuous
-    within its bounds; the integer actions 0 and 1 are Gym's forces -10 and 10. Starts
-    with each state uniform in +-0.05. A step costs -1; the episode ends when the
-    position or the angle leaves its bounds.
+    - *State:* position [m], velocity [m/s], angle [rad], 0 upright; spin [rad/s].
+        *Control:* force [N], continuous within its bounds. The integer actions 0 and 1
+        are Gym's forces -10 and 10.
+    - *Start:* each state uniform in +-0.05.
+    - *Cost:* -1 per step.
+    - *End:* when the position or the angle leaves its bounds.
 
-    The dynamics are smooth as they are. That cost has no gradient: for planning and
-    policy gradients give a [`delucax.costs.Quadratic`][] as `cost`. The linear model
-    about the upright pole is `dlx.linearize(env.dynamics)`.
+    The dynamics are smooth. The cost has no gradient: for planning and policy
+    gradients, pass a [`delucax.costs.Quadratic`][] as `cost`. The linear model about
+    the upright pole is `dlx.linearize(env.dynamics)`.
 
     **Arguments:**
 
-    - `max_force`: 10 by default.
-    - `max_position`: where the track ends, 2.4 by default.
-    - `max_angle`: beyond which the pole has fallen, 12 degrees by default.
-    - `semi_implicit`: whether in Gym's integrator, which is an explicit Euler step, the
-        positions move with the new velocities; False by default.
+    - `max_force`: the bound of the force [N], 10 by default.
+    - `max_position`: where the track ends [m], 2.4 by default.
+    - `max_angle`: the angle at which the pole counts as fallen [rad], 12 degrees by
+        default.
+    - `semi_implicit`: use Gym's semi-implicit integrator, whose positions move with the
+        new velocities. False by default, for Gym's explicit Euler step.
 
     Source: Gymnasium (Towers et al., 2023), `CartPole-v1`; Barto, Sutton and Anderson,
     1983.
@@ -105,12 +110,16 @@ def cartpole(
         import jax.numpy as jnp
 
         env = dlx.environments.cartpole(half_length=0.6)
-        env.step(0.0, jnp.zeros(4), 1)
         smooth = dlx.make("cartpole", cost=dlx.costs.Quadratic(jnp.eye(4), jnp.eye(1)))
         lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), jnp.eye(4), jnp.eye(1))
+        env.step(0.0, jnp.zeros(4), 1).state
+        ```
+
+        ```text
+        Array([ 0.   ,  0.195,  0.   , -0.244], dtype=float32)
         ```
     """
-    # Gym's own: twice where the episode ends, which no state of an episode reaches.
+    # Gym's bounds: twice those that end the episode, so that no state reaches them.
     feature_bound = [2 * max_position, np.inf, 2 * max_angle, np.inf]
     return dict(
         cost=Arrival(step_cost=-1.0),
@@ -139,23 +148,26 @@ def mountain_car(
     goal_position: Number = 0.45,
     goal_velocity: Number = 0.0,
 ) -> Fields:
-    """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
+    r"""Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
 
-    State (position, velocity); control (push), in +-1. Starts at rest with the position
-    uniform in [-0.6, -0.4]. A step costs `0.1 push^2`, and the arrival at the goal
-    -100, where the episode ends. The cost is that of the push after clipping; Gym
-    charges the push before.
+    - *State:* position, velocity [1/step]. *Control:* push, in +-1.
+    - *Start:* at rest, with the position uniform in [-0.6, -0.4].
+    - *Cost:* `0.1 push^2` per step, and -100 on arrival at the goal. The push is that
+        after clipping; Gym charges the push before clipping.
+    - *End:* at the goal.
 
-    The arrival has no gradient. For planning and policy gradients give as `cost` a
+    The arrival has no gradient. For planning and policy gradients, pass a
     [`delucax.costs.Quadratic`][] with the goal as `state_target`, `terminated=None`,
-    and a `solver` for dynamics without walls and limits.
+    and a `solver` for dynamics without walls and speed limits.
 
     **Arguments:**
 
     - `goal_position`: 0.45 by default.
-    - `goal_velocity`: the least velocity at the goal, 0 by default.
-    - `max_speed`, `min_position`, `max_position`: of Gym's integrator, which stops the
-        car at the left wall; 0.07, -1.2 and 0.6 by default.
+    - `goal_velocity`: the smallest velocity that counts at the goal [1/step], 0 by
+        default.
+    - `max_speed`: the speed limit of Gym's integrator [1/step], 0.07 by default.
+    - `min_position`, `max_position`: the walls of Gym's integrator, -1.2 and 0.6 by
+        default. The car stops at the left wall.
 
     Source: Gymnasium (Towers et al., 2023), `MountainCarContinuous-v0`; Moore, 1990.
 
@@ -166,12 +178,14 @@ def mountain_car(
         import jax.numpy as jnp
 
         env = dlx.environments.mountain_car(power=0.002)
-        cost = dlx.costs.Quadratic(
-            jnp.diag(jnp.array([1.0, 0.0])), 0.1 * jnp.eye(1), state_target=[0.45, 0.0]
-        )
-        smooth = dlx.make(
-            "mountain_car", solver=dlx.dynamics.RK4(), cost=cost, terminated=None
-        )
+        cost = dlx.costs.Quadratic([1.0, 0.0], [0.1], state_target=[0.45, 0.0])
+        options = dict(solver=dlx.dynamics.RK4(), cost=cost, terminated=None)
+        smooth = dlx.make("mountain_car", **options)
+        smooth.step(0.0, jnp.array([-0.5, 0.0]), jnp.ones(1)).cost
+        ```
+
+        ```text
+        Array(1.0025, dtype=float32)
         ```
     """
     goal = _AtGoal(goal_position, goal_velocity)
@@ -192,19 +206,24 @@ def mountain_car_discrete(
     goal_position: Number = 0.5,
     goal_velocity: Number = 0.0,
 ) -> Fields:
-    """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
+    r"""Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
 
-    As [`delucax.environments.mountain_car`][] with a weaker motor and a farther goal;
-    the integer actions 0, 1, 2 are the pushes -1, 0, 1, and a push between them is
-    taken too. A step costs 1, the arrival nothing. The limits are the same.
+    It differs from [`delucax.environments.mountain_car`][] in a weaker motor, a farther
+    goal and the cost:
 
-    The cost is not differentiable; see there for smooth alternatives.
+    - *Control:* the integer actions 0, 1 and 2 are the pushes -1, 0 and 1. A push in
+        between works too.
+    - *Cost:* 1 per step, nothing on arrival.
+
+    The cost has no gradient. See [`delucax.environments.mountain_car`][] for smooth
+    alternatives.
 
     **Arguments:**
 
-    - `power`: of its motor, 0.001 by default.
+    - `power`: power of the motor [1/step^2], 0.001 by default.
     - `goal_position`: 0.5 by default.
-    - `goal_velocity`: the least velocity at the goal, 0 by default.
+    - `goal_velocity`: the smallest velocity that counts at the goal [1/step], 0 by
+        default.
 
     Source: Gymnasium (Towers et al., 2023), `MountainCar-v0`; Moore, 1990.
 
@@ -215,7 +234,11 @@ def mountain_car_discrete(
         import jax.numpy as jnp
 
         env = dlx.environments.mountain_car_discrete()
-        env.step(0.0, jnp.array([-0.5, 0.0]), 2)
+        env.step(0.0, jnp.array([-0.5, 0.0]), 2).control
+        ```
+
+        ```text
+        Array([1.], dtype=float32)
         ```
     """
     goal = _AtGoal(goal_position, goal_velocity)
@@ -244,7 +267,7 @@ def acrobot_features(x: State) -> Vector:
 
 
 class _AboveLine(eqx.Module):
-    """Whether the tip is above a line, with links of length 1."""
+    """Whether the tip is above a line, if both links have length 1, as in Gym."""
 
     goal_height: Real = parameter()
 
@@ -261,34 +284,39 @@ def acrobot(
     goal_height: Number = 1.0,
     disturbance: AbstractDisturbance | None = None,
 ) -> Fields:
-    """Swing the tip of two hanging links above a line, by a torque at the elbow.
+    r"""Swing the tip of two hanging links above a line, by a torque at the elbow.
 
-    State (angle_1, angle_2, velocity_1, velocity_2), hanging at 0; control (torque);
-    disturbance (push), a torque that is added; the integer actions 0, 1, 2 are the
-    torques -1, 0, 1. Starts with each state uniform in +-0.1. A step costs 1; the
-    episode ends when `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`, which
-    takes 1 off the cost: Gym rewards the last step with 0. `encode` gives the cosine
-    and the sine of both angles, and the velocities.
+    - *State:* angle_1 [rad], angle_2 [rad], both 0 where the links hang; velocity_1
+        [rad/s], velocity_2 [rad/s]. *Control:* torque [N m]; the integer actions 0, 1
+        and 2 are the torques -1, 0 and 1. *Disturbance:* push [N m], added to the
+        torque.
+    - *Start:* each state uniform in +-0.1.
+    - *Cost:* 1 per step, and -1 on arrival, because Gym rewards the last step with 0.
+    - *End:* when `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`.
+    - *Features:* `encode` gives the cosines and sines of both angles, and the
+        velocities.
 
-    That cost has no gradient. For planning and policy gradients give
-    `cost=`[`delucax.costs.AcrobotHeight`][]`()` and `terminated=None`, and a `solver`
-    for dynamics without wraps and clips: Gym's are not smooth where a velocity meets
-    its limit, and the state, though not the gradient, jumps where an angle wraps.
+    The cost has no gradient. For planning and policy gradients, pass
+    `cost=`[`delucax.costs.AcrobotHeight`][]`()`, `terminated=None`, and a `solver` for
+    dynamics without wraps and clips. Gym's dynamics are not smooth where a velocity
+    meets its limit. Where an angle wraps, the state jumps, but the gradient does not.
 
-    A step is Gym's to rounding. The acrobot is chaotic, so that of 100 episodes under
-    random actions about 5 end more than 1e-6 from Gym's in double precision, as Gym's
-    own do when the initial state is perturbed by one ulp.
+    A step equals Gym's up to rounding. But the acrobot is chaotic: of 100 episodes
+    under random actions in double precision, about 5 end more than 1e-6 from Gym's. The
+    same happens in Gym itself if the initial state is perturbed by one ulp.
 
     **Arguments:**
 
-    - `max_torque`: 1 by default.
-    - `torque_noise`: at each step a torque drawn uniformly from +-torque_noise is
-        added, beyond the bounds too, as by Gym's `torque_noise_max`; none by default.
-        Not with a `disturbance`.
-    - `goal_height`: of the line above the first joint, in lengths of a link, 1 by
-        default.
-    - `disturbance`: of the environment, in place of `torque_noise`; none by default.
-    - `max_velocity_1`, `max_velocity_2`: of Gym's integrator, 4 pi and 9 pi by default.
+    - `max_torque`: the bound of the torque [N m], 1 by default.
+    - `torque_noise`: add a torque drawn uniformly from +-`torque_noise` [N m] at each
+        step, also beyond the bounds, as Gym's `torque_noise_max` does; none by default.
+        Do not combine it with a `disturbance`.
+    - `goal_height`: height of the line above the first joint, in lengths of a link; 1
+        by default.
+    - `disturbance`: the disturbance of the environment, in place of `torque_noise`;
+        none by default.
+    - `max_velocity_1`, `max_velocity_2`: the velocity limits of Gym's integrator
+        [rad/s], 4 pi and 9 pi by default.
 
     Source: Gymnasium (Towers et al., 2023), `Acrobot-v1`; Sutton, 1996.
 
@@ -299,20 +327,20 @@ def acrobot(
         import jax.numpy as jnp
 
         env = dlx.environments.acrobot()
-        env.step(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), 2)
-        smooth = dlx.make(
-            "acrobot",
-            solver=dlx.dynamics.RK4(),
-            cost=dlx.costs.AcrobotHeight(),
-            terminated=None,
-        )
+        options = dict(cost=dlx.costs.AcrobotHeight(), terminated=None)
+        smooth = dlx.make("acrobot", solver=dlx.dynamics.RK4(), **options)
+        env.step(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), 2).state
+        ```
+
+        ```text
+        Array([ 0.075,  0.043, -0.247,  0.423], dtype=float32)
         ```
     """
-    # A disturbance of the user's may drive the features beyond their bounds.
+    # A user's disturbance may drive the features beyond their bounds.
     bounded = disturbance is None
     if torque_noise is not None:
         if not bounded:
-            raise ValueError("acrobot: give torque_noise or a disturbance, not both.")
+            raise ValueError("acrobot: pass torque_noise or a disturbance, not both.")
         disturbance = Uniform(-torque_noise, torque_noise, size=1)
     fastest = np.inf, np.inf
     if isinstance(dynamics, GymAcrobot):

@@ -1,4 +1,4 @@
-"""Environments: dynamics, a cost, disturbances, bounds and an initial state."""
+"""The environment: a control task."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -28,7 +28,6 @@ from .._module import (
     check_parameters,
     function_field,
     parameter,
-    parts_of,
 )
 from .._results import Result
 from .._typing import (
@@ -45,19 +44,19 @@ from .._typing import (
     Vector,
 )
 from ..costs import AbstractCost
-from ..disturbances import AbstractDisturbance, Brownian, Zero
+from ..disturbances import AbstractDisturbance
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..math import clip
-from ..systems import AbstractPlant
+from ._environment_checks import check_noise, check_signal, default_disturbance
 
 
 class Step(NamedTuple):
     """The outcome of one step of an environment.
 
-    - `state`: the next state.
-    - `control`: the control that was applied, after the bounds.
-    - `cost`: the stage cost at the current state and the applied control.
-    - `terminated`: whether the next state ends the episode.
+    - `state`: the next state, shape `(n,)`.
+    - `control`: the control that was applied, after the bounds, shape `(m,)`.
+    - `cost`: the stage cost at the current state and the applied control, a scalar.
+    - `terminated`: whether the next state ends the episode, a boolean.
     - `result`: the status of the step, one of `delucax.RESULTS`.
     """
 
@@ -80,34 +79,42 @@ class Environment(eqx.Module):
     """A control task: dynamics, a cost, disturbances, bounds, an initial state and a
     condition of termination.
 
+    [`delucax.make`][] makes one of the ready-made tasks. [`delucax.rollout`][]
+    simulates a controller in it.
+
     **Arguments:**
 
-    - `dynamics`: the discrete-time dynamics.
-    - `cost`: the stage and final cost; minus the reward.
-    - `disturbance`: the disturbances; by default none, or the Brownian increments of
-        dynamics that have a diffusion.
-    - `sensor_noise`: disturbances added to what is observed; none by default.
-    - `initial_state`: a vector, or a function of a key to one; zero by default.
-    - `control_bounds`: `(low, high)`, each a number or a vector; controls are clipped
-        to them. None by default.
-    - `horizon`: steps per episode, 200 by default.
-    - `terminated`: `(t, x) -> bool`; never by default.
-    - `actions`: the table behind integer actions, shape `(actions, m)`; none by
+    - `dynamics`: the discrete-time dynamics, an [`delucax.AbstractDynamics`][].
+    - `cost`: the stage and final cost, an [`delucax.AbstractCost`][]. A cost is minus a
+        reward.
+    - `disturbance`: an [`delucax.AbstractDisturbance`][]. By default there is none, or
+        for dynamics with a diffusion, Brownian increments.
+    - `sensor_noise`: an [`delucax.AbstractDisturbance`][] that is added to the
+        observation; none by default.
+    - `initial_state`: shape `(n,)`, or a function of a random key to such a state; zero
+        by default.
+    - `control_bounds`: `(low, high)`, each a number or shape `(m,)`. Controls are
+        clipped to them. None by default.
+    - `horizon`: the number of steps of an episode, 200 by default.
+    - `terminated`: whether a state ends the episode, a function `(t, x) -> bool`; never
+        by default.
+    - `actions`: the control of each integer action, shape `(actions, m)`; none by
         default.
-    - `encode`: features of an observation for networks and Gymnasium users (cosine and
-        sine of an angle, for example): a function of a vector to a vector; the identity
-        by default. Controllers are given the observation itself.
-    - `observation_bounds`: `(low, high)`, each a number or a vector: bounds of
-        `encode(y)`, the observation space of a Gymnasium user. Informational only: they
-        are not enforced. None by default.
+    - `encode`: a function of an observation to features for networks and Gymnasium
+        users, such as the cosine and sine of an angle; the identity by default.
+        Controllers get the observation itself.
+    - `observation_bounds`: `(low, high)`, each a number or a vector: the bounds of
+        `encode(y)` that define the observation space of Gymnasium. They are not
+        enforced. None by default.
 
-    **Raises:** `ValueError` if sizes do not fit each other or bounds cross.
+    **Raises:** `ValueError` if sizes do not fit each other, or `low` is above `high`.
 
     !!! note
 
-        `jax.jit(env.step)` raises "unhashable", as does a method of any module that
-        holds arrays: use `eqx.filter_jit(env.step)`, or pass the environment as an
-        argument, `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither.
+        `jax.jit(env.step)` raises "unhashable", because `env` holds arrays. Use
+        `eqx.filter_jit(env.step)`, or pass the environment as an argument,
+        `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither. The same
+        holds for the methods of every module.
 
     !!! example
 
@@ -118,13 +125,20 @@ class Environment(eqx.Module):
         dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
         env = dlx.Environment(dynamics, cost, control_bounds=(-2.0, 2.0))
-        step = env.step(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), None)
+        step = env.step(0.0, jnp.array([0.1, 0.0]), jnp.array([5.0]))
+        step.state, step.control, step.cost
+        ```
+
+        ```text
+        (Array([0.109, 0.377], dtype=float32),
+         Array([2.], dtype=float32),
+         Array(0.41, dtype=float32))
         ```
     """
 
     dynamics: AbstractDynamics
     cost: AbstractCost
-    # What is None by default follows from the dynamics, in `__post_init__`.
+    # `__post_init__` replaces these defaults of None, as the dynamics need it.
     disturbance: AbstractDisturbance | None = eqx.field(default=None)
     sensor_noise: AbstractDisturbance | None = None
     initial_state: Any = eqx.field(default=None, converter=_as_start)
@@ -142,7 +156,7 @@ class Environment(eqx.Module):
     def __post_init__(self):
         check_instance(self.dynamics, AbstractDynamics, "dynamics", "Environment")
         if self.disturbance is None:
-            self.disturbance = _default_disturbance(self.dynamics)
+            self.disturbance = default_disturbance(self.dynamics)
         if self.initial_state is None:
             self.initial_state = jnp.array(np.zeros(self.dynamics.state_size))
         if self.encode is None:
@@ -151,13 +165,13 @@ class Environment(eqx.Module):
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        _check_noise(dynamics, where)
+        check_noise(dynamics, where)
         n, m = dynamics.state_size, dynamics.control_size
         check_instance(self.cost, AbstractCost, "cost", where)
         check_cost_sizes(self.cost, (n, m), "cost", where)
-        _check_signal(self.disturbance, dynamics.disturbance_size, "disturbance")
+        check_signal(self.disturbance, dynamics.disturbance_size, "disturbance")
         if self.sensor_noise is not None:
-            _check_signal(self.sensor_noise, dynamics.observation_size, "sensor_noise")
+            check_signal(self.sensor_noise, dynamics.observation_size, "sensor_noise")
         check_parameters(self)
         if not callable(self.initial_state):
             x0 = as_vector(self.initial_state, n, "initial_state", where)
@@ -173,15 +187,16 @@ class Environment(eqx.Module):
             )
 
     def __replaced__(self, before: "Environment") -> dict[str, Any]:
-        """New defaults in place of those that `before` had from its dynamics."""
+        """The fields of `before` that still have the default for its old dynamics, with
+        the default for the new ones."""
         old, new, x0 = before.dynamics, self.dynamics, before.initial_state
         if not isinstance(new, AbstractDynamics):
             return {}
         fields: dict[str, Any] = {}
-        if eqx.tree_equal(before.disturbance, _default_disturbance(old)):
-            fields["disturbance"] = _default_disturbance(new)
+        if eqx.tree_equal(before.disturbance, default_disturbance(old)):
+            fields["disturbance"] = default_disturbance(new)
         n = new.state_size
-        # Only zeros can have been the default; another state is the user's.
+        # A state that is not zero was given by the user.
         if n != old.state_size and not callable(x0) and is_concrete(x0):
             if x0.shape == (old.state_size,) and not np.any(x0):
                 fields["initial_state"] = jnp.zeros(n, x0.dtype)
@@ -189,7 +204,7 @@ class Environment(eqx.Module):
 
     @property
     def dt(self) -> Array:
-        """The control interval."""
+        """The control interval, in units of time."""
         return self.dynamics.dt
 
     @property
@@ -204,12 +219,12 @@ class Environment(eqx.Module):
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`."""
+        """The size of the disturbance `w`."""
         return self.dynamics.disturbance_size
 
     @property
     def observation_size(self) -> int:
-        """The size of the observation that a controller is given."""
+        """The size of the observation that a controller gets."""
         return self.dynamics.observation_size
 
     @property
@@ -224,16 +239,18 @@ class Environment(eqx.Module):
         return shape[0]
 
     def trim(self, *, fix: Any = (), throw: bool = True) -> OperatingPoint:
-        """The operating point of the task: that of [`delucax.trim`][] from the
-        `targets` of its cost if they give both a state and a control, else from the
-        equilibrium of its dynamics, else from the target that is given and zeros.
+        """The operating point of the task, by [`delucax.trim`][].
+
+        The guess is the `targets` of the cost if it has one for the state and one for
+        the control. Else it is the equilibrium of the dynamics, or else the one target
+        of the cost, with zeros for the other.
 
         **Arguments:** `fix`, `throw`: as in [`delucax.trim`][].
 
-        **Returns:** [`delucax.dynamics.OperatingPoint`][].
+        **Returns:** a [`delucax.dynamics.OperatingPoint`][].
 
-        **Raises:** `ValueError` if neither cost nor dynamics define a point, and as
-        [`delucax.trim`][] does.
+        **Raises:** `ValueError` if neither the cost nor the dynamics define a guess,
+        and the errors of [`delucax.trim`][].
 
         !!! example
 
@@ -249,26 +266,27 @@ class Environment(eqx.Module):
         point = self.cost.set_point(self.dynamics)
         if point is None:
             raise ValueError(
-                "Environment: trim needs a cost with targets or dynamics that define "
-                "an equilibrium; use `delucax.trim(env.dynamics, x=..., u=...)`."
+                "Environment: trim needs a cost with targets, or dynamics with an "
+                "equilibrium. Without them, use `delucax.trim(env.dynamics, x=..., "
+                "u=...)`."
             )
         x, u = point
         return trim(self.dynamics, x=x, u=u, fix=fix, throw=throw)
 
     @staticmethod
     def split_key(key: PRNGKey) -> tuple[PRNGKey, PRNGKey, PRNGKey, PRNGKey]:
-        """The keys of an episode, as [`delucax.rollout`][] splits the one it is given.
+        """Split a random key for an episode, as [`delucax.rollout`][] does.
 
         **Arguments:** `key`: a random key.
 
-        **Returns:** keys for the first state, the disturbance, the sensor noise and the
-        controller.
+        **Returns:** four keys: for the first state, the disturbance, the sensor noise
+        and the controller.
         """
         start, disturbance, noise, controller = jr.split(key, 4)
         return start, disturbance, noise, controller
 
     def reset(self, key: PRNGKey) -> State:
-        """A first state.
+        """A first state, drawn if `initial_state` is a function.
 
         **Arguments:** `key`: a random key.
 
@@ -282,16 +300,18 @@ class Environment(eqx.Module):
         return self.initial_state
 
     def saturate(self, u: ArrayLike) -> Array:
-        """Clip a control to `control_bounds`, or look up an integer action.
+        """Clip a control to `control_bounds`. An integer action is looked up first.
 
-        **Arguments:** `u`: a control, shape `(m,)`; or an integer action, a scalar,
-            where there is a table of `actions`.
+        **Arguments:** `u`: a control, shape `(m,)`; or an integer action, a scalar, if
+            the environment has `actions`.
 
-        **Returns:** shape `(m,)`.
+        **Returns:** the control, shape `(m,)`.
+
+        **Raises:** `ValueError` on another shape or an unknown action.
         """
         try:
             control = jnp.asarray(u)
-        except (TypeError, ValueError):  # no number, or ragged
+        except (TypeError, ValueError):  # not a number, or a ragged list
             raise ValueError(
                 "Environment: u (the control) must have shape "
                 f"({self.control_size},), got {shortened(u)}."
@@ -319,18 +339,18 @@ class Environment(eqx.Module):
     ) -> Step:
         """One step: clip the control, charge the stage cost, advance the state.
 
+        `result` is the status of the solver alone. The next state is not checked: it is
+        NaN if the state or the control is NaN, and a huge state may overflow, although
+        `result` is a success. [`delucax.rollout`][], losses and adapters check for
+        states that are not finite.
+
         **Arguments:**
 
         - `t`: time, a scalar.
         - `x`: state, shape `(state_size,)`.
-        - `u`: control, shape `(control_size,)`; or an integer where there is a table of
-            `actions`.
-        - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
-
-        A step does not check its numbers, and `result` is that of the solver alone: NaN
-        in the state or the control gives NaN, and a state that is finite but huge may
-        overflow to infinity or NaN, while `result` is a success.
-        [`delucax.rollout`][], losses and adapters check for states that are not finite.
+        - `u`: control, shape `(control_size,)`; or an integer action, if the
+            environment has `actions`.
+        - `w`: disturbance, shape `(disturbance_size,)`; `None` (default) for zero.
 
         **Returns:** a [`delucax.environments.Step`][].
 
@@ -343,19 +363,19 @@ class Environment(eqx.Module):
         return self._advance(t, x, self._applied(u), w)
 
     def _applied(self, u: Any) -> Control:
-        """The control or action `u` as a control within the bounds."""
+        """The control or integer action `u`, as a control within the bounds."""
         u = self.saturate(as_float_array(u) if self.actions is None else u)
         return as_vector(u, self.control_size, "u (the control)", "Environment.step")
 
     def _advance(self, t: Time, x: State, u: Control, w: Disturbance) -> Step:
-        """A step with arguments that were checked."""
+        """A step with arguments that are already checked."""
         step, *_ = self._advance_by(self.dynamics.advance, t, x, u, w)
         return step
 
     def _advance_by(
         self, advance: Callable[..., Any], t: Time, x: State, u: Control, w: Disturbance
     ) -> tuple[Any, ...]:
-        """The step by a method of the dynamics, and what else that returns."""
+        """The step by a method of the dynamics, and what else this method returns."""
         cost = jnp.asarray(self.cost(t, x, u))
         if cost.shape != ():
             raise ValueError(
@@ -377,44 +397,3 @@ class Environment(eqx.Module):
 
 def _identity(y: Any) -> Any:
     return y
-
-
-def _check_signal(signal: Any, size: int, name: str) -> None:
-    """Raise unless `signal` is a disturbance with entries of that size."""
-    check_instance(signal, AbstractDisturbance, name, "Environment")
-    if signal.size != size:
-        raise ValueError(
-            f"Environment: {name} has size {signal.size} where {size} is expected."
-        )
-
-
-def _default_disturbance(dynamics: AbstractDynamics) -> AbstractDisturbance:
-    k, count = dynamics.disturbance_size, dynamics.increments
-    return Brownian(k // count, substeps=count) if count else Zero(k)
-
-
-def _check_noise(plant: AbstractPlant, where: str) -> None:
-    """Raise unless `plant`, and each plant that it wraps, forwards the Brownian noise
-    of the plants inside."""
-    name, noise = type(plant).__name__, plant.noise
-    if isinstance(plant, AbstractDynamics):
-        if (plant.increments > 0) != (noise == "brownian"):
-            raise ValueError(
-                f"{where}: {name} has noise = {noise!r} and increments = "
-                f"{plant.increments}, but increments must be at least 1 where w is "
-                "Brownian, and 0 where it is not. A subclass of "
-                "delucax.dynamics.AbstractWrapper forwards both."
-            )
-    for part in parts_of(plant, AbstractPlant):
-        _check_noise(part, where)
-        try:
-            is_brownian = part.noise == "brownian"
-        except (TypeError, ValueError):  # a batch; a plant without noise does not fail
-            is_brownian = True
-        if is_brownian and not plant.declares_noise():
-            raise ValueError(
-                f"{where}: {name} does not forward `noise` of the "
-                f"{type(part).__name__} that it wraps. Derive it from "
-                f"delucax.dynamics.AbstractWrapper, or define `noise` in {name}: that "
-                "of the wrapped plant, or None if w is not Brownian."
-            )

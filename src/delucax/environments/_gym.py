@@ -1,4 +1,4 @@
-"""Gym's integrators, the default dynamics of the tasks of classic control."""
+"""Gym's integrators: the default dynamics of the classic control tasks."""
 
 import abc
 
@@ -18,20 +18,21 @@ from ..systems import Acrobot, CartPole, MountainCar, Pendulum
 
 
 class AbstractGymStep(AbstractDiscretization):
-    """A step as Gym writes it, to which `w` is added where the system does not take it.
+    """A step as in Gym. If the system has no `disturbance_names`, `w` is added to the
+    next state.
 
-    Where a state meets a limit the gradient through it is 0: a smooth variant is
-    [`delucax.Discretized`][] of the same system. Angles of the pendulum and the
+    The gradient through a state that meets its limit is 0. For a smooth variant, use
+    [`delucax.Discretized`][] of the same system. The angles of the pendulum and the
     cart-pole are not wrapped.
     """
 
     @abc.abstractmethod
     def gym_step(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        """The next state, of any precision.
+        """The next state, before an additive `w`, in any precision.
 
         **Arguments:** `t`: time. `x`: state. `u`: control. `w`: disturbance.
 
-        **Returns:** the state, without a `w` that the system has no name for.
+        **Returns:** the next state.
         """
 
     def advance(
@@ -73,7 +74,8 @@ class GymCartPole(AbstractGymStep):
     def gym_step(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         dt = self.dt
         position, velocity, angle, spin = x[0], x[1], x[2], x[3]
-        # Batched, XLA would compute both accelerations again for each entry.
+        # Without the fence, XLA computes both accelerations again for each entry of a
+        # batch.
         acceleration, turn = fence(*self.system.accelerations(angle, spin, u[0]))
         velocity_next, spin_next = velocity + dt * acceleration, spin + dt * turn
         if self.semi_implicit:
@@ -83,8 +85,8 @@ class GymCartPole(AbstractGymStep):
 
 
 class GymMountainCar(AbstractGymStep):
-    """A semi-implicit Euler step, velocity and position clipped; a car that runs into
-    the left wall stops there."""
+    """A semi-implicit Euler step with clipped velocity and position. A car that runs
+    into the left wall stops there."""
 
     system: MountainCar
     dt: Real = parameter(1.0, constraint=positive)
@@ -103,14 +105,14 @@ class GymMountainCar(AbstractGymStep):
         velocity = clip(velocity, -self.max_speed, self.max_speed)
         position = position + velocity * self.dt
         position = clip(position, self.min_position, self.max_position)
-        # Gym's right wall stops no car: the goal is before it.
+        # As in Gym, the right wall does not stop the car; the goal is before it.
         stopped = (position <= self.min_position) & (velocity < 0)
         return jnp.stack([position, jnp.where(stopped, 0, velocity)])
 
 
 class GymAcrobot(AbstractGymStep):
-    """One Runge-Kutta step of order 4, the torque and `w` held; then the angles are
-    wrapped to +-pi and the velocities clipped."""
+    """One Runge-Kutta step of order 4 with torque and `w` held. Then the angles are
+    wrapped to +-pi and the velocities are clipped."""
 
     system: Acrobot
     dt: Real = parameter(0.2, constraint=positive)

@@ -1,4 +1,4 @@
-"""Tasks that no linear law solves: swing up, flip, carry, drift and ignite."""
+"""Tasks that no linear controller solves: swing up, flip, carry, drift and ignite."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,10 +23,10 @@ from ._task import box, Fields, Limit, Number, once, Positive, task, UniformStat
 
 
 class _Chord(eqx.Module):
-    """`x - x_ref` with `2 sin(d / 2)` for the difference d of each angle.
+    """`x - x_ref`, where the difference `d` of each angle becomes `2 sin(d / 2)`.
 
-    Its square, `2 (1 - cos(d))`, is smooth all around the circle, and `d^2` for small
-    differences.
+    Its square, `2 (1 - cos(d))`, is smooth all around the circle, and near `d^2` for
+    small differences.
     """
 
     angles: tuple[int, ...] = eqx.field(static=True)
@@ -38,7 +38,7 @@ class _Chord(eqx.Module):
 
 
 class _Features(eqx.Module):
-    """The state with the cosine and the sine of each angle in its place."""
+    """The state, with each angle replaced by its cosine and sine."""
 
     angles: tuple[int, ...] = eqx.field(static=True)
 
@@ -50,8 +50,8 @@ class _Features(eqx.Module):
 
 
 def _turning(system: AbstractSystem, weights: Numbers, effort: Numbers) -> Fields:
-    """The cost about the equilibrium, the features and their bounds where some of the
-    states are angles that go all the way around."""
+    """The cost about the equilibrium, the features and their bounds, for a system with
+    angles that turn all the way around."""
     names = system.state_names
     angles = tuple(i for i, name in enumerate(names) if name in system.angle_names)
     x, u = system.equilibrium()
@@ -82,7 +82,7 @@ def _on_track(
     max_position: Positive,
     exit_cost: Number,
 ) -> Fields:
-    """`fields` on a track of which the end ends the episode."""
+    """`fields` for a cart on a track. Leaving the track ends the episode."""
     off = _OffTrack(max_position)
     return fields | dict(
         cost=fields["cost"] + once(off, exit_cost),
@@ -102,20 +102,23 @@ def cartpole_swing_up(
 ) -> Fields:
     """Swing a pole up from hanging and keep it upright, on a track that ends.
 
-    State (position, velocity, angle, spin), upright at 0; control (force). Starts with
-    the position uniform in +-0.5, the angle within 0.2 of hanging, and the velocities
-    in +-0.1. Cost
-    `0.1 position^2 + 2 (1 - cos(angle)) + 0.01 (velocity^2 + spin^2) + 0.001 force^2`
-    per step. The episode ends, at `exit_cost`, when the cart leaves the track: that is
-    more than an episode of hanging costs. `encode` gives the cosine and the sine of the
-    angle in its place. The force is less than the weight of cart and pole, and the
-    swing-up takes two or three pushes.
+    - *State:* position [m], velocity [m/s], angle [rad], 0 upright; spin [rad/s].
+        *Control:* force [N].
+    - *Start:* the position uniform in +-0.5 m, the angle within 0.2 rad of hanging, the
+        velocity and the spin in +-0.1.
+    - *Cost:* `0.1 position^2 + 2 (1 - cos(angle)) + 0.01 (velocity^2 + spin^2) +
+        0.001 force^2` per step.
+    - *End:* when the cart leaves the track. This costs `exit_cost`, more than a whole
+        episode of hanging.
+    - *Features:* `encode` replaces the angle by its cosine and sine.
+
+    The force is smaller than the weight, so a swing-up takes two or three pushes.
 
     **Arguments:**
 
-    - `max_force`: 10 by default.
-    - `max_position`: where the track ends, 2.4 by default.
-    - `exit_cost`: 1000 by default.
+    - `max_force`: the bound of the force [N], 10 by default.
+    - `max_position`: where the track ends [m], 2.4 by default.
+    - `exit_cost`: the cost of leaving the track, 1000 by default.
 
     Source: Barto, Sutton and Anderson, 1983 (the plant); Tassa et al., 2018 (the task).
 
@@ -142,22 +145,24 @@ def double_pendulum_cart(
 ) -> Fields:
     """Swing up both rods of a double pendulum on a cart, and keep them upright.
 
-    State (position, angle_1, angle_2, velocity, spin_1, spin_2), both angles measured
-    from the upright; control (force). Starts near rest, with the position uniform in
-    +-0.1 and the angles within 0.1 of hanging. Cost
-    `0.1 position^2 + 2 (1 - cos(angle_1)) + 2 (1 - cos(angle_2)) +
-    0.01 (velocity^2 + spin_1^2 + spin_2^2) + 0.0003 force^2` per step. The episode
-    ends, at `exit_cost`, when the cart leaves the track: that is more than an episode
-    of hanging costs. `encode` gives the cosine and the sine of each angle in its place.
+    - *State:* position [m], angle_1 [rad], angle_2 [rad], both 0 upright; velocity
+        [m/s], spin_1 [rad/s], spin_2 [rad/s]. *Control:* force [N].
+    - *Start:* at rest, the position uniform in +-0.1 m, the angles within 0.1 rad of
+        hanging.
+    - *Cost:* `0.1 position^2 + 2 (1 - cos(angle_1)) + 2 (1 - cos(angle_2)) +
+        0.01 (velocity^2 + spin_1^2 + spin_2^2) + 0.0003 force^2` per step.
+    - *End:* when the cart leaves the track. This costs `exit_cost`, more than a whole
+        episode of hanging.
+    - *Features:* `encode` replaces each angle by its cosine and sine.
 
-    Plans that look ahead by a second swing it up within a second and a half. The
-    upright is caught by a linear law only from within a few degrees.
+    Plans that look ahead by one second swing it up within a second and a half. A linear
+    controller catches it upright only from within a few degrees.
 
     **Arguments:**
 
-    - `max_force`: 40 by default.
-    - `max_position`: where the track ends, 3 by default.
-    - `exit_cost`: 1500 by default.
+    - `max_force`: the bound of the force [N], 40 by default.
+    - `max_position`: where the track ends [m], 3 by default.
+    - `exit_cost`: the cost of leaving the track, 1500 by default.
 
     Source: Bogdanov, 2004 (the plant); Graichen, Treuer and Zeitz, 2007 (the task).
 
@@ -179,16 +184,21 @@ def double_pendulum_cart(
 def furuta(system: FurutaPendulum, *, max_voltage: Limit = 5.0) -> Fields:
     """Swing up a pendulum at the end of a turning arm, and keep it upright.
 
-    State (arm, angle, arm_rate, spin), upright at 0; control (voltage). Starts with the
-    arm uniform in +-0.5, the angle within 0.2 of hanging and the rates in +-0.5. Cost
-    `0.1 arm^2 + 2 (1 - cos(angle)) + 0.001 (arm_rate^2 + spin^2) + 0.001 voltage^2` per
-    step; a turn of the arm counts, as it winds up its cable. Never terminates. `encode`
-    gives the cosine and the sine of the angle in its place. The swing-up takes three or
-    four pushes of the motor.
+    - *State:* arm [rad], angle [rad], 0 upright; arm_rate [rad/s], spin [rad/s].
+        *Control:* voltage [V].
+    - *Start:* the arm uniform in +-0.5 rad, the angle within 0.2 rad of hanging, the
+        rates in +-0.5 rad/s.
+    - *Cost:* `0.1 arm^2 + 2 (1 - cos(angle)) + 0.001 (arm_rate^2 + spin^2) +
+        0.001 voltage^2` per step. The arm is not wrapped, because turning it winds up
+        its cable.
+    - *End:* never terminates.
+    - *Features:* `encode` replaces the angle by its cosine and sine.
+
+    A swing-up takes three or four pushes of the motor.
 
     **Arguments:**
 
-    - `max_voltage`: 5 by default, of 10 that the motor takes.
+    - `max_voltage`: the bound of the voltage [V], 5 by default; the motor takes 10.
 
     Source: Furuta, Yamakita and Kobayashi, 1992; Cazzolato and Prime, 2011.
 
@@ -210,17 +220,20 @@ def furuta(system: FurutaPendulum, *, max_voltage: Limit = 5.0) -> Fields:
 def quadrotor_flip(system: PlanarQuadrotor, *, max_thrust: Limit = 1.0) -> Fields:
     """Flip a planar quadrotor that is upside down, and bring it back to the origin.
 
-    State (x, y, angle, vx, vy, rate); control (left, right), the thrusts, neither
-    negative; disturbance (force_x, force_y). Starts with x and y uniform in +-0.5, the
-    angle within 0.5 of upside down, the velocities in +-0.5 and the rate in +-1. Cost
-    `x^2 + y^2 + 2 (1 - cos(angle)) + 0.1 (vx^2 + vy^2) + 0.01 rate^2 + 0.1 |u - u*|^2`
-    per step, u* being half of the weight. Never terminates. `encode` gives the cosine
-    and the sine of the angle in its place. It falls by 2 or 3 m as it turns: what a
-    rotor pushes then drives it down.
+    - *State:* x [m], y [m], angle [rad], vx [m/s], vy [m/s], rate [rad/s]. *Control:*
+        thrusts left and right [N], not negative. *Disturbance:* force_x, force_y [N].
+    - *Start:* x and y uniform in +-0.5 m, the angle within 0.5 rad of upside down, the
+        velocities in +-0.5 m/s, the rate in +-1 rad/s.
+    - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 0.1 (vx^2 + vy^2) + 0.01 rate^2 +
+        0.1 |u - u*|^2` per step, where each entry of `u*` is half of the weight.
+    - *End:* never terminates.
+    - *Features:* `encode` replaces the angle by its cosine and sine.
+
+    It falls by 2 or 3 m while it turns, because upside down its rotors push it down.
 
     **Arguments:**
 
-    - `max_thrust`: of a rotor, 1 by default, about the weight.
+    - `max_thrust`: the largest thrust of a rotor [N], 1 by default, about the weight.
 
     Source: Gradu et al., 2021 (the plant); Lupashin, Schöllig, Sherback and D'Andrea,
     2010 (flips).
@@ -242,20 +255,24 @@ def quadrotor_flip(system: PlanarQuadrotor, *, max_thrust: Limit = 1.0) -> Field
 
 @task(SlungLoad, dt=0.05, horizon=120)
 def slung_load(system: SlungLoad, *, max_thrust: Limit = 5.0) -> Fields:
-    """Carry a load on a cable to the origin, and leave it there without swing.
+    """Carry a load on a cable to the origin, and stop it there without swing.
 
-    State (x, y, angle, swing, vx, vy, rate, swing_rate), x and y being those of the
-    load; control (left, right), the thrusts, neither negative. Starts with x and y
-    uniform in +-4, the angle in +-0.1, the swing in +-0.8 and what moves in +-0.5. Cost
-    `x^2 + y^2 + 2 (1 - cos(angle)) + 2 (1 - cos(swing)) + 0.1 (vx^2 + vy^2 +
-    swing_rate^2) + 0.01 rate^2 + 0.01 |u - u*|^2` per step, u* being half of the whole
-    weight. Never terminates. `encode` gives the cosine and the sine of each angle in
-    its place. From this far, a linear law asks for more than the rotors have, and tips
-    over.
+    - *State:* x [m] and y [m] of the load, angle [rad], swing [rad], vx [m/s], vy
+        [m/s], rate [rad/s], swing_rate [rad/s]. *Control:* the thrusts left [N] and
+        right [N], not negative.
+    - *Start:* x and y uniform in +-4 m, the angle in +-0.1 rad, the swing in +-0.8 rad,
+        the velocities and rates in +-0.5.
+    - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 2 (1 - cos(swing)) +
+        0.1 (vx^2 + vy^2 + swing_rate^2) + 0.01 rate^2 + 0.01 |u - u*|^2` per step,
+        where each entry of `u*` is half of the whole weight.
+    - *End:* never terminates.
+    - *Features:* `encode` replaces each angle by its cosine and sine.
+
+    From this far, a linear controller asks for too much thrust and tips over.
 
     **Arguments:**
 
-    - `max_thrust`: of a rotor, 5 by default; 5.9 is the whole weight.
+    - `max_thrust`: the largest thrust of a rotor [N], 5 by default; 5.9 is the weight.
 
     Source: Sreenath, Lee and Kumar, 2013.
 
@@ -283,21 +300,22 @@ def drift(
     max_force: Limit = 4500.0,
     max_steering: Limit = 0.6,
 ) -> Fields:
-    """Make a car that drives straight ahead drift, and hold the drift.
+    """Bring a car from driving straight ahead into a drift, and hold the drift.
 
-    State (vx, vy, rate); control (force, steering). Starts with vx within 2 m/s of the
-    speed of the drift, vy in +-0.2 m/s and the rate in +-0.1 rad/s. Cost
-    `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 + 1e-7 (force - force*)^2 +
-    (steering - steering*)^2` per step, measured from the drift to the left, which is an
-    unstable equilibrium. Never terminates.
+    - *State:* vx [m/s], vy [m/s], rate [rad/s]. *Control:* force [N], steering [rad].
+    - *Start:* vx within 2 m/s of the speed of the drift, vy in +-0.2 m/s, the rate in
+        +-0.1 rad/s.
+    - *Cost:* `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 +
+        1e-7 (force - force*)^2 + (steering - steering*)^2` per step. The stars are the
+        drift to the left, an unstable equilibrium.
+    - *End:* never terminates.
 
     **Arguments:**
 
     - `speed`: vx of the drift [m/s], 8 by default.
-    - `steering`: of the drift [rad], 12 degrees to the right by default.
-    - `max_force`: of the rear tyre, in either direction [N], 4500 by default, which is
-        nine tenths of its grip.
-    - `max_steering`: to either side [rad], 0.6 by default.
+    - `steering`: steering angle of the drift [rad], 12 degrees to the right by default.
+    - `max_force`: the bound of the force [N], 4500 by default, nine tenths of the grip.
+    - `max_steering`: the largest steering angle to either side [rad], 0.6 by default.
 
     Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014.
 
@@ -341,23 +359,25 @@ def reactor_start_up(
     """Start a stirred-tank reactor from cold, and hold it where most of the feed
     reacts.
 
-    State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts with
-    the concentration uniform in [0.9, 1] mol/l, hardly any having reacted, and the
-    temperature in [295, 305] K. Cost
-    `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per step, with
-    the equilibrium at the concentration. The episode ends, at `shutdown_cost`, above
-    the highest temperature. The time is in minutes.
+    - *State:* concentration [mol/l], temperature [K]. *Control:* coolant [K]. Time is
+        in minutes.
+    - *Start:* the concentration uniform in [0.9, 1] mol/l, with hardly any of the feed
+        reacted, the temperature in [295, 305] K.
+    - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
+        step. The stars are the equilibrium at `concentration`.
+    - *End:* above `max_temperature`. This costs `shutdown_cost`, more than a whole
+        episode of doing nothing.
 
-    As in [`delucax.environments.cstr`][], but from where the jacket must heat first,
-    and to a point with two unstable poles. Without enough heat the reaction never
+    The plant is that of [`delucax.environments.cstr`][], but the jacket must heat
+    first, and the goal has two unstable poles. Without enough heat the reaction never
     starts; with too much it runs away.
 
     **Arguments:**
 
     - `concentration`: to hold [mol/l], below that of the feed; 0.3 by default.
-    - `min_coolant`, `max_coolant`: what the jacket can do [K], 290 and 310 by default.
-    - `max_temperature`: above which the reactor is shut down [K], 380 by default.
-    - `shutdown_cost`: 5000 by default, more than an episode of doing nothing costs.
+    - `min_coolant`, `max_coolant`: bounds of the coolant [K], 290 and 310 by default.
+    - `max_temperature`: where the reactor is shut down [K], 380 by default.
+    - `shutdown_cost`: the cost of a shutdown, 5000 by default.
 
     Source: Henson and Seborg, 1997.
 

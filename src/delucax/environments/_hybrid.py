@@ -1,4 +1,4 @@
-"""Tasks of plants with events: bounce, roll, walk, switch, slip and land."""
+"""Tasks with events: bounce, roll, walk, switch, slip and land."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ class PeakCost(AbstractCost):
 
 
 class _Rests(eqx.Module):
-    """Whether what is left of the bouncing is low."""
+    """Whether the ball no longer bounces high."""
 
     system: BouncingBall
     low: Real = parameter(0.05)
@@ -58,23 +58,26 @@ def bouncing_ball(
     max_force: Limit = 3.0,
     rest_cost: Number = 1000.0,
 ) -> Fields:
-    """Keep a ball bouncing to a height by a force smaller than its weight.
+    """Keep a ball bouncing to a given height, with a force smaller than its weight.
 
-    State (height, velocity); control (force). Starts at rest at a height uniform in
-    [0.5, 1.5]. Cost `(peak - height)^2 + 0.01 force^2` per step, in which
-    `peak = height + velocity^2 / (2 gravity)` is what the energy of the ball would lift
-    it to. The episode ends, at `rest_cost`, when the peak is below 0.05: before the
-    bounces accumulate, unless the restitution is below 0.2.
+    - *State:* height [m], velocity [m/s]. *Control:* force [N].
+    - *Start:* at rest, at a height uniform in [0.5, 1.5] m.
+    - *Cost:* `(peak - height)^2 + 0.01 force^2` per step, where `height` is the
+        argument and `peak` is the height to which the energy of the ball would lift it:
+        its height plus `velocity^2 / (2 gravity)`.
+    - *End:* when the peak is below 0.05 m. This costs `rest_cost`. Bounces do not
+        accumulate before, unless the restitution is below 0.2.
 
-    The cost and the end hold the ball too: for others call this again, under `jax.vmap`
-    for many.
+    The cost and the condition of termination also hold the ball. To change the ball,
+    call this function again, under `jax.vmap` for a batch, instead of using
+    [`delucax.replace`][].
 
     **Arguments:**
 
-    - `drag`: of the ball, 0.02 by default.
-    - `height`: of the bounces, 2 by default.
-    - `max_force`: 3 by default.
-    - `rest_cost`: 1000 by default.
+    - `drag`: drag of the ball [kg/m], 0.02 by default.
+    - `height`: height of the bounces [m], 2 by default.
+    - `max_force`: the bound of the force [N], 3 by default.
+    - `rest_cost`: the cost of letting the ball come to rest, 1000 by default.
 
     Source: Goebel, Sanfelice and Teel, 2012.
 
@@ -96,7 +99,7 @@ def bouncing_ball(
 
 
 class _RollsBack(eqx.Module):
-    """Whether the wheel turns backwards, as it did not come over a spoke."""
+    """Whether the wheel rolls back, because it did not come over a spoke."""
 
     def __call__(self, t: Time, x: State) -> BoolScalar:
         return x[1] < 0
@@ -112,16 +115,18 @@ def rimless_wheel(
 ) -> Fields:
     """Roll a wheel of spokes down a gentle slope, faster than it rolls by itself.
 
-    State (angle, velocity); control (torque). Starts with the angle uniform in +-0.2
-    about the vertical and the velocity in [0.8, 1.6]. Cost
-    `(velocity - speed)^2 + 0.1 torque^2` per step. The episode ends, at `stall_cost`,
-    when the wheel turns back.
+    - *State:* angle [rad], velocity [rad/s]. *Control:* torque [N m].
+    - *Start:* the angle uniform in +-0.2 rad about the vertical, the velocity in [0.8,
+        1.6] rad/s.
+    - *Cost:* `(velocity - speed)^2 + 0.1 torque^2` per step.
+    - *End:* when the wheel rolls back. This costs `stall_cost`.
 
     **Arguments:**
 
-    - `speed`: 2 by default.
-    - `max_torque`: 2 by default, about half of what holds the wheel on its spokes.
-    - `stall_cost`: 500 by default.
+    - `speed`: the velocity to hold [rad/s], 2 by default.
+    - `max_torque`: the bound of the torque [N m], 2 by default, about half of what
+        holds the wheel on its spokes.
+    - `stall_cost`: the cost of rolling back, 500 by default.
 
     Source: McGeer, 1990; Coleman, Chatterjee and Ruina, 1997.
 
@@ -144,8 +149,8 @@ def rimless_wheel(
 
 
 class WalkingCost(AbstractCost):
-    """`(v - speed)^2 + torque_weight torque^2`, v being the speed of the hip along the
-    slope."""
+    """`(v - speed)^2 + torque_weight torque^2`, where `v` is the speed of the hip along
+    the slope."""
 
     system: CompassGait
     speed: Real = parameter()
@@ -160,7 +165,7 @@ class WalkingCost(AbstractCost):
 
 class _Falls(eqx.Module):
     """Whether the stance leg leans too far from the normal of the slope, or the swing
-    foot, below the ground as the legs pass, has not come up."""
+    foot is still below the ground after the legs have passed each other."""
 
     system: CompassGait
     max_lean: Real = parameter(0.8)
@@ -169,7 +174,7 @@ class _Falls(eqx.Module):
         u = jnp.zeros(1, x.dtype)
         (height,), (ahead,) = self.system.guards(t, x, u), self.system.enabled(t, x, u)
         leans = abs(x[1] + self.system.slope) > self.max_lean
-        # A foot that strikes at the end of an interval may be below by rounding.
+        # The tolerance is for a foot that strikes at the end of an interval.
         return leans | ahead & (height < -8 * jnp.finfo(x.dtype).eps)
 
 
@@ -183,21 +188,29 @@ def compass_gait(
 ) -> Fields:
     """Walk on two straight legs with a motor at the hip.
 
-    State (swing, stance, swing rate, stance rate); control (torque). Starts as a step
-    of the passive gait on 3 degrees does, with angles within 0.01 and rates within
-    0.03 of it: there the walker goes on without control; on level ground (`slope=0.0`)
-    it slows down and falls. Cost `(v - speed)^2 + 0.001 torque^2` per step, v being the
-    speed of the hip along the slope. The episode ends, at `fall_cost`, when the walker
-    trips or leans by more than 0.8 from the normal of the slope.
+    - *State:* swing [rad], stance [rad], swing rate [rad/s], stance rate [rad/s].
+        *Control:* torque [N m].
+    - *Start:* near the start of a step of the passive gait on a slope of 3 degrees, the
+        angles within 0.01 rad and the rates within 0.03 rad/s of it.
+    - *Cost:* `(v - speed)^2 + 0.001 torque^2` per step, where `v` is the speed of the
+        hip along the slope.
+    - *End:* when the walker trips, or leans by more than 0.8 rad from the normal of the
+        slope. This costs `fall_cost`.
 
-    The cost and the end hold the walker too: for others call this again, under
-    `jax.vmap` for many.
+    On the default slope of 3 degrees the walker walks on without control. On level
+    ground (`slope=0.0`) it slows down and falls.
+
+    The cost and the condition of termination also hold the walker. To change the
+    walker, call this function again, under `jax.vmap` for a batch, instead of using
+    [`delucax.replace`][].
 
     **Arguments:**
 
-    - `speed`: 0.73 by default, that of the passive gait on 3 degrees.
-    - `max_torque`: 10 by default; 0 for a passive walker.
-    - `fall_cost`: 200 by default.
+    - `speed`: the speed of the hip to hold [m/s], 0.73 by default, that of the passive
+        gait on 3 degrees.
+    - `max_torque`: the bound of the torque [N m], 10 by default; 0 for a passive
+        walker.
+    - `fall_cost`: the cost of falling, 200 by default.
 
     Source: Goswami, Thuilot and Espiau, 1998.
 
@@ -211,7 +224,7 @@ def compass_gait(
         ```
     """
     falls = _Falls(system)
-    # Both feet on the ground.
+    # These angles put both feet on the ground.
     angles = [-0.27105 - system.slope, 0.27105 - system.slope]
     centre = jnp.stack([*angles, *map(jnp.asarray, (-0.3772, -1.0918))])
     return dict(
@@ -226,17 +239,19 @@ def compass_gait(
 def thermostat(
     system: Thermostat, *, target: Number = 20.0, max_heat: Limit = 2.0
 ) -> Fields:
-    """Calm the swings of a room whose heater a thermostat switches, by a heat pump that
-    is too weak to heat alone.
+    """Reduce the temperature swings of a room with a thermostat, by a heat pump that is
+    too weak to heat alone.
 
-    State (temperature, mode); control (heat). Starts off, with the temperature uniform
-    in [19.2, 20.8]. Cost `(temperature - target)^2 + 0.01 heat^2` per step. Never
-    terminates.
+    - *State:* temperature [degC], mode. *Control:* heat [kW]. Time is in hours.
+    - *Start:* the heater is off, the temperature uniform in [19.2, 20.8] degC.
+    - *Cost:* `(temperature - target)^2 + 0.01 heat^2` per step.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `target`: 20 by default.
-    - `max_heat`: to heat or to cool, 2 by default, of which 3 would hold the target.
+    - `target`: the temperature to hold [degC], 20 by default.
+    - `max_heat`: the bound of the heat pump, to heat or to cool [kW], 2 by default. To
+        hold the target takes 3 kW.
 
     Source: Ihara and Schweppe, 1981.
 
@@ -262,18 +277,21 @@ def thermostat(
     arguments=lambda *, damping=0.1: dict(damping=damping),
 )
 def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
-    """Bring a mass that sticks to a moving belt and slips to rest, with the belt
-    slipping under it.
+    """Bring a mass on a moving belt to rest, so that the belt slips under it.
 
-    State (position, velocity, mode); control (force). Starts sticking, with the
-    position uniform in +-0.1. Cost
-    `100 (position - position*)^2 + 10 velocity^2 + force^2` per step, position* being
-    that at rest. Never terminates. Without control it sticks and slips for ever.
+    - *State:* position [m], velocity [m/s], mode. *Control:* force [N].
+    - *Start:* the mass sticks to the belt, the position uniform in +-0.1 m.
+    - *Cost:* `100 (position - position*)^2 + 10 velocity^2 + force^2` per step, where
+        `position*` is that at rest.
+    - *End:* never terminates.
+
+    Without control the mass sticks and slips forever.
 
     **Arguments:**
 
-    - `damping`: of the mass, 0.1 by default.
-    - `max_force`: 0.5 by default, which is less than either friction.
+    - `damping`: damping of the mass [N s/m], 0.1 by default.
+    - `max_force`: the bound of the force [N], 0.5 by default, less than the static and
+        the kinetic friction.
 
     Source: Popp and Stelter, 1990.
 
@@ -298,15 +316,17 @@ def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
 def valve_with_stops(system: ValveWithStops, *, max_force: Limit = 25.0) -> Fields:
     """Bring the valve of an engine to its open stop, land softly, and hold it there.
 
-    State (position, velocity, mode); control (force). Starts free, with the position
-    uniform in [0.2, 0.8] and the velocity in +-1. Cost
-    `10 (position - 1)^2 + 0.1 velocity^2 + 0.0002 force^2` per step. Never terminates.
-    Without control the valve comes to rest between its stops; a force of 19.5 holds it
-    open.
+    - *State:* position, velocity [1/s], mode. *Control:* force [N].
+    - *Start:* free, the position uniform in [0.2, 0.8], the velocity in +-1 per second.
+    - *Cost:* `10 (position - 1)^2 + 0.1 velocity^2 + 0.0002 force^2` per step.
+    - *End:* never terminates.
+
+    Without control the valve comes to rest between its stops. A force of 19.5 N holds
+    it open.
 
     **Arguments:**
 
-    - `max_force`: 25 by default.
+    - `max_force`: the bound of the force [N], 25 by default.
 
     Source: Hoffmann, Peterson and Stefanopoulou, 2003.
 

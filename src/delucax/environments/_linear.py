@@ -1,4 +1,4 @@
-"""Linear dynamical systems: given, drawn at random, and the cart-pole of the paper."""
+"""Linear tasks: given matrices, random ones, and the cart-pole of the Deluca paper."""
 
 from typing import Any
 
@@ -35,26 +35,27 @@ def cartpole_linear(
     horizon: int = 200,
     **others: Any,
 ) -> Environment:
-    """The linear cart-pole of the Deluca paper: a point mass on a rod near the upright,
-    by an Euler step, at quadratic cost `x'x + u'u`.
+    r"""The linear cart-pole of the Deluca paper: a point mass on a rod near upright,
+    discretised by an Euler step.
 
-    ```
-    d(velocity)/dt = (force + m g angle) / M
-    d(spin)/dt = (force + (M + m) g angle) / (M l)
-    ```
+    $$\ddot p = \frac{F + m g \theta}{M}, \qquad
+    \ddot\theta = \frac{F + (M + m) g \theta}{M l}$$
 
-    State (position, angle, velocity, spin), in this order; control (force), without
-    bounds. The angle grows against the direction of positive positions. Starts with
-    each state uniform in +-0.05. Never terminates.
+    - *State:* position $p$ [m], angle $\theta$ [rad], velocity [m/s], spin [rad/s], in
+        this order. A positive angle leans towards negative positions. *Control:* force
+        $F$ [N], without bounds.
+    - *Start:* each state uniform in +-0.05.
+    - *Cost:* $x^\top x + u^\top u$ per step.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `cart_mass`: M [kg], 1 by default.
-    - `pole_mass`: m [kg], 0.1 by default.
-    - `length`: l, of the rod [m], 1 by default.
-    - `gravity`: g [m/s^2], 9.81 by default.
-    - `dt`: the step, 0.02 by default.
-    - `horizon`: steps per episode, 200 by default: 4 s, where the paper's code stops
+    - `cart_mass`: $M$ [kg], 1 by default.
+    - `pole_mass`: $m$ [kg], 0.1 by default.
+    - `length`: $l$, length of the rod [m], 1 by default.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
+    - `dt`: the step [s], 0.02 by default.
+    - `horizon`: steps per episode, 200 by default, which is 4 s. The paper's code stops
         after 10 steps.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
@@ -97,7 +98,7 @@ def cartpole_linear(
 
 @host_unless_traced
 def _euler_step(M: Any, m: Any, l: Any, g: Any, dt: Any) -> tuple[Matrix, Matrix]:
-    """The matrices of the step of the linear cart-pole."""
+    """The matrices of the Euler step of the linear cart-pole."""
     dtype = jnp.result_type(float)
     M, m, l, g = (xp.asarray(number, dtype) for number in (M, m, l, g))
     zero, one = xp.zeros_like(M), xp.ones_like(M)
@@ -126,33 +127,39 @@ def lds(
     horizon: int = 200,
     **others: Any,
 ) -> Environment:
-    """A linear dynamical system `x_next = A x + B u + w`, `y = C x`, at quadratic cost
-    `x'x + u'u`.
+    r"""A linear dynamical system with a quadratic cost.
+
+    $$x_{k+1} = A x_k + B u_k + w_k, \qquad y_k = C x_k, \qquad
+    c = x^\top x + u^\top u$$
+
+    Define it in one of three ways: by matrices, by a linear model `system`, or by a
+    random `key`. The first state is zero. It never terminates.
 
     **Arguments:**
 
-    - `A`, `B`, `C`: the matrices; `C` is the identity by default. If neither `A` nor
-        `B` is given, all are drawn with `key`: entries standard normal, `A` scaled to
-        the spectral radius.
-    - `system`: a linear model in place of matrices. One in continuous time is sampled
-        exactly with `dt`. `delucax.interop.from_control` makes one of a python-control
-        object, `delucax.interop.read_linear` of a file, [`delucax.linearize`][] of any
-        system.
-    - `dt`: the step; 1 by default, and that of a `system` that has one.
+    - `A`, `B`, `C`: the matrices, shapes `(n, n)`, `(n, m)` and `(p, n)`; `C` is the
+        identity by default. Without `A` and `B`, all are drawn with `key`: entries are
+        standard normal, and `A` is scaled to `spectral_radius`.
+    - `system`: a [`delucax.LinearDynamics`][] or a
+        [`delucax.systems.LinearSystem`][], in place of the matrices. The latter is
+        sampled exactly with `dt`. `delucax.interop.from_control` makes one from a
+        python-control object, `delucax.interop.read_linear` from a file, and
+        [`delucax.linearize`][] from any system.
+    - `dt`: the step, in units of time; 1 by default. It is required for a `system` in
+        continuous time, and must be left out for one in discrete time.
     - `key`: a random key, for random matrices.
-    - `states`, `controls`: sizes of random matrices, 2 and 1 by default.
-    - `observations`: rows of a random `C`; the identity by default.
-    - `spectral_radius`: of the random `A`, 0.9 by default; below 1 is stable.
+    - `states`, `controls`: `n` and `m` of random matrices, 2 and 1 by default.
+    - `observations`: `p` of a random `C`; by default `C` is the identity.
+    - `spectral_radius`: that of the random `A`, 0.9 by default. Below 1 it is stable.
     - `horizon`: steps per episode, 200 by default.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if one of `A` and `B` is missing, if there is no key to
-    draw them with, or one with them, if shapes do not fit, or if `system` is not
-    linear, is given with matrices or a key, or has a step where `dt` is given, or none
-    where it is not.
+    **Raises:** `ValueError` if only one of `A` and `B` is given, if there are neither
+    matrices nor a key nor a system, or more than one of these, if shapes do not fit, if
+    `system` is not linear, or if `dt` does not fit it.
 
     !!! example
 
@@ -169,20 +176,21 @@ def lds(
     if system is not None:
         for name, value in {"A": A, "B": B, "C": C, "key": key}.items():
             if value is not None:
-                raise ValueError(f"lds: give {name} or a system, not both.")
+                raise ValueError(f"lds: pass {name} or a system, not both.")
         dynamics = _sampled(system, dt)
     else:
         if (A is None) != (B is None):
             missing, other = ("A", "B") if A is None else ("B", "A")
             raise ValueError(
-                f"lds: {missing} must be given with {other}, or neither of them."
+                f"lds: {missing} must be given together with {other}. For random "
+                "matrices, leave both out."
             )
         if A is None and C is not None:
-            raise ValueError("lds: C needs A and B; for a random C give observations.")
+            raise ValueError("lds: C needs A and B. For a random C, pass observations.")
         if A is None:
             A, B, C = _random(key, states, controls, observations, spectral_radius)
         elif key is not None:
-            raise ValueError("lds: give A and B, or a key to draw them with, not both.")
+            raise ValueError("lds: pass A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
     cost = Quadratic([1.0] * n, [1.0] * m)
@@ -191,17 +199,17 @@ def lds(
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:
-    """A linear model in discrete time."""
+    """`system` in discrete time."""
     if isinstance(system, LinearDynamics):
         if dt is not None:
             raise ValueError(
-                f"lds: dt must be left out for a system that has one, got {dt} and "
-                f"{system.dt}."
+                f"lds: dt must be left out for a system in discrete time, got {dt}, "
+                f"and the system has {system.dt}."
             )
         return system
     hint = (
-        " or LinearDynamics (`delucax.interop.from_control` makes one of a "
-        "python-control object, `delucax.interop.read_linear` of a file)"
+        " or LinearDynamics (`delucax.interop.from_control` makes one from a "
+        "python-control object, `delucax.interop.read_linear` from a file)"
     )
     check_instance(system, LinearSystem, "system", "lds", hint)
     if dt is None:
@@ -217,7 +225,7 @@ def _random(
     """Matrices with standard normal entries, the first scaled to a spectral radius."""
     if key is None:
         raise ValueError(
-            "lds: give A and B, or a key to draw them with, such as "
+            "lds: pass A and B, or a key to draw them with, such as "
             "key=jax.random.key(0)."
         )
     check_key(key, "lds")
@@ -241,7 +249,7 @@ def _normal(key: PRNGKey, shapes: tuple[tuple[int, int], ...]) -> list[Matrix]:
 
 @host_unless_traced
 def _scaled(A: Matrix, radius: Any) -> Matrix:
-    """`A` of this spectral radius."""
+    """`A` scaled to a spectral radius."""
     # The eigenvalues scale with the matrix.
     factor = radius / xp.max(xp.abs(xp.linalg.eigvals(A)))
     return A * xp.asarray(factor, A.dtype)

@@ -1,4 +1,4 @@
-"""Parameters drawn at random."""
+"""Domain randomisation: parameters drawn at random."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,24 +16,27 @@ from .._typing import PRNGKey
 
 
 def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
-    """A copy with the named parameters drawn at random: domain randomisation.
+    """Domain randomisation: a copy of an environment with some parameters drawn at
+    random.
 
-    Under `jax.vmap` over keys it makes a batch of plants that compiles once. There the
-    ends of the ranges are validated in place of the draws: each with the others at
-    their lower, and at their upper ends. Draws by a function are validated only outside
-    of `jax.vmap` and `jax.jit`.
+    Use `jax.vmap` over keys to make a batch of plants, which compiles once. Traced
+    draws cannot be checked, so the ends of the ranges are checked instead: each end,
+    with all other parameters at their lower and at their upper ends. Draws by a
+    function are checked only outside of `jax.vmap` and `jax.jit`.
 
     **Arguments:**
 
-    - `tree`: an environment, or anything that [`delucax.replace`][] takes.
+    - `tree`: an environment, or anything else that [`delucax.replace`][] takes.
     - `key`: a random key.
-    - `ranges`: from a path to `(low, high)`, drawn uniformly, or to a function of a key
-        to a value.
+    - `ranges`: a dictionary from paths, such as `"dynamics.system.length"`, to ranges.
+        A range is a pair `(low, high)`, from which values are drawn uniformly, or a
+        function of a random key to a value.
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path is not there or is part of another one, a range
-    is not a finite pair or a function, or a range holds values that are not valid.
+    **Raises:** `ValueError` if a path does not exist or is part of another path, if a
+    range is neither a pair of finite numbers nor a function, or if it holds values that
+    are not valid.
 
     !!! example
 
@@ -49,7 +52,12 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             zero = dlx.controllers.Zero(1)
             return dlx.rollout(plant, zero, key=key, x0=[0.1, 0.0]).total_cost
 
-        jax.jit(jax.vmap(cost))(jax.random.split(jax.random.key(0), 8))
+        costs = jax.jit(jax.vmap(cost))(jax.random.split(jax.random.key(0), 8))
+        costs.shape
+        ```
+
+        ```text
+        (8,)
         ```
     """
     check_key(key, "randomise")
@@ -69,7 +77,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
                 low, high = (as_float_array(end) for end in given)
             if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
                 raise ValueError(
-                    f"randomise: the range of {path!r} must be of numbers, got "
+                    f"randomise: the range of {path!r} must hold numbers, got "
                     f"{shortened(given)}."
                 )
             shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
@@ -94,7 +102,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
 
 
 def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
-    """The ends of a range, moved inside by a rounding, so that an open interval may be
+    """The ends of a range, moved inside by a rounding. An open interval may then be
     given by its end points, such as 0 for a positive parameter."""
     small = np.finfo(low.dtype).eps * (high - low)
     first = np.maximum(np.nextafter(low, high), low + small)
@@ -103,10 +111,10 @@ def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
 
 
 def _check_ends(tree: Any, changes: dict[str, Any], ends: dict[str, Any]) -> None:
-    """Raise if a range holds invalid values, which traced draws cannot show.
+    """Raise if a range holds invalid values, because traced draws cannot be checked.
 
     All values are set to the same end of their ranges, or all but one. Each of these
-    combinations may be drawn, so that no valid ranges are refused.
+    combinations may be drawn, so no valid ranges are refused.
     """
     count = len(ends)
     sides = {
@@ -120,4 +128,6 @@ def _check_ends(tree: Any, changes: dict[str, Any], ends: dict[str, Any]) -> Non
             with jax.ensure_compile_time_eval():
                 replace(tree, changes | tried)
         except ValueError as error:
-            raise ValueError(f"{error} The ranges of randomise allow it.") from error
+            raise ValueError(
+                f"{error} It is within the ranges of randomise. Narrow them."
+            ) from error

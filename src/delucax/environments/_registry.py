@@ -1,4 +1,4 @@
-"""Tasks by name."""
+"""The registry of tasks by name."""
 
 import importlib
 from collections.abc import Callable
@@ -19,14 +19,14 @@ TASKS = {
     "permanent_magnet_motor two_tank van_der_pol",
     "_robots": "dynamic_bicycle kinematic_bicycle planar_quadrotor quadrotor reacher",
 }
-"""The tasks of this package, by the module that makes them."""
+"""The tasks of this package, by the module that defines them."""
 _LUNGS = """
     balloon_lung delay_lung double_compartment learned_lung single_compartment
 """.split()
-# The names of the paper.
+# The Deluca paper's names for these tasks start with "classic/".
 _CLASSIC = "acrobot cartpole mountain_car pendulum planar_quadrotor reacher".split()
 
-# The entry points.
+# From names to entry points.
 _REGISTRY: dict[str, str] = {
     **{
         name: f"delucax.environments:{name}"
@@ -40,17 +40,19 @@ _REGISTRY: dict[str, str] = {
 
 
 def make(name: str, **kwargs: Any) -> Environment:
-    """Create a registered environment by its name.
+    """Make a registered task by its name.
 
     **Arguments:**
 
-    - `name`: such as `"pendulum"`; the paper's names (`"classic/pendulum"`) work too.
-    - `**kwargs`: passed to the function that makes the task.
+    - `name`: such as `"pendulum"`. The names of the Deluca paper, such as
+        `"classic/pendulum"`, work too. [`delucax.environments.registered`][] lists all.
+    - `**kwargs`: passed to the function that makes the task, such as
+        [`delucax.environments.pendulum`][].
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on an unknown name, with similar ones, or if the function
-    does not return an environment.
+    **Raises:** `ValueError` on an unknown name, or if the function does not return an
+    environment.
 
     !!! example
 
@@ -58,13 +60,18 @@ def make(name: str, **kwargs: Any) -> Environment:
         import delucax as dlx
 
         env = dlx.make("pendulum", length=1.2)
+        env.state_size, env.control_size, env.horizon
+        ```
+
+        ```text
+        (2, 1, 200)
         ```
     """
     env = _function_of(name)(**kwargs)
     if not isinstance(env, Environment):
         raise ValueError(
-            f"make: {name!r} must be an Environment, but {_REGISTRY[name]!r} returned "
-            f"{type(env).__name__}."
+            f"make: the entry point {_REGISTRY[name]!r} of {name!r} must return an "
+            f"Environment, got {type(env).__name__}."
         )
     return env
 
@@ -83,22 +90,22 @@ def _function_of(name: str) -> Callable[..., Any]:
         return getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         raise ValueError(
-            f"make: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
+            f"make: the entry point {_REGISTRY[name]!r} of {name!r} cannot be "
             f"imported: {error}."
         ) from error
 
 
 def register(name: str, entry_point: str) -> None:
-    """Add a task that [`delucax.make`][] finds.
+    """Register a task, so that [`delucax.make`][] can make it by its name.
 
     **Arguments:**
 
-    - `name`: what to call it.
-    - `entry_point`: `"module:function"`, imported when the task is first made; the
-        function returns an [`delucax.Environment`][].
+    - `name`: the name of the task.
+    - `entry_point`: `"module:function"`. It is imported when the task is first made.
+        The function must return an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if the entry point is not of that form, or if the name is
-    taken by another.
+    **Raises:** `ValueError` if the entry point does not have this form, or if another
+    task has the name.
 
     !!! example
 
@@ -111,7 +118,7 @@ def register(name: str, entry_point: str) -> None:
     """
     if not isinstance(name, str) or not name:
         raise ValueError(
-            f"register: name must be a string that is not empty, got {name!r}."
+            f"register: name must be a non-empty string, got {name!r}."
         )
     module, _, function = str(entry_point).partition(":")
     if not module or not function.isidentifier():
@@ -120,19 +127,28 @@ def register(name: str, entry_point: str) -> None:
             f"'my_package.tasks:rocket', got {entry_point!r}."
         )
     if _REGISTRY.get(name, entry_point) != entry_point:
-        raise ValueError(f"register: {name!r} is already {_REGISTRY[name]!r}.")
+        raise ValueError(
+            f"register: name must be new, got {name!r}, which is already registered as "
+            f"{_REGISTRY[name]!r}."
+        )
     _REGISTRY[name] = entry_point
 
 
 def registered() -> tuple[str, ...]:
-    """The names that [`delucax.make`][] knows.
+    """The names of the registered tasks, which [`delucax.make`][] knows.
+
+    **Returns:** a tuple of strings, sorted.
 
     !!! example
 
         ```python
         import delucax as dlx
 
-        dlx.environments.registered()
+        dlx.environments.registered()[:3]
+        ```
+
+        ```text
+        ('acrobot', 'balloon_lung', 'bouncing_ball')
         ```
     """
     return tuple(sorted(_REGISTRY))

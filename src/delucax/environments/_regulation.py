@@ -1,4 +1,4 @@
-"""Set-point regulation tasks with a quadratic cost."""
+"""Regulation tasks with a quadratic cost."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +27,7 @@ def _regulation(
     bounds: tuple[Limit, Limit],
     centre: Array | Sequence[float] | float = 0.0,
 ) -> Fields:
-    """A start within `spread` of `centre`, and bounds of the controls."""
+    """The cost, a start within `spread` of `centre`, and bounds of the controls."""
     return dict(
         cost=cost,
         initial_state=UniformState(*box(spread, centre)),
@@ -39,12 +39,14 @@ def _regulation(
 def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fields:
     """Bring a mass on a line to rest at the origin.
 
-    State (position, velocity); control (force). Starts with the position uniform in
-    +-2 and the velocity in +-1. Cost `|x|^2 + 0.1 force^2` per step. Never terminates.
+    - *State:* position [m], velocity [m/s]. *Control:* force [N].
+    - *Start:* the position uniform in +-2 m, the velocity in +-1 m/s.
+    - *Cost:* `|x|^2 + 0.1 force^2` per step.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_force`: 1 by default.
+    - `max_force`: the bound of the force [N], 1 by default.
 
     Source: Åström and Murray, 2008.
 
@@ -62,14 +64,16 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fi
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
 def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> Fields:
-    """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
+    """Bring a mass on a spring, or a chain of masses, to rest by a force on the last.
 
-    State (positions, velocities); control (force). Starts with each state uniform in
-    +-1. Cost `|x|^2 + 0.1 force^2` per step. Never terminates.
+    - *State:* positions [m], velocities [m/s]. *Control:* force [N].
+    - *Start:* each state uniform in +-1.
+    - *Cost:* `|x|^2 + 0.1 force^2` per step.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_force`: 1 by default.
+    - `max_force`: the bound of the force [N], 1 by default.
 
     Source: Åström and Murray, 2008.
 
@@ -89,12 +93,14 @@ def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> F
 def van_der_pol(system: VanDerPol, *, max_control: Limit = 3.0) -> Fields:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
-    State (x, v); control (u). Starts with each state uniform in +-2. Cost
-    `|x|^2 + 0.1 u^2` per step. Never terminates.
+    - *State:* x, v. *Control:* u.
+    - *Start:* each state uniform in +-2.
+    - *Cost:* `x^2 + v^2 + 0.1 u^2` per step.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_control`: 3 by default.
+    - `max_control`: the bound of the control, 3 by default.
 
     Source: van der Pol, 1926.
 
@@ -114,12 +120,15 @@ def van_der_pol(system: VanDerPol, *, max_control: Limit = 3.0) -> Fields:
 def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
-    State (x, y, z); control (u). Starts with x and y uniform in +-20 and z in [10, 40].
-    Cost `|x - x*|^2 + 0.001 u^2` per step, x* being the equilibrium. Never terminates.
+    - *State:* x, y, z. *Control:* u.
+    - *Start:* x and y uniform in +-20, z in [10, 40].
+    - *Cost:* `(x - x*)^2 + (y - y*)^2 + (z - z*)^2 + 0.001 u^2` per step, where the
+        stars are the equilibrium.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_control`: 50 by default.
+    - `max_control`: the bound of the control, 50 by default.
 
     Source: Lorenz, 1963; Kaiser, Kutz and Brunton, 2018.
 
@@ -139,16 +148,19 @@ def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
 
 @task(TwoTank, dt=2.0, horizon=200)
 def two_tank(system: TwoTank, *, level: Limit = 10.0, max_flow: Limit = 30.0) -> Fields:
-    """Hold the lower of two tanks at a level.
+    """Hold the lower of two tanks at a given level.
 
-    State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
-    levels uniform in [0, 20]. Cost `(lower - level)^2 + 0.01 (flow - flow*)^2` per
-    step, where flow* holds the level. Never terminates.
+    - *State:* the levels upper [cm] and lower [cm]. *Control:* flow [cm^3/s], not
+        negative.
+    - *Start:* the levels uniform in [0, 20] cm.
+    - *Cost:* `(lower - level)^2 + 0.01 (flow - flow*)^2` per step, where `flow*` is the
+        flow that holds the level.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `level`: to hold [cm], 10 by default.
-    - `max_flow`: of the pump, 30 by default.
+    - `level`: the level to hold [cm], 10 by default.
+    - `max_flow`: the largest flow of the pump [cm^3/s], 30 by default.
 
     Source: Johansson, 2000.
 
@@ -175,15 +187,19 @@ def cstr(
 ) -> Fields:
     """Hold a stirred-tank reactor at its unstable equilibrium.
 
-    State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts within
-    0.05 mol/l and 3 K of the equilibrium. Cost
-    `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per step, with
-    the equilibrium at the concentration. Never terminates. The time is in minutes.
+    - *State:* concentration [mol/l], temperature [K]. *Control:* coolant [K]. Time is
+        in minutes.
+    - *Start:* within 0.05 mol/l and 3 K of the equilibrium.
+    - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
+        step. The stars are the equilibrium at `concentration`.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `concentration`: to hold [mol/l], below that of the feed; 0.5 by default.
-    - `min_coolant`, `max_coolant`: what the jacket can do [K], 280 and 320 by default.
+    - `concentration`: the concentration to hold [mol/l], below that of the feed; 0.5 by
+        default.
+    - `min_coolant`, `max_coolant`: the bounds of the coolant [K], 280 and 320 by
+        default.
 
     Source: Henson and Seborg, 1997.
 
@@ -205,17 +221,19 @@ def cstr(
 def permanent_magnet_motor(
     system: PermanentMagnetMotor, *, speed: Number = 100.0, max_voltage: Limit = 150.0
 ) -> Fields:
-    """Bring a synchronous motor to a speed and hold it.
+    """Bring a synchronous motor to a given speed and hold it.
 
-    State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
-    (load). Starts with the currents uniform in +-1 A and the speed in +-50 rad/s. Cost
-    `0.01 (di_d^2 + di_q^2) + 0.001 dspeed^2 + 1e-5 |dv|^2` per step, each measured from
-    what holds the speed without load. Never terminates.
+    - *State:* i_d [A], i_q [A], speed [rad/s]. *Control:* v_d [V], v_q [V].
+        *Disturbance:* load [N m].
+    - *Start:* the currents uniform in +-1 A, the speed in +-50 rad/s.
+    - *Cost:* `0.01 |i - i*|^2 + 0.001 (speed - speed*)^2 + 1e-5 |v - v*|^2` per step,
+        where the stars are the equilibrium at the speed, without load.
+    - *End:* never terminates.
 
     **Arguments:**
 
-    - `speed`: to hold [rad/s], 100 by default.
-    - `max_voltage`: 150 by default.
+    - `speed`: the speed to hold [rad/s], 100 by default.
+    - `max_voltage`: the bound of each voltage [V], 150 by default.
 
     Source: Krause, Wasynczuk and Sudhoff, 2002.
 
@@ -238,10 +256,10 @@ def permanent_magnet_motor(
 def _drawn(
     *, key: PRNGKey | None = None, states: Any = 2, controls: Any = 1, width: int = 32
 ) -> dict[str, Any]:
-    """The arguments of a network with random weights."""
+    """The arguments of a `NeuralSystem` with random weights."""
     if key is None:
         raise ValueError(
-            "neural: give a system, or a key to draw the weights of one, such as "
+            "neural: pass a system, or a key to draw the weights of one, such as "
             "key=jax.random.key(0), got neither."
         )
     return dict(key=key, states=states, controls=controls, width=width)
@@ -251,16 +269,19 @@ def _drawn(
 def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
     """Bring the state of a learned vector field to the origin.
 
-    Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` per step. Never
-    terminates.
+    - *Start:* each state uniform in +-1.
+    - *Cost:* `|x|^2 + 0.1 |u|^2` per step.
+    - *End:* never terminates.
+
+    Pass a `system`, such as a network that was fitted to data, or a `key` for a network
+    with random weights.
 
     **Arguments:**
 
-    - `key`: a random key, for random weights if no `system` is given, which may be a
-        network that was fitted to data, or any other system.
-    - `states`, `controls`, `width`: of a network with random weights, 2, 1 and 32 by
-        default; see [`delucax.systems.NeuralSystem`][].
-    - `max_control`: of each control, to either side; 1 by default.
+    - `key`: a random key for random weights.
+    - `states`, `controls`, `width`: sizes of the network with random weights, 2, 1 and
+        32 by default; see [`delucax.systems.NeuralSystem`][].
+    - `max_control`: the bound of each control, 1 by default.
 
     Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
 

@@ -1,4 +1,4 @@
-"""Tasks of robots: keep a car in its lane, fly a quadrotor to a point, reach a goal."""
+"""Robot tasks: keep a car in its lane, fly a quadrotor to a point, reach a goal."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -29,13 +29,13 @@ from ._task import box, Fields, Limit, Number, task, UniformState
 
 
 def bicycle_features(x: State) -> Vector:
-    """The state of a car with the cosine and sine of the heading in its place."""
+    """The state of a car, with the heading replaced by its cosine and sine."""
     turned = jnp.stack([x[0], x[1], cos(x[2]), sin(x[2])])
     return jnp.concatenate([turned, x[3:]])
 
 
 def heading_difference(x: State, x_ref: State) -> State:
-    """`x - x_ref` with the heading wrapped."""
+    """`x - x_ref`, with the difference of the headings wrapped."""
     d = x - x_ref
     rest = [d[i] for i in range(3, x.shape[0])]
     return jnp.stack([d[0], d[1], wrap(d[2]), *rest])
@@ -47,17 +47,17 @@ def _lane_keeping(
     max_acceleration: Limit,
     max_steering: Limit,
 ) -> Fields:
-    """The common part of the bicycles' tasks, which start within `spread` of driving
-    along the lane.
+    """What both bicycle tasks share. They start within `spread` of driving along the
+    lane.
 
-    The cost is `y^2 + heading^2 + 0.1 (speed - speed*)^2`, 0.1 times the squares of
-    what else moves, and `0.1 acceleration^2 + steering^2`. Of the features the cosine
-    and the sine of the heading are bounded.
+    The cost is `y^2 + heading^2 + 0.1 acceleration^2 + steering^2`, plus 0.1 times the
+    squared deviations of the speed and of the other states. Among the features, only
+    the cosine and sine of the heading are bounded.
     """
     rest = len(spread) - 3
     target = [0.0, 0.0, 0.0, speed] + [0.0] * (rest - 1)
     feature_bound = [FLOAT32_MAX] * 2 + [1.0] * 2 + [FLOAT32_MAX] * rest
-    # Where the car is along the lane costs nothing.
+    # The position along the lane costs nothing.
     weights = [0.0, 1.0, 1.0] + [0.1] * rest
     cost = Quadratic(
         weights, [0.1, 1.0], state_target=target, difference=heading_difference
@@ -79,19 +79,25 @@ def kinematic_bicycle(
     max_acceleration: Limit = 3.0,
     max_steering: Limit = 0.5,
 ) -> Fields:
-    """Bring a car that rolls without slip to the lane y = 0, and to a speed.
+    """Bring a car that rolls without slip to the lane y = 0, and to a given speed.
 
-    State (x, y, heading, speed); control (acceleration, steering). Starts at x = 0 with
-    y uniform in +-2 m, the heading in +-0.3 rad and the speed within 3 m/s of the one
-    to hold. Cost
-    `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 + steering^2` per
-    step, the heading wrapped. `encode` gives its cosine and sine. Never terminates.
+    - *State:* x [m], y [m], heading [rad], speed [m/s]. *Control:* acceleration
+        [m/s^2], steering [rad].
+    - *Start:* at x = 0, y uniform in +-2 m, the heading in +-0.3 rad, the speed within
+        3 m/s of the one to hold.
+    - *Cost:* `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 +
+        steering^2` per step, where `speed*` is the speed to hold. The heading is
+        wrapped.
+    - *End:* never terminates.
+    - *Features:* `encode` replaces the heading by its cosine and sine.
 
     **Arguments:**
 
-    - `speed`: to hold [m/s], 10 by default.
-    - `max_acceleration`: in either direction [m/s^2], 3 by default.
-    - `max_steering`: to either side [rad], 0.5 by default.
+    - `speed`: the speed to hold [m/s], 10 by default.
+    - `max_acceleration`: the bound of the acceleration, in either direction [m/s^2], 3
+        by default.
+    - `max_steering`: the bound of the steering angle, to either side [rad], 0.5 by
+        default.
 
     Source: Kong, Pfeiffer, Schildbach and Borrelli, 2015.
 
@@ -115,20 +121,25 @@ def dynamic_bicycle(
     max_acceleration: Limit = 5.0,
     max_steering: Limit = 0.2,
 ) -> Fields:
-    """Bring a fast car on tyres to the lane y = 0, and to a speed.
+    """Bring a fast car on tyres to the lane y = 0, and to a given speed.
 
-    State (x, y, heading, vx, vy, rate); control (acceleration, steering). Starts at
-    x = 0 with y uniform in +-2 m, the heading in +-0.1 rad, vx within 5 m/s of the
-    speed to hold, vy in +-0.5 m/s and the rate in +-0.2 rad/s. Cost
-    `y^2 + heading^2 + 0.1 ((vx - speed*)^2 + vy^2 + rate^2) + 0.1 acceleration^2 +
-    steering^2` per step, the heading wrapped. `encode` gives its cosine and sine. Never
-    terminates.
+    - *State:* x [m], y [m], heading [rad], vx [m/s], vy [m/s], rate [rad/s]. *Control:*
+        acceleration [m/s^2], steering [rad].
+    - *Start:* at x = 0, y uniform in +-2 m, the heading in +-0.1 rad, vx within 5 m/s
+        of the speed to hold, vy in +-0.5 m/s, the rate in +-0.2 rad/s.
+    - *Cost:* `y^2 + heading^2 + 0.1 ((vx - speed*)^2 + vy^2 + rate^2) +
+        0.1 acceleration^2 + steering^2` per step, where `speed*` is the speed to hold.
+        The heading is wrapped.
+    - *End:* never terminates.
+    - *Features:* `encode` replaces the heading by its cosine and sine.
 
     **Arguments:**
 
-    - `speed`: to hold [m/s], 20 by default.
-    - `max_acceleration`: in either direction [m/s^2], 5 by default.
-    - `max_steering`: to either side [rad], 0.2 by default.
+    - `speed`: the speed to hold [m/s], 20 by default.
+    - `max_acceleration`: the bound of the acceleration, in either direction [m/s^2], 5
+        by default.
+    - `max_steering`: the bound of the steering angle, to either side [rad], 0.2 by
+        default.
 
     Source: Rajamani, 2012.
 
@@ -154,12 +165,12 @@ _WINDS: dict[str, Callable[..., Any]] = {
 def _wind(
     *, wind: str | Callable[..., Array] | None = None, wind_strength: Any = None
 ) -> dict[str, Any]:
-    """The wind of a system, by its name or as it is."""
+    """The wind of a system, from its name or as it is."""
     where = "planar_quadrotor"
     if not isinstance(wind, str):
         if wind_strength is not None:
             raise ValueError(
-                f"{where}: wind_strength needs a wind that is named, such as "
+                f"{where}: wind_strength needs the name of a wind, such as "
                 f"'dissipative', got wind={wind!r}."
             )
         return dict(wind=wind)
@@ -175,18 +186,23 @@ def _wind(
 def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
     """Fly a planar quadrotor to the origin and hover there.
 
-    State (x, y, angle, vx, vy, rate); control (left, right), the thrusts, without
-    bounds; disturbance (force_x, force_y). Starts at rest at (1, 1). Cost
-    `|x|^2 + 0.1 |u - u_hover|^2` per step, u_hover being half of the weight, whatever
-    the wind. Explicit Euler, as in the paper. Never terminates.
+    - *State:* x [m], y [m], angle [rad], vx [m/s], vy [m/s], rate [rad/s]. *Control:*
+        the thrusts left [N] and right [N], without bounds. *Disturbance:* force_x [N],
+        force_y [N].
+    - *Start:* at rest at (1, 1).
+    - *Cost:* `|x|^2 + 0.1 |u - u*|^2` per step, where each entry of `u*` is half of the
+        weight, whatever the wind.
+    - *End:* never terminates.
+
+    The default solver is explicit Euler, as in the paper.
 
     **Arguments:**
 
-    - `wind`: `"dissipative"`, `"constant"`, `"vortices"`, or any function
-        `(t, x) -> force`; none by default. What the names stand for is said at
-        [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] and
-        [`delucax.systems.VortexWind`][].
-    - `wind_strength`: of a wind that is named, 0.1 by default.
+    - `wind`: `"dissipative"`, `"constant"` or `"vortices"`, for
+        [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] or
+        [`delucax.systems.VortexWind`][]; or any function `(t, x) -> force`. None by
+        default.
+    - `wind_strength`: the strength of a wind given by name, 0.1 by default.
 
     Source: Gradu et al., 2021 (Deluca).
 
@@ -199,7 +215,7 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
         ```
     """
     windless = PlanarQuadrotor(system.mass, system.length, system.gravity)
-    # The paper's cost is that of the model, which knows of no wind.
+    # The wind is left out, because the paper's cost is that of a model without wind.
     _, hover = windless.equilibrium()
     return dict(
         cost=Quadratic([1.0] * 6, [0.1] * 2, control_target=hover),
@@ -207,12 +223,12 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
     )
 
 
-# The entries of a rotation matrix, with room for what rounding adds.
+# The bound of the entries of a rotation matrix, with room for rounding.
 _ROTATION = 1.00001
 
 
 class _Start(eqx.Module):
-    """A state from a box, its quaternion of length 1."""
+    """A state drawn from a box, with its quaternion normalised."""
 
     box: UniformState
 
@@ -221,29 +237,31 @@ class _Start(eqx.Module):
 
 
 def quadrotor_features(x: State) -> Vector:
-    """The state with the rotation matrix in place of the quaternion: q and -q, which
-    are one attitude, look the same."""
+    """The state, with the quaternion replaced by the rotation matrix, which is the same
+    for q and -q."""
     return jnp.concatenate([x[:3], Quadrotor.rotation(x), x[7:]])
 
 
 @task(Quadrotor, dt=0.02, horizon=250)
 def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
-    """Fly a quadrotor to the origin and hover there.
+    r"""Fly a quadrotor to the origin and hover there.
 
-    State (position, quaternion, velocity, body rates), 13 entries; control (front,
-    left, back, right), the thrusts, or (thrust, torque); disturbance, a force. Starts
-    with the position uniform in +-1 m, the velocity in +-0.5 m/s, the rates in +-0.5
-    rad/s and the attitude up to about 40 degrees from level. Cost per step: the squares
-    of position and of the quaternion's deviation, 0.1 times those of the velocities,
-    and 0.1 times those of the control's deviation from hovering. Never terminates.
-
-    `encode` gives (position, rotation matrix from body to world row by row, velocity,
-    body rates), shape `(18,)`: q and -q, which are one attitude, look the same.
+    - *State:* 13 entries: position [m], quaternion, velocity [m/s], body rates [rad/s].
+        *Control:* the thrusts front, left, back and right [N]; or with
+        `inputs="wrench"` thrust [N] and torques [N m]. *Disturbance:* a force [N].
+    - *Start:* the position uniform in +-1 m, the velocity in +-0.5 m/s, the rates in
+        +-0.5 rad/s, the attitude up to about 40 degrees from level.
+    - *Cost:* $|p|^2 + |q - q^*|^2 + 0.1 (|v|^2 + |\omega|^2) + 0.1 |u - u^*|^2$ per
+        step, with the attitude $q^*$ and the control $u^*$ of hovering.
+    - *End:* never terminates.
+    - *Features:* `encode` gives position, rotation matrix from body to world (row by
+        row), velocity and body rates, shape `(18,)`. The rotation matrix is the same
+        for $q$ and $-q$.
 
     **Arguments:**
 
-    - `max_thrust`: of a rotor, 6 by default; none is negative. A wrench is bounded by
-        the largest that the rotors give on each axis.
+    - `max_thrust`: the largest thrust of a rotor [N], 6 by default; the smallest is 0.
+        A wrench is bounded by the largest that the rotors give on each axis.
 
     Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016.
 
@@ -275,7 +293,7 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
 
 
 class ReacherCost(AbstractCost):
-    """`|tip - goal|^2 + torque_weight |torques|^2`."""
+    """The cost `|tip - goal|^2 + torque_weight |torques|^2`."""
 
     system: Reacher
     goal: Real = parameter()
@@ -296,7 +314,7 @@ class ReacherCost(AbstractCost):
 
 
 class _ReacherFeatures(eqx.Module):
-    """Cosines and sines of the angles, the rates, and the offset of the tip."""
+    """Cosines and sines of the angles, the rates, and `tip - goal`."""
 
     cost: ReacherCost
 
@@ -319,18 +337,23 @@ def reacher(
 ) -> Fields:
     """Bring the tip of an arm of two links to a goal.
 
-    State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,
-    elbow_torque), without bounds. Starts at rest at the angles (pi/4, pi/2). Cost
-    `|tip - goal|^2 + 0.1 |torques|^2` per step. `encode` gives cosines and sines of the
-    angles, the rates and `tip - goal`. Explicit Euler, as in the paper. Never
-    terminates.
+    - *State:* shoulder [rad], elbow [rad], shoulder_rate [rad/s], elbow_rate [rad/s].
+        *Control:* shoulder_torque [N m], elbow_torque [N m], without bounds.
+    - *Start:* at rest at the angles (pi/4, pi/2).
+    - *Cost:* `|tip - goal|^2 + 0.1 |torques|^2` per step.
+    - *End:* never terminates.
+    - *Features:* `encode` gives cosines and sines of the angles, the rates and
+        `tip - goal`.
 
-    The cost and `encode` hold the arm too: for arms of other lengths call this again,
-    under `jax.vmap` for many, where `delucax.replace` would change one of the three.
+    The default solver is explicit Euler, as in the paper.
+
+    The cost and `encode` also hold the arm. To change the arm, call this function
+    again, under `jax.vmap` for a batch: [`delucax.replace`][] would change only one of
+    the three.
 
     **Arguments:**
 
-    - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
+    - `goal`: position of the goal [m], shape `(2,)`; (0, 1.8) by default.
 
     Source: Gradu et al., 2021 (Deluca).
 

@@ -1,4 +1,4 @@
-"""The decorator that makes environments of systems, and uniform initial states."""
+"""The decorator that makes tasks from systems, and uniform initial states."""
 
 import functools
 import inspect
@@ -32,9 +32,13 @@ from ._environment import Environment
 
 
 class UniformState(eqx.Module):
-    """A first state drawn uniformly from a box.
+    """A first state, drawn uniformly from a box.
 
-    **Arguments:** `low`, `high`: vectors, the corners of the box.
+    Pass it as `initial_state` of a [`delucax.Environment`][].
+
+    **Arguments:**
+
+    - `low`, `high`: the corners of the box, each of shape `(n,)`.
 
     **Raises:** `ValueError` if the corners differ in size or `low` is above `high`.
 
@@ -46,7 +50,11 @@ class UniformState(eqx.Module):
         import jax.numpy as jnp
 
         start = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
-        start(jax.random.key(0))
+        start(jax.random.key(0)).shape
+        ```
+
+        ```text
+        (2,)
         ```
     """
 
@@ -66,7 +74,7 @@ class UniformState(eqx.Module):
 
 @host_unless_traced
 def box(spread: Any, centre: Any = 0.0) -> tuple[Array, Array]:
-    """The corners of the box within `spread` of `centre`, numbers or lists of them."""
+    """The corners of the box within `spread` of `centre`, both numbers or lists."""
     dtype = jnp.result_type(float)
     spread, centre = xp.asarray(spread, dtype), xp.asarray(centre, dtype)
     return centre - spread, centre + spread
@@ -75,17 +83,17 @@ def box(spread: Any, centre: Any = 0.0) -> tuple[Array, Array]:
 _CHANGES_OBSERVATIONS = frozenset(
     "disturbance dynamics encode initial_state sensor_noise terminated".split()
 )
-"""Arguments of `Environment` that can invalidate the task's bounds of observations."""
+"""Arguments of `Environment` that may invalidate the observation bounds of a task."""
 
 
 def once(ended: Callable[[Time, State], BoolScalar], cost: Any) -> Arrival:
-    """What the end of an episode costs."""
+    """A cost that is charged once, at the end of an episode."""
     return Arrival(ended, step_cost=0.0, arrival_cost=cost)
 
 
 Fields: TypeAlias = dict[str, Any]
 """Arguments of `Environment`, by name."""
-# An option of a task, which `task` checks.
+# The options of a task have these annotations; `task` checks them.
 Number: TypeAlias = Annotated[Array | float | int, check_number]
 Positive: TypeAlias = Annotated[Array | float | int, check_positive]
 Limit: TypeAlias = Annotated[Array | float | int, check_range]
@@ -102,36 +110,42 @@ def task(
     arguments: Callable[..., dict[str, Any]] = lambda: {},
     accepts: type[AbstractSystem] | None = None,
 ) -> Callable[[Callable[..., Fields]], Callable[..., Environment]]:
-    """A decorator that turns a function into a task, which returns an `Environment`.
+    """A decorator that turns a function into a task: a function that returns an
+    `Environment`.
 
-    The decorated function maps the system (with `gym`, the dynamics) and options to
-    arguments of `Environment`. The task takes a system or its arguments, the options,
-    which it checks as their annotations say, `dt`, `horizon`, `solver` and `substeps`,
-    the arguments of `gym`, and those of `Environment`, which take precedence over the
-    function's. It adds the documentation of these to the function's docstring.
+    The decorated function maps a system (with `gym`, the dynamics) and options to
+    arguments of `Environment`. The task takes
+
+    - a system, or the arguments of its class;
+    - the options, which it checks by their annotations;
+    - `dt`, `horizon`, `solver` and `substeps`;
+    - the arguments of `gym`;
+    - the arguments of `Environment`, which override those of the function.
+
+    The documentation of these arguments is added to the function's docstring.
 
     **Arguments:**
 
-    - `kind`: the class of the system, if none is given.
+    - `kind`: the class of the system.
     - `dt`, `horizon`, `solver`, `substeps`: defaults of the task.
-    - `gym`: the dynamics by Gym's integrator, a function of a system, `dt` and limits;
-        used unless a solver is given.
-    - `arguments`: derives arguments of the system from options of the task.
-    - `accepts`: the class of systems that are accepted; `kind` by default.
+    - `gym`: a function of a system, `dt` and limits to the dynamics by Gym's
+        integrator. It is used unless a solver is given.
+    - `arguments`: a function of more options to arguments of the system.
+    - `accepts`: the class of accepted systems; `kind` by default.
     """
     default_solver, accepts = solver, accepts or kind
     arithmetic = () if gym is None else (gym,)
     derived = inspect.signature(arguments).parameters
     default_name = "[`delucax.dynamics.RK4`][] by default"
     if gym is not None:
-        default_name = "in place of Gym's integrator, whose limits it does not have"
+        default_name = "which replaces Gym's integrator and its limits; none by default"
     elif solver is not None:
         default_name = f"`diffrax.{type(solver).__name__}()` by default"
 
     def decorate(build: Callable[..., Fields]) -> Callable[..., Environment]:
         where = build.__name__
-        # The first parameter is the system or the dynamics, the others are options,
-        # each with the check that its annotation holds (alone, or in a union).
+        # The first parameter is the system or the dynamics. The others are options, and
+        # the annotation of each holds its check (alone, or in a union).
         _, *options = inspect.signature(build).parameters.values()
         checks = [
             (option.name, check, option.default)
@@ -149,7 +163,7 @@ def task(
             substeps: int = substeps,
             **others: Any,
         ) -> Environment:
-            """- `system`: a [`delucax.systems.{kind}`][]; made of `others` by default.
+            """- `system`: a [`delucax.systems.{kind}`][], by default from `others`.
             - `dt`: the control interval{unit}, {dt} by default.
             - `horizon`: steps per episode, {horizon} by default.
             - `solver`: a Diffrax solver, {solver}.
@@ -159,12 +173,13 @@ def task(
 
             **Returns:** the [`delucax.Environment`][].
 
-            **Raises:** `ValueError` on invalid numbers, on arguments of a system beside
-            one, and on Gym's limits beside a solver or `substeps` without one.
+            **Raises:** `ValueError` on invalid numbers, or on arguments that exclude
+            each other: a system and arguments of its class, or a solver and limits of
+            Gym's integrator. `substeps` needs a solver in tasks with Gym's integrator.
             """
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             check_step(dt, where)
-            # Each takes its own of the other arguments; those of Environment are left.
+            # Each takes its own arguments; those of Environment are left.
             chosen = _taken(others, [option.name for option in options])
             special = _taken(others, derived)
             special = {n: v for n, v in special.items() if v is not None}
@@ -175,14 +190,14 @@ def task(
                 system = kind(**(constants | arguments(**special)))
             elif special or constants:
                 names = ", ".join([*special, *constants])
-                raise ValueError(f"{where}: give a system or its {names}, not both.")
+                raise ValueError(f"{where}: pass a system or its {names}, not both.")
             check_instance(system, accepts, "system", where)
 
             if gym is None or solver is not None:
                 for name in limits:
                     raise ValueError(
-                        f"{where}: {name} applies to Gym's integrator alone; give one "
-                        f"of {name} and solver, not both."
+                        f"{where}: {name} applies only to Gym's integrator. Pass "
+                        f"{name} or a solver, not both."
                     )
                 dynamics = Discretized(system, dt, solver or default_solver, substeps)
             elif substeps != 1:
@@ -195,13 +210,13 @@ def task(
                     check(value, name, where)
             fields: Fields = dict(dynamics=dynamics, horizon=horizon)
             fields |= build(system if gym is None else dynamics, **chosen)
-            # Bounds of observations are those of the task as it is.
+            # The bounds of the observations only hold for the unchanged task.
             if not _CHANGES_OBSERVATIONS.isdisjoint(others):
                 fields["observation_bounds"] = None
             return Environment(**(fields | others))
 
-        # Documentation and the check of keywords read the arguments off the signature:
-        # those of `make`, with the options after the system.
+        # Documentation and the check of keywords read this signature: the arguments of
+        # `make`, with the options after the system.
         signature = inspect.signature(make)
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
@@ -211,9 +226,9 @@ def task(
         names = dict(kind=kind.__name__, unit=unit, solver=default_name)
         shared = (inspect.getdoc(make) or "").format(**numbers, **names)
         functools.update_wrapper(make, build)
-        # Tools that document it would read the arguments of `build` through this.
+        # Documentation tools would read the signature of `build` through this.
         del vars(make)["__wrapped__"]
-        # They follow the options, and end where the source is named.
+        # The shared arguments follow the options, before the source.
         own, source, rest = (inspect.getdoc(build) or "").partition("\n\nSource:")
         make.__doc__ = f"{own}\n{shared}{source}{rest}"
         vars(make)["__signature__"] = signature.replace(parameters=parameters)
@@ -223,7 +238,7 @@ def task(
 
 
 def _plain(option: inspect.Parameter) -> inspect.Parameter:
-    """The option, annotated without its check."""
+    """The option, without the check in its annotation."""
     if hasattr(option.annotation, "__metadata__"):
         return option.replace(annotation=option.annotation.__origin__)
     return option
