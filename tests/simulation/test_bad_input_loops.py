@@ -75,7 +75,7 @@ def test_a_slip_of_a_controller(run, kind, match):
 
 
 def test_continuous_feedback_without_its_state():
-    with user_error(match=r"Slip: must return \(u, state\)"):
+    with user_error(match=r"Slip: __call__ must return \(u, state\)"):
         simulate(Slip("alone"), hold=None)
 
 

@@ -71,8 +71,8 @@ def test_incidents_need_not_be_kept(key):
     run = dlx.rollout(env, Cautious("failed_plan"), key=key, keep=(), x0=UPRIGHT + 2)
     assert run.incidents is run.controller_state is None
     assert run.result == dlx.RESULTS.plan_failed
-    assert "in `keep`" in dlx.RESULTS[run.result]
-    with user_error(match="incidents must be kept.*keep= with 'incidents'"):
+    assert "`keep` holds" in dlx.RESULTS[run.result]
+    with user_error(match="keep must hold 'incidents'"):
         _ = run.incident_counts
 
 

@@ -197,7 +197,7 @@ def test_one_recorded_step(key):
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=1)
     assert_close(run.disturbances, one.values)
     assert_close(run.observations[0], run.states[0] + one.values[0])
-    with user_error(match="FromArray: values has 1 steps, fewer than the horizon of 2"):
+    with user_error(match="FromArray: values must have at least 2 steps"):
         dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=2)
 
 
@@ -336,7 +336,7 @@ def test_wrong_kinds(key):
         dlx.rollout(env, lambda y: y, key=key)
     with pytest.raises(ValueError, match="size 3, got size 2.*features=env.encode"):
         dlx.rollout(env, dlx.controllers.Linear(jnp.ones((1, 3))), key=key)
-    with pytest.raises(ValueError, match=r"shape \(2,\).*takes shape \(1,\)"):
+    with pytest.raises(ValueError, match=r"must have shape \(1,\).*got shape \(2,\)"):
         dlx.rollout(env, dlx.controllers.Zero(2), key=key)
 
 

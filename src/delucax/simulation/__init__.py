@@ -1,4 +1,4 @@
-"""Closed loops, step by step and over a whole horizon."""
+"""Simulation of closed loops, step by step (`rollout`) or in one solve (`simulate`)."""
 
 from ._rollout import rollout as rollout
 from ._simulate import simulate as simulate

@@ -1,4 +1,4 @@
-"""How a trajectory is built from its plant, and how it is checked."""
+"""The fields of a trajectory that describe its plant, and the check of its result."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from ._trajectory import Trajectory
 
 
 def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
-    """The fields of a trajectory that its plant gives."""
+    """The fields of a trajectory that describe its plant."""
     names = ("disturbance_size", "state_names", "control_names")
     names += ("state_units", "control_units", "time_unit")
     fields = {name: getattr(plant, name) for name in names}
@@ -25,12 +25,13 @@ def checked(
 ) -> Trajectory:
     """Raise if the trajectory failed: now if its values are known, else at run time.
 
-    With `dynamics` that are hybrid the error names the event, if states and controls
-    are kept.
+    If `dynamics` are hybrid and states and controls are kept, the error names the
+    event.
     """
     failed = trajectory.failed
     if not is_concrete(failed):
-        # A random key in the controller's state is no argument of a run-time check.
+        # Only numbers, because a run-time check does not take random keys, which a
+        # controller's state may hold.
         numbers, rest = eqx.partition(trajectory, eqx.is_inexact_array)
         return eqx.combine(trajectory.result.error_if(numbers, failed), rest)
     if failed:

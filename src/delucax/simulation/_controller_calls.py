@@ -1,4 +1,4 @@
-"""The calls of a controller in a closed loop, with what it returns checked."""
+"""Calls of a controller in a closed loop, with checks of what it returns."""
 
 import types
 from typing import Any
@@ -16,34 +16,34 @@ from .._typing import RealScalar
 def call_controller(
     controller: AbstractController, t: RealScalar, y: Array, state: PyTree
 ) -> tuple[Array, PyTree]:
-    """`(u, state)`, what the controller returns."""
+    """The control and the new state that the controller returns."""
     returned: Any = controller(t, y, state)
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         got = type(returned).__name__
         if isinstance(returned, jax.Array):
             got = f"an array of shape {returned.shape}"
         raise ValueError(
-            f"{type(controller).__name__}: must return (u, state), the state unchanged "
-            f"if the controller has none, got {got}."
+            f"{type(controller).__name__}: __call__ must return (u, state), got {got}. "
+            "If the controller has no state, return the given state unchanged."
         )
     u, after = returned
     return u, after
 
 
 def check_control(u: Any, source: Any, size: int, taker: str) -> None:
-    """Raise unless `u`, returned by a controller or function, has the shape that
-    `taker` takes."""
+    """Raise unless the control `u`, returned by `source`, has the size that `taker`
+    needs."""
     if jnp.shape(u) != (size,):
         is_function = isinstance(source, types.FunctionType)
         name = source.__name__ if is_function else type(source).__name__
         raise ValueError(
-            f"{name}: returned a control of shape {jnp.shape(u)}, but the {taker} "
-            f"takes shape ({size},)."
+            f"{name}: the control must have shape ({size},), as the {taker} needs it, "
+            f"got shape {jnp.shape(u)}."
         )
 
 
 def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Result:
-    """The result by a controller's incident counters before a run and after it."""
+    """The result from a controller's incident counters, `before` a run and after it."""
     result = RESULTS.successful
     for name, kind in INCIDENTS.items():
         if name in counts:
@@ -53,9 +53,9 @@ def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Res
 
 
 def check_state(controller: AbstractController, first: PyTree, after: PyTree) -> None:
-    """Raise unless a controller's state has the structure of the `first`, of `init`.
+    """Raise unless a controller's state keeps the structure of the `first`, of `init`.
 
-    A loop carries arrays of fixed shapes and dtypes, and nothing else.
+    A compiled loop carries arrays of fixed shapes and dtypes, and nothing else.
     """
     (old, structure), (new, structure_after) = (
         jax.tree_util.tree_flatten_with_path(state) for state in (first, after)
@@ -68,8 +68,8 @@ def check_state(controller: AbstractController, first: PyTree, after: PyTree) ->
         raise ValueError(
             f"{type(controller).__name__}: state{jax.tree_util.keystr(path)} must keep "
             "the structure, shape and dtype that init gives it, "
-            f"{eqx.tree_pformat(before)}, got {eqx.tree_pformat(now)}. What changes "
-            "must be a JAX array from the start."
+            f"{eqx.tree_pformat(before)}, got {eqx.tree_pformat(now)}. Make everything "
+            "that changes a JAX array in init."
         )
 
 
@@ -78,6 +78,6 @@ def _same_kind(before: Any, now: Any) -> bool:
         return False
     if not eqx.is_array(before):
         return before is now or bool(eqx.tree_equal(before, now))
-    # The dtype of a weakly typed number follows from what it meets in the first step.
+    # A weakly typed number may get another dtype from the first operation on it.
     same_dtype = before.dtype == now.dtype or before.weak_type
     return before.shape == now.shape and same_dtype

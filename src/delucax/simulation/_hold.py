@@ -1,7 +1,7 @@
 """Zero-order hold inside one solve, exact at the switch.
 
-The solve counts its time `s` in intervals from the start, so that the switches are
-whole numbers, which rounding leaves alone, and constants of the compiled program.
+The solve counts its time `s` in intervals from the start. The switches are then whole
+numbers: they are not rounded, and they are constants of the compiled program.
 """
 
 from typing import Any, NamedTuple
@@ -19,10 +19,10 @@ from ._controller_calls import call_controller, check_control, check_state
 
 
 class Inputs(eqx.Module):
-    """The `args` of the solve: all that a gradient may be taken with respect to.
+    """The `args` of the solve: everything that you may differentiate with respect to.
 
-    `index`, an integer, tells which control is held, in place of the control itself, so
-    that the adjoint equations reach `controls`.
+    The integer `index` says which control is held. The control itself would not do,
+    because the adjoint equations must reach `controls`.
     """
 
     system: AbstractSystem
@@ -38,7 +38,7 @@ class Inputs(eqx.Module):
 
     def since_start(self, s: Array) -> Array:
         """The time that has passed after `s` intervals."""
-        # By a fraction of the length: the end is not rounded.
+        # As a fraction of the length, so that the end is not rounded.
         return self.length * (s / self.intervals)
 
     def control(self, t: Array, x: Array) -> Array:
@@ -71,7 +71,7 @@ class Inputs(eqx.Module):
         u, after = call_controller(self.source, t, self.system.observe(t, x), state)
         check_control(u, self.source, self.system.control_size, "system")
         u = u.astype(x.dtype)
-        # Without bounds the control is applied as it is, and there is no cost here.
+        # The system has no bounds, so the control is applied unchanged, and no cost.
         after = self.source.applied(u, jnp.zeros((), x.dtype), after)
         check_state(self.source, self.memory, after)
         return u, eqx.filter(after, eqx.is_array)
@@ -116,7 +116,7 @@ class InTime(diffrax.AbstractAdaptiveStepSizeController):
         start, end = t0 * h, t1 * h
         states = y0, y1_candidate, args, y_error, error_order, controller_state
         keep, low, high, *rest = self.controller.adapt_step_size(start, end, *states)
-        # A step begins at an end of the last one, which is not rounded.
+        # A step begins where the last one began or ended; these times are exact.
         begin = jnp.where(low == start, t0, jnp.where(low == end, t1, low / h))
         return keep, begin, high / h, *rest
 
@@ -125,8 +125,8 @@ _index = lambda args: args.index
 
 
 class SavedState(NamedTuple):
-    """A saved state with the held control of the step that it comes from, and the
-    controller's tallies then."""
+    """A saved state, with the held control and the controller's tallies in the step
+    that it comes from."""
 
     state: Array
     control: Array
@@ -134,22 +134,22 @@ class SavedState(NamedTuple):
 
 
 def save_fn(t: Any, x: Any, args: Any) -> SavedState:
-    """The function by which a solve with a held controller saves."""
+    """What a solve with a held controller saves at a time."""
     del t
-    # Diffrax saves the state itself at the ends of a solve, and an interpolation, which
-    # `_Ends` has completed, in between.
+    # In between, Diffrax saves an interpolation, which `_Ends` has made a SavedState.
+    # At the ends of a solve it saves the state itself.
     if isinstance(x, SavedState):
         return x
     return SavedState(x, args.u, _counts(args.memory, x))
 
 
 def _counts(memory: Any, like: Array) -> dict[str, Array]:
-    """A controller's tallies as floating-point numbers, as a solve saves them."""
+    """A controller's tallies as floating-point numbers, which a solve can save."""
     return {n: count.astype(like.dtype) for n, count in tallies(memory).items()}
 
 
 class _Ends(diffrax.AbstractLocalInterpolation):
-    """The interpolation of a step, with the solver's own state at its end."""
+    """The interpolation of a step, with the exact state of the solver at its end."""
 
     t0: Array
     t1: Array
@@ -160,23 +160,24 @@ class _Ends(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return self.inside.evaluate(t0, t1, left=left)
-        # An interpolation meets the end of its step to rounding alone.
+        # An interpolation only meets the end of its step up to rounding.
         x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
         return x if self.held is None else SavedState(x, *self.held)
 
 
 class Hold(AbstractForwardingSolver):
-    """A solver of which each step uses the control of the interval that it lies in.
+    """A solver that uses one control in all stages of a step: that of the interval in
+    which the step lies.
 
-    The interval cannot be inferred from the times of the stages: the last stage is at
-    the switch itself, and rounding puts others beyond it. So it is determined once per
-    step, from its two ends, and handed to the vector field as an index. A slope that a
-    solver reuses from its last step is dropped at a switch. The step-size controller
-    ensures that no step crosses one.
+    The times of the stages do not determine the interval: the last stage is at the
+    switch itself, and rounding may put others beyond it. The interval therefore follows
+    from the two ends of the step, and the vector field gets it as an index. Solvers
+    that reuse the slope of the last step drop it at a switch. The step-size controller
+    ensures that no step crosses a switch.
 
     With `sampled`, a controller is called at the start of each interval for the control
-    to hold; the control and the controller's memory are carried in the solver's state,
-    so that rejected steps restore them.
+    to hold. The control and the controller's memory are part of the solver's state, so
+    that a rejected step restores them.
     """
 
     solver: diffrax.AbstractSolver
@@ -185,7 +186,7 @@ class Hold(AbstractForwardingSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        # Diffrax calls it with the step's `dense_info` as keywords.
+        # Diffrax passes the step's `dense_info` as keywords.
         inside = self.solver.interpolation_cls
 
         def ends(*, t0, t1, inner, end, held):
@@ -197,7 +198,7 @@ class Hold(AbstractForwardingSolver):
         args = eqx.tree_at(_index, args, self._interval(t0, t1))
         inner = self.solver.init(terms, t0, t1, y0, args)
         held = (args.u, eqx.filter(args.memory, eqx.is_array)) if self.sampled else None
-        # No interval yet, so that the first step counts as a switch.
+        # -1 is no interval, so that the first step counts as a switch.
         return inner, jnp.full((), -1, jnp.int32), held
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -230,24 +231,41 @@ class Hold(AbstractForwardingSolver):
         return self.solver.func(terms, t0, y0, eqx.tree_at(_index, args, index))
 
     def _interval(self, t0, t1):
-        """The interval that the step from `t0` to `t1` lies in.
+        """The interval in which the step from `t0` to `t1` lies.
 
-        A step that begins one rounding before a switch belongs to what comes after it.
+        A step that begins just before a switch, by rounding, belongs to the interval
+        after it.
         """
         # A backward solve counts its time down in negative numbers.
         ends = jnp.abs(t0), jnp.abs(t1)
         low, high = jnp.minimum(*ends), jnp.maximum(*ends)
         index = interval_from(low, self.intervals)
-        # The interval in which the larger part of the step lies.
+        # The larger part of the step decides.
         later = (high - (index + 1) > (index + 1) - low).astype(index.dtype)
         return jnp.minimum(index + later, self.intervals - 1)
 
 
 def interval_from(s: Array, intervals: int) -> Array:
-    """k with `k <= s < k + 1`."""
+    """The interval k with `k <= s < k + 1`."""
     return jnp.clip(jnp.floor(s).astype(jnp.int32), 0, intervals - 1)
 
 
 def interval_before(s: Array, intervals: int) -> Array:
-    """k with `k < s <= k + 1`."""
+    """The interval k with `k < s <= k + 1`."""
     return jnp.clip(jnp.ceil(s).astype(jnp.int32) - 1, 0, intervals - 1)
+
+
+def in_intervals(
+    t0: Array, ts: Array, intervals: int, substeps: int, length: Array
+) -> Array:
+    """The save times `ts`, counted in intervals from `t0`.
+
+    A time within rounding of the end of a fixed step is moved to it, so that the
+    interval before it is unambiguous.
+    """
+    scale = intervals / length
+    saves = jnp.clip((ts - t0) * scale, 0, intervals)
+    near = jnp.round(saves * substeps) / substeps
+    # The rounding of a difference is that of its two times.
+    slack = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(ts))
+    return jnp.where(jnp.abs(saves - near) <= slack * scale, near, saves)

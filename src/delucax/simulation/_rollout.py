@@ -1,4 +1,4 @@
-"""The closed loop."""
+"""Simulation of a controller in an environment, step by step."""
 
 import math
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ KEEP = (
     "controller_state",
 )
 EXTRA = ("events",)
-"""What is kept only when it is asked for."""
+"""Entries of `keep` that are not there by default."""
 
 
 def rollout(
@@ -66,54 +66,60 @@ def rollout(
     truncate: int | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    """Simulate a controller in an environment, step by step.
+    r"""Simulate a controller in an environment, step by step.
 
-    At each step k, with `t_k = k dt`: the controller acts on the observation `y_k`; the
-    environment clips the control, charges `c(t_k, x_k, u_k)` and steps; then
-    `controller.applied(u, cost, state)` is called with the clipped control and its
-    cost. The final cost is charged once, at `x_T` or on entering a terminated state,
-    after which the state is held at no cost.
+    At each step $k$, at the time $t_k = k\, \Delta t$:
 
-    It is already compiled, as `diffrax.diffeqsolve` is: a second call with other
-    numbers, another key or start does not compile again. A batch is `jax.vmap` of it.
-    It is differentiable with respect to every array leaf of its arguments.
+    1. The controller acts on the observation $y_k$.
+    2. The environment clips the control, charges the stage cost $c(t_k, x_k, u_k)$ and
+        steps to $x_{k+1}$.
+    3. `controller.applied(u, cost, state)` gets the clipped control and its cost.
+
+    The final cost is charged once: at the last state, or at the first state that
+    terminates the episode. After termination, the state is held and costs nothing.
+
+    `rollout` is already compiled: call it directly. Another key, start or number does
+    not compile again. For a batch, use `jax.vmap`. You can differentiate with respect
+    to every array leaf of the arguments.
 
     **Arguments:**
 
-    - `environment`: the environment.
-    - `controller`: the controller.
-    - `key`: a random key, for the start, the disturbances, the sensor noise and the
-        controller.
-    - `horizon`: steps; the environment's own by default.
+    - `environment`: a [`delucax.Environment`][].
+    - `controller`: a [`delucax.AbstractController`][].
+    - `key`: a random key for the first state, the disturbances, the sensor noise and
+        the controller.
+    - `horizon`: the number of steps; that of the environment by default.
     - `x0`: the first state, shape `(n,)`; drawn by the environment by default.
-    - `w`: disturbances, shape `(horizon, k)`, in place of those that the environment
-        draws, which is the default. For a system with a diffusion they are its Brownian
-        increments: standard normal numbers times `sqrt(dt / substeps)`.
-    - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
-        `"disturbances"`, `"costs"`, `"terminated"`, `"incidents"` and
-        `"controller_state"`, all by default, and `"events"` of a hybrid plant, which
-        take room for `max_events` times two states a step.
-    - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
-        step, and the step is computed again; `"sqrt"`: the state at each of about the
-        square root of T steps, for long horizons; `None`: all intermediate values,
-        without recomputation.
-    - `gradient_decay`: the gradient passing back through the state is multiplied by it
-        at each step. 1, the true gradient, by default; 0.9 damps the exploding
-        gradients of a long unstable horizon. It is a factor per step: `exp(-dt / tau)`
-        forgets over the time `tau` at any `dt`.
-    - `truncate`: the gradient is cut before every `truncate`-th step, in the state and
-        in the memory of the controller: truncated back-propagation. Never by default.
-    - `throw`: raise if a step fails, the states become NaN or infinite, or a learner
-        refuses an update (default); if false, look at `trajectory.result`.
+    - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default. For
+        a system with a diffusion, pass Brownian increments: standard normal numbers
+        times `sqrt(dt / substeps)`.
+    - `keep`: the names of the arrays that the trajectory stores. By default all of
+        `"states"`, `"observations"`, `"controls"`, `"disturbances"`, `"costs"`,
+        `"terminated"`, `"incidents"` and `"controller_state"`. For a plant with events
+        you may add `"events"`; they need room for `2 * max_events` states per step.
+    - `checkpoint`: what the gradient stores. `"step"` (default) stores the state at
+        each step, and computes the step again. `"sqrt"` stores about the square root of
+        that many states; use it for long horizons. `None` stores all intermediate
+        values and computes nothing again.
+    - `gradient_decay`: a factor on the gradient that passes back through the state at
+        each step. 1 (default) gives the true gradient. 0.9 damps exploding gradients
+        over a long, unstable horizon. To forget over a time `tau` whatever `dt` is, use
+        `exp(-dt / tau)`.
+    - `truncate`: cut the gradient before every `truncate`-th step, in the state and in
+        the memory of the controller (truncated back-propagation). Never by default.
+    - `throw`: whether to raise if a step fails, the states become NaN or infinite, or a
+        learner refuses an update; true by default. With `throw=False`, look at
+        `trajectory.result`.
 
-    **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first failure of a
-    step, else `diverged`, else `update_refused` if a learner's update was not finite,
-    else `plan_failed`, `estimate_failed` or `filter_failed` if a plan, an estimate or a
-    filter of the controller did not succeed. `throw` raises on all but these three,
-    which the controller handles (`throw=` of [`delucax.controllers.MPC`][]).
+    **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first of these that
+    applies: the first failure of a step; `diverged`; `update_refused`, if the update of
+    a learner was not finite; `plan_failed`, `estimate_failed` or `filter_failed`, if a
+    plan, an estimate or a safety filter of the controller did not succeed; success.
+    `throw` does not raise on the last three failures, because the controller handles
+    them (see `throw=` of [`delucax.controllers.MPC`][]).
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
-    time as `throw` says.
+    **Raises:** `ValueError` on an argument of the wrong kind or shape. An error at run
+    time if the rollout fails and `throw` is true.
 
     !!! example
 
@@ -124,12 +130,16 @@ def rollout(
 
         env = dlx.make("pendulum")
         controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
-        trajectory = dlx.rollout(
-            env, controller, key=jax.random.key(0), x0=[0.1, 0.0]
-        )
-        keys = jax.random.split(jax.random.key(1), 100)
-        run = jax.jit(jax.vmap(lambda key: dlx.rollout(env, controller, key=key)))
-        batch = run(keys)
+        key = jax.random.key(0)
+        trajectory = dlx.rollout(env, controller, key=key, x0=[0.1, 0.0])
+
+        run = lambda key: dlx.rollout(env, controller, key=key)
+        batch = jax.jit(jax.vmap(run))(jax.random.split(key, 100))
+        trajectory.total_cost, batch.states.shape
+        ```
+
+        ```text
+        (Array(0.074, dtype=float32), (100, 201, 2))
         ```
     """
     where = "rollout"
@@ -148,12 +158,12 @@ def rollout(
     known = KEEP + EXTRA
     if not named or not set(keep) <= set(known):
         raise ValueError(
-            f"{where}: keep must be some of {', '.join(known)}; got {keep!r}."
+            f"{where}: keep must hold names among {', '.join(known)}, got {keep!r}."
         )
     if "events" in keep and not environment.dynamics.event_names:
         raise ValueError(
-            f"{where}: keep has 'events', but the plant has none; it must be a "
-            "delucax.systems.AbstractHybridSystem."
+            f"{where}: keep must not hold 'events' for a plant without events. Only a "
+            "delucax.systems.AbstractHybridSystem has some."
         )
     keep = tuple(name for name in known if name in keep)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
@@ -171,13 +181,12 @@ def rollout(
 @eqx.filter_jit
 def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate):
     dynamics = env.dynamics
-    # Always in four parts: what is drawn does not depend on what else is given.
+    # Always split in four, so that no draw depends on which other arguments are given.
     start_key, w_key, noise_key, controller_key = env.split_key(key)
     if x0 is None:
         x0 = env.reset(start_key)
     size, dtype, dt = x0.shape[0], x0.dtype, env.dt
-    # Drawn for the whole horizon at once, outside of the loop. A disturbance that is
-    # known to be zero is left out of it.
+    # A disturbance that is known to be zero is left out of the loop.
     if w is None and not isinstance(env.disturbance, Zero):
         w = env.disturbance.draw(w_key, dt, horizon, dtype)
     noise = None
@@ -188,14 +197,14 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
     keeps_y = not ("states" in keep and noise is None and dynamics.observes_state)
 
     first = initial_state(controller, controller_key)
-    # A loop carries arrays alone. The rest of a controller's state, such as the names
+    # The loop carries only arrays. The rest of a controller's state, such as the names
     # of its tallies, is put back at each step.
     first, static = eqx.partition(first, eqx.is_array)
 
     def body(carry, inputs):
         parts, memory, ended, total = carry
         k, w, noise = inputs
-        # By a product: a sum of steps would be rounded anew at each of them.
+        # A product, because a sum of steps would be rounded at each step.
         t = (k * dt).astype(dtype)
         x = join_state(parts)
         # The same value, with `decay` times its derivative.
@@ -212,8 +221,9 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         y = y if noise is None else (y + noise).astype(dtype)
         observed, (done, length) = y, ended or (None, None)
         if done is not None:
-            # After termination everything is evaluated at the first state: it is not
-            # used, but its derivatives must be finite, because 0 times infinity is NaN.
+            # After termination everything is evaluated at the first state. The values
+            # are not used, but their derivatives must be finite, because 0 times
+            # infinity is NaN.
             y0 = lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype)
             observed = jnp.where(done, y0, y)
             x = jnp.where(done, lax.stop_gradient(x0), x)
@@ -227,12 +237,12 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         step, *events = env._advance_by(advance, t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
-        # Broadcasting would otherwise give the loop's state another shape.
+        # Checked, because broadcasting may give the next state another shape.
         if x_next.shape != x.shape:
             raise ValueError(
                 f"rollout: a step must give a state of shape {x.shape} and a scalar "
                 f"cost, got shapes {x_next.shape} and {cost.shape}. If a constant has "
-                "a batch axis, run a batch of environments: jax.vmap."
+                "a batch axis, use jax.vmap over the environment."
             )
         after = controller.applied(applied, cost, after)
         check_state(controller, eqx.combine(first, static), after)
@@ -251,12 +261,13 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
             if records:
                 events = [events[0].unless(done)]
-            # A result that is statically a success stays one, and costs nothing.
+            # A result that is statically a success needs no choice.
             if result is not RESULTS.successful:
                 result = choose(done, RESULTS.successful, result)
             ended = (done | step.terminated, length + ~done)
         after_parts = split_state(x_next.astype(dtype))
-        # The state before the step, not after it: `stack_steps` says why.
+        # The state before the step, not after it, for the reason given in
+        # `stack_steps`.
         kept = {
             "states": parts,
             "observations": split_state(y) if keeps_y else None,
@@ -267,7 +278,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             "events": events[0] if records else None,
         }
         kept = {name: value for name, value in kept.items() if name in keep}
-        # Costs that are kept are summed afterwards, in a tree: less rounding.
+        # Costs that are kept are summed afterwards, in a tree, which rounds less.
         total = None if total is None else total + cost
         return (after_parts, after, ended, total), (kept, or_none(result))
 
@@ -291,7 +302,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         )
 
     has_ended, length = ended or (jnp.zeros((), bool), jnp.asarray(horizon))
-    # At the time of termination, where there was one: the state is held from then on.
+    # At the time of termination, if any, because the state is held from then on.
     end = (length * dt).astype(dtype)
     final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
     if final_cost.shape != ():
@@ -301,10 +312,10 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         )
     costs = kept.get("costs")
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
-    # NaN propagates, so the last state tells of all.
+    # NaN propagates, so it is enough to check the last state.
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
     result = choose(finite, RESULTS.successful, RESULTS.diverged)
-    # In order of cause: a failed step, divergence, then what the controller counted.
+    # In the order of causes: a failed step, divergence, incidents of the controller.
     result = first_failure(result, controller_result(tallies(last), tallies(first)))
     return Trajectory(
         states=over_time("states", size, parts),
@@ -331,16 +342,16 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
 
 
 def _scan(body, carry, inputs, horizon, checkpoint):
-    """`lax.scan` over the horizon, with what the gradient stores chosen."""
+    """`lax.scan` over the horizon; `checkpoint` chooses what the gradient stores."""
     body = by_components(body)
-    # Without it the gradient would store what each operation of a step needs, many
-    # times the state. To compute a step again costs less than to write that out.
+    # Without a checkpoint the gradient stores the intermediate values of each step,
+    # many times the state. To compute a step again takes less time than to store them.
     if checkpoint == "step":
         body = jax.checkpoint(body)
     if checkpoint != "sqrt":
         return lax.scan(body, carry, inputs)
-    # Blocks of sqrt(T) steps: one state is stored for each block, and those of a block
-    # while it is run again (Chen, Xu, Zhang and Guestrin, 2016).
+    # Blocks of sqrt(T) steps. One state is stored for each block, and the states of one
+    # block while it runs again (Chen, Xu, Zhang and Guestrin, 2016).
     block = max(1, math.isqrt(horizon))
     blocks, rest = divmod(horizon, block)
     inner = jax.checkpoint(body)

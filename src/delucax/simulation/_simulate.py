@@ -1,4 +1,4 @@
-"""Continuous-time simulation of a whole horizon by one solve."""
+"""Simulation of a whole horizon by one continuous-time solve."""
 
 from typing import Any, Literal
 
@@ -36,6 +36,7 @@ from ._controller_calls import check_control, controller_result
 from ._hold import (
     field,
     Hold,
+    in_intervals,
     Inputs,
     interval_before,
     InTime,
@@ -71,73 +72,78 @@ def simulate(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    r"""Integrate a controlled system over the whole horizon in one solve.
+    r"""Simulate a controlled system over the whole horizon in one solve.
 
-    `dx/dt = f(t, x, u, w)` from `t0` to `t1` by a single `diffrax.diffeqsolve`, so that
-    `adjoint` governs the gradient of the whole horizon. The horizon is cut into T equal
-    intervals. With `hold="zero"` the control of interval k is held over it, and the
-    solve is exact at the switch: no step crosses one, and every stage of a step uses
-    the control of the interval that the step lies in. A step that starts at a switch
-    uses nothing from before it.
+    It integrates $\dot x = f(t, x, u, w)$ from `t0` to `t1` by a single
+    `diffrax.diffeqsolve`, so that `adjoint` applies to the gradient of the whole
+    horizon. It is already compiled: call it directly.
 
-    The solve counts its time in intervals from `t0`, so that a late start costs no
-    precision: its switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in
-    single precision, however large `t0` is. A step-size controller receives the time
-    since `t0`. The field, with a control that is not held, is corrected for the
-    rounding of `t0 + s` as in [`delucax.Discretized`][]; held controllers receive the
-    rounded time.
+    The horizon is cut into $T$ equal intervals. With `hold="zero"`, the control of an
+    interval is held over it. The solve is exact at the switches: no step crosses a
+    switch, all stages of a step use the control of its interval, and a step that starts
+    at a switch uses no slope from before.
 
-    There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
-    `total_cost` are zero. It is already compiled, as [`delucax.rollout`][] is.
+    A late start costs no precision, because the solve counts its time in intervals from
+    `t0`. In single precision, switches are rounded to about `1e-7 (t1 - t0)`, however
+    large `t0` is. A step-size controller gets the time since `t0`. A field whose
+    control is not held is corrected for the rounding of `t0 + s`, as in
+    [`delucax.Discretized`][]. Held controllers get the rounded time.
+
+    There are no costs: `costs` of the trajectory is `None`, and `final_cost` and
+    `total_cost` are zero.
 
     **Arguments:**
 
     - `system`: the continuous-time system.
-    - `controller_or_controls`: an array of controls, shape `(T, m)`; a function of time
-        to a control; or a controller. A held controller samples the sensor at each
-        switch, and its `applied` is called at once, with its own control and a cost of
-        zero; controllers that learn from costs are therefore refused.
-    - `t0`, `t1`: start and end of the horizon, numbers with `t1 > t0`.
+    - `controller_or_controls`: one of
+
+        - an array of controls, shape `(T, m)`;
+        - a function of time to a control, shape `(m,)`;
+        - a controller. A held controller reads the sensor at each switch. Its `applied`
+            is called right after, with its own control and a cost of zero, so a
+            controller that learns from costs is refused.
+
+    - `t0`, `t1`: start and end of the horizon, in units of time, with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
-    - `hold`: `"zero"` (default), the control is held over each interval; `None`, it is
-        a function of time, or continuous feedback `u = pi(t, observe(t, x))` of a
-        controller without a state of its own.
-    - `dt`: the interval, a number of which `t1 - t0` is a whole multiple. By default
-        `(t1 - t0) / T` where `controller_or_controls` or `w` is an array; needed
+    - `hold`: `"zero"` (default) to hold the control over each interval. `None` for a
+        control that is a function of time, or for continuous feedback
+        $u = \pi(t, h(t, x))$ by a controller that has no state.
+    - `dt`: the interval, in units of time; `t1 - t0` must be a whole multiple. By
+        default `(t1 - t0) / T` if `controller_or_controls` or `w` is an array; required
         otherwise.
     - `w`: disturbances that enter the vector field, shape `(T, k)`, held over the
-        intervals whatever `hold` is; zero by default.
+        intervals with any `hold`; zero by default.
     - `solver`: a Diffrax solver; `diffrax.Tsit5()` by default.
     - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
         `None` (default) for fixed steps.
     - `substeps`: fixed steps per interval, 1 by default.
-    - `adjoint`: any of `diffrax.RecursiveCheckpointAdjoint()` (default),
-        `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()`, or
-        `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller`, takes no
-        held controller, whose memory cannot be run backwards, and with `ts` raises if a
-        gradient with respect to `t0`, `t1` or `ts` is asked for.
-    - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 per
-        interval if that is more.
-    - `ts`: the times to save at, increasing and between `t0` and `t1`; by default the
-        T + 1 ends of the intervals, where the saved states are the solver's own, not
+    - `adjoint`: `diffrax.RecursiveCheckpointAdjoint()` (default),
+        `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()` or
+        `diffrax.BacksolveAdjoint()`. The last needs a `stepsize_controller`, and does
+        not work with a held controller, because its memory cannot run backwards. With
+        `ts`, it raises if you ask for a gradient with respect to `t0`, `t1` or `ts`.
+    - `max_steps`: the largest number of adaptive steps over the horizon; by default
+        4096, or 64 per interval if that is more.
+    - `ts`: the times to save at, shape `(S + 1,)`, increasing and between `t0` and
+        `t1`. By default the `T + 1` ends of the intervals; the states there are not
         interpolated.
     - `key`: a random key for the controller's `init`; none by default.
     - `progress_meter`: such as `diffrax.TqdmProgressMeter()`; none by default.
-    - `throw`: raise if the solve fails or the state becomes NaN or infinite (default);
-        if false, look at `trajectory.result`.
+    - `throw`: whether to raise if the solve fails or the state becomes NaN or infinite,
+        true by default. With `throw=False`, look at `trajectory.result`.
 
-    **Returns:** a [`delucax.Trajectory`][] whose `times` are those saved at. Its
-    `controls` and `disturbances` are those acting just before each time but the first
-    (with `hold=None`, the control just after each time but the last), `observations`
-    are what the sensor reads at each time but the last.
+    **Returns:** a [`delucax.Trajectory`][] at the saved times. Its `controls` and
+    `disturbances` are those that act just before each time, from the second on. With
+    `hold=None`, `controls` are those just after each time, up to the last but one.
+    `observations` are the readings of the sensor at each time, up to the last but one.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
-    adjoint that does not fit, on a controller that learns from costs, on more than
-    2^22 steps in single precision, which is too coarse for their times, and on systems
-    that one solve cannot integrate: those that `project` their state after each
-    interval, that have a `diffusion`, or, with `w`, that name no disturbances;
-    discretise these with [`delucax.Discretized`][]. An error at run time as `throw`
-    says.
+    adjoint that does not fit, on a controller that learns from costs, and on more than
+    2^22 steps in single precision, which is too coarse for their times. Also on systems
+    that one solve cannot integrate: those that override `project`, have a `diffusion`
+    or events, or have no `disturbance_names` although `w` is given. Use
+    [`delucax.Discretized`][] for these. An error at run time if the solve fails and
+    `throw` is true.
 
     Source: Kidger, 2021 (Diffrax).
 
@@ -152,17 +158,23 @@ def simulate(
         pendulum = dlx.systems.Pendulum()
         x0 = jnp.array([0.1, 0.0])
 
+        # The gradient with respect to 20 controls, each held for 0.05 s.
         def cost(controls):
-            options = dict(solver=diffrax.Midpoint())
-            trajectory = dlx.simulate(pendulum, controls, 0.0, 1.0, x0, **options)
+            trajectory = dlx.simulate(pendulum, controls, 0.0, 1.0, x0)
             return jnp.sum(trajectory.final_state**2)
 
-        jax.jit(jax.grad(cost))(jnp.zeros((20, 1)))
+        slopes = jax.jit(jax.grad(cost))(jnp.zeros((20, 1)))
 
+        # Continuous feedback, with adaptive steps.
         feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
-        options = dict(hold=None, dt=0.05)
-        options["stepsize_controller"] = diffrax.PIDController(rtol=1e-5, atol=1e-6)
-        continuous = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, **options)
+        adaptive = diffrax.PIDController(rtol=1e-5, atol=1e-6)
+        options = dict(hold=None, dt=0.05, stepsize_controller=adaptive)
+        trajectory = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, **options)
+        trajectory.states.shape, trajectory.final_state
+        ```
+
+        ```text
+        ((21, 2), Array([ 0.003, -0.011], dtype=float32))
         ```
     """
     where = "simulate"
@@ -180,15 +192,15 @@ def simulate(
     if isinstance(source, AbstractController) and source.learns_from_cost:
         raise ValueError(
             f"{where}: {type(source).__name__} learns from the cost of each step, but "
-            "simulate has no cost; use `delucax.rollout`."
+            "simulate has no cost. Use `delucax.rollout`."
         )
     if not callable(source):
         name = "controller_or_controls"
         source = finite_rows(source, system.control_size, name, where)
         if hold is None:
             raise ValueError(
-                f"{where}: hold=None needs a controller or a function of time; an "
-                "array of controls is held, hold='zero'."
+                f"{where}: hold=None needs a controller or a function of time, got an "
+                "array of controls. Pass hold='zero' to hold them."
             )
     if w is not None:
         w = finite_rows(w, system.disturbance_size, "w", where)
@@ -198,9 +210,9 @@ def simulate(
     steps = count_intervals(t0, t1, dt, source, w, where)
     if steps is None and (hold == "zero" or not adaptive or ts is None):
         raise ValueError(
-            f"{where}: dt must be given, as there is no array of controls to take the "
-            "interval from (it may be left out with hold=None if both "
-            "stepsize_controller and ts are given)."
+            f"{where}: dt must be given, because no array of controls or disturbances "
+            "determines the interval. (With hold=None you may leave it out if you pass "
+            "both stepsize_controller and ts.)"
         )
     if ts is not None:
         ts = as_save_times(ts, t0, t1, where)
@@ -221,7 +233,7 @@ def simulate(
         progress_meter=progress_meter or diffrax.NoProgressMeter(),
     )
     start = jnp.asarray(t0, x0.dtype)
-    # The length of the horizon before its ends are rounded, if they are known.
+    # Computed before the ends are rounded to the precision of the state.
     length = jnp.asarray(t1 - t0, x0.dtype)
     given = system, source, w, x0, start, length, ts, key, hold, steps, substeps
     trajectory = _simulate(*given, options)
@@ -238,14 +250,14 @@ def _simulate(
         times: Any = t0 + length * (saves / intervals)
     else:
         times = ts.astype(dtype)
-        saves = _since(t0, times, intervals, substeps, length)
+        saves = in_intervals(t0, times, intervals, substeps, length)
     count = times.shape[0]
 
     sampled = hold == "zero" and isinstance(source, AbstractController)
     args = _inputs(system, source, w, x0, t0, length, intervals, key, hold)
     if sampled:
-        # The control at the start. The first step calls the controller again, in the
-        # same state, because it is the first of its interval.
+        # The control at the start. The first step calls the controller again, from the
+        # same state.
         u, _ = args.act(jnp.zeros((), dtype), x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
     start = TimeOffset(t0, lambda t: args.field(t, x0))
@@ -287,12 +299,13 @@ def _simulate(
         controls = before(args.controls)
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
-    # At fixed steps Diffrax estimates no error, and does not report a state that is not
+    # Checked here, because at fixed steps Diffrax does not report a state that is not
     # finite.
     finite = jnp.all(jnp.isfinite(final_state))
     result = solve_result(solution, options["stepsize_controller"], dtype)
     result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))
-    # At the last save time. The record at `t1` is made with the first state's counters.
+    # Counted up to the last save time. The record at `t1` has the counters of the first
+    # state.
     last = {name: totals[count - 1] for name, totals in counts.items()}
     incidents = {n: at[1:count] > at[: count - 1] for n, at in counts.items()}
     result = first_failure(result, controller_result(last, tallies(args.memory)))
@@ -316,7 +329,8 @@ def _simulate(
         recorded_terminated=None,
         incidents=incidents,
         steps=count - 1,
-        # With costs, although there are none, so that they don't count as left out.
+        # "costs" is listed although there are none, so that they do not count as left
+        # out by the user.
         keep=("states", "observations", "controls", "disturbances", "costs"),
         **plant_fields(system),
     )
@@ -330,17 +344,17 @@ def _inputs(system, source, w, x0, t0, length, intervals, key, hold) -> Inputs:
         memory = source.init(key=key)
         if hold is None and jax.tree.leaves(memory):
             raise ValueError(
-                f"simulate: hold=None needs a controller without a state of its own, "
-                f"got {type(source).__name__}, whose state is only defined from one "
-                "sample to the next; use hold='zero' with dt."
+                f"simulate: hold=None needs a controller without a state, got "
+                f"{type(source).__name__}, whose state changes from sample to sample. "
+                "Pass hold='zero' and dt."
             )
-        # The solve's loop keeps the types that it starts with: no weak ones.
+        # Weak types become strong, because the loop of the solve keeps its types.
         strong = lambda a: jnp.asarray(a, a.dtype) if eqx.is_array(a) else a
         memory = jax.tree.map(strong, memory)
     elif not callable(source):
         controls = source
     elif hold == "zero":
-        # A function of time that is held is an array: its values at the switches.
+        # Holding a function of time makes an array of its values at the switches.
         switches = t0 + length * (jnp.arange(intervals, dtype=x0.dtype) / intervals)
         controls = jax.vmap(source)(switches)
         check_control(controls[0], source, system.control_size, "system")
@@ -352,7 +366,7 @@ def _inputs(system, source, w, x0, t0, length, intervals, key, hold) -> Inputs:
 
 
 def _with_switches(options, held: bool, sampled: bool, length, intervals, substeps):
-    """The options of a solve whose steps end at the switches of what is held."""
+    """The options of a solve whose steps end at the switches."""
     dtype = length.dtype
 
     def fitted(options):
@@ -360,11 +374,10 @@ def _with_switches(options, held: bool, sampled: bool, length, intervals, subste
         if held and "solver" in options:
             options["solver"] = Hold(options["solver"], intervals, sampled)
         if (controller := options.get("stepsize_controller")) is not None:
-            # What a step costs depends on its length, what it approximates does not.
+            # No gradient, because the solution does not depend on the choice of steps.
             interval = lax.stop_gradient(length / intervals)
             controller = InTime(controller, interval)  # pyright: ignore
-            # No adaptive step crosses a switch: its error estimate would be of two
-            # fields.
+            # A step across a switch would estimate its error from two different fields.
             if held and intervals > 1:
                 switches = jnp.arange(1, intervals, dtype=dtype)
                 controller = diffrax.ClipStepSizeController(controller, switches)
@@ -375,7 +388,7 @@ def _with_switches(options, held: bool, sampled: bool, length, intervals, subste
     fixed = options["stepsize_controller"] is None
     if fixed and isinstance(solver, diffrax.AbstractImplicitSolver):
         solver = as_fixed_step_solver(solver)
-    # The backward solve has a solver of its own, which must hold the controls, too.
+    # The backward solve has its own solver, which must hold the controls too.
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         adjoint = diffrax.BacksolveAdjoint(**fitted(adjoint.kwargs))
     adjoint = throwing_adjoint(adjoint)
@@ -384,17 +397,3 @@ def _with_switches(options, held: bool, sampled: bool, length, intervals, subste
         ends = jnp.arange(intervals * substeps + 1, dtype=dtype) / substeps
         options["stepsize_controller"] = diffrax.StepTo(ends)
     return options
-
-
-def _since(t0, ts, intervals: int, substeps: int, length) -> Array:
-    """The save times `ts`, counted in intervals from `t0`.
-
-    They are snapped to the ends of fixed steps within rounding, so that the interval
-    before each is unambiguous.
-    """
-    scale = intervals / length
-    saves = jnp.clip((ts - t0) * scale, 0, intervals)
-    near = jnp.round(saves * substeps) / substeps
-    # Both times are rounded to their own size, and so is their difference.
-    slack = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(ts))
-    return jnp.where(jnp.abs(saves - near) <= slack * scale, near, saves)

@@ -23,16 +23,16 @@ def check_system(system: Any, w: Any, where: str) -> None:
     elif system.projects_state:
         reason = f"system {name} projects its state after each interval"
     elif system.noise == "brownian":
-        reason = f"system {name} has a diffusion, whose increments are of fixed steps"
+        reason = f"system {name} has a diffusion, whose increments need fixed steps"
     elif w is not None and not system.disturbance_names:
         reason = (
-            f"w cannot be given, as {name} names no disturbances: w would be added to "
-            "the state after each interval"
+            f"system {name} has no disturbance_names, so w would be added to the state "
+            "after each interval"
         )
     else:
         return
     raise ValueError(
-        f"{where}: {reason}, which one solve cannot do; use `delucax.open_loop` or "
+        f"{where}: {reason}, which one solve cannot do. Use `delucax.open_loop` or "
         "`delucax.rollout` with delucax.Discretized(system, dt)."
     )
 
@@ -40,7 +40,8 @@ def check_system(system: Any, w: Any, where: str) -> None:
 def count_intervals(
     t0: Any, t1: Any, dt: Any, source: Any, w: Array | None, where: str
 ) -> int | None:
-    """The number of intervals that the arguments agree on; `None` if none says."""
+    """The number of intervals on which the arguments agree; `None` if none determines
+    it."""
     counts = {}
     if not callable(source):
         counts["controller_or_controls"] = source.shape[0]
@@ -50,7 +51,7 @@ def count_intervals(
     if dt is not None and known:
         check_positive(dt, "dt", where)
         ratio = (t1 - t0) / dt
-        # Single precision rounds the quotient by a few parts in 1e7.
+        # The tolerance allows for the rounding of single precision.
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             raise ValueError(
                 f"{where}: t1 - t0 must be a whole multiple of dt, got t0 = {t0}, "
@@ -59,13 +60,15 @@ def count_intervals(
         counts["dt"] = round(ratio)
     elif dt is not None and not counts:
         raise ValueError(
-            f"{where}: dt, t0 and t1 must be known numbers, not traced ones, as "
-            "they say how many intervals there are; give an array of controls, or "
+            f"{where}: dt, t0 and t1 must be known numbers, not traced ones, because "
+            "they determine the number of intervals. Pass an array of controls, or "
             "use `delucax.rollout`."
         )
     if len(set(counts.values())) > 1:
-        said = ", ".join(f"{name} says {count}" for name, count in counts.items())
-        raise ValueError(f"{where}: the numbers of intervals differ: {said}.")
+        said = ", ".join(f"{count} by {name}" for name, count in counts.items())
+        raise ValueError(
+            f"{where}: the arguments must agree on the number of intervals, got {said}."
+        )
     return next(iter(counts.values()), None)
 
 
@@ -93,8 +96,8 @@ def check_adjoint(adjoint: Any, adaptive: bool, sampled: bool, where: str) -> No
     check_kind(adjoint, "adjoint", where)
     if isinstance(adjoint, diffrax.ImplicitAdjoint):
         raise ValueError(
-            f"{where}: adjoint ImplicitAdjoint is for solves that end in a steady "
-            "state; use diffrax.RecursiveCheckpointAdjoint()."
+            f"{where}: adjoint must not be ImplicitAdjoint, which is for solves that "
+            "end in a steady state. Use diffrax.RecursiveCheckpointAdjoint()."
         )
     if not isinstance(adjoint, diffrax.BacksolveAdjoint):
         return
@@ -105,8 +108,8 @@ def check_adjoint(adjoint: Any, adaptive: bool, sampled: bool, where: str) -> No
         )
     if sampled:
         raise ValueError(
-            f"{where}: adjoint BacksolveAdjoint does not fit a held controller: its "
-            "samples and memory cannot be run backwards. Use "
+            f"{where}: adjoint BacksolveAdjoint does not fit a held controller, whose "
+            "samples and memory cannot run backwards. Use "
             "diffrax.RecursiveCheckpointAdjoint(), hold=None, or an array of controls."
         )
     for name, value in adjoint.kwargs.items():

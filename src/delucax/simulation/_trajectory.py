@@ -21,44 +21,47 @@ if TYPE_CHECKING:
 
 
 class Trajectory(eqx.Module):
-    """The record of a closed loop: `T` steps from `T + 1` states.
+    """The record of a simulation: `T` steps and `T + 1` states.
 
-    Arrays that `keep=` leaves out are `None`. Under `jax.vmap` every array has a
-    leading batch axis.
+    [`delucax.rollout`][] and [`delucax.simulate`][] return it. Arrays that you left out
+    of `keep=` are `None`. Under `jax.vmap` every array has a leading batch axis.
 
     **Attributes:**
 
-    - `times`: shape `(T + 1,)`.
+    - `times`: shape `(T + 1,)`, in units of time.
     - `states`: shape `(T + 1, n)`.
-    - `observations`: those given to the controller, shape `(T, p)`.
-    - `controls`: what was applied, after the bounds, shape `(T, m)`.
+    - `observations`: those that the controller got, shape `(T, p)`.
+    - `controls`: those that were applied, after the bounds, shape `(T, m)`.
     - `disturbances`: shape `(T, k)`.
     - `costs`: stage costs, shape `(T,)`; 0 after termination.
     - `terminated`: whether the episode had terminated after step k, shape `(T,)`.
     - `final_state`: shape `(n,)`.
     - `final_cost`: a scalar, charged once.
-    - `total_cost`: the sum of the stage costs and the final cost.
-    - `length`: steps until termination, T if there was none.
+    - `total_cost`: the sum of the stage costs and the final cost, a scalar.
+    - `length`: the number of steps until termination, or T without termination.
     - `ended`: whether the episode terminated within the T steps.
     - `result`: the first failure, or success; one of `delucax.RESULTS`.
-    - `incidents`: from the name of something that went wrong in the controller to the
-        steps at which it did, booleans of shape `(T,)`. `"clipped_control"`: the
-        environment's bounds changed the control. `"failed_plan"`: a plan of
-        [`delucax.controllers.MPC`][] did not succeed. `"failed_estimate"`: nor did an
-        estimator. `"failed_filter"`: a [`delucax.controllers.SafetyFilter`][] found no
-        control that keeps its barriers. `"refused_update"`: what a learner would have
-        learned was not finite. Others are those that a controller counts with
-        [`delucax.controllers.Tally`][].
+    - `incidents`: a dictionary from each kind of incident in the controller to the
+        steps at which it happened, booleans of shape `(T,)`. The kinds are
+
+        - `"clipped_control"`: the bounds of the environment changed the control.
+        - `"failed_plan"`: a plan of [`delucax.controllers.MPC`][] did not succeed.
+        - `"failed_estimate"`: an estimator did not succeed.
+        - `"failed_filter"`: a [`delucax.controllers.SafetyFilter`][] found no control
+            that keeps its barriers.
+        - `"refused_update"`: the update of a learner was not finite, and was not made.
+        - others that a controller counts with [`delucax.controllers.Tally`][].
+
     - `controller_state`: the arrays of the controller's state at the end.
-    - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
-    - `keep`: the names of what was kept.
+    - `dt`: the control interval, in units of time.
+    - `steps`, `disturbance_size`: T and k, ints.
+    - `keep`: the names of the arrays that were kept.
     - `recorded_times`, `recorded_observations`, `recorded_disturbances`,
-        `recorded_terminated`, `recorded_events`: the arrays behind `times`,
-        `observations`, `disturbances`, `terminated` and `events` where they do not
-        follow from the rest.
+        `recorded_terminated`, `recorded_events`: the stored arrays behind `times`,
+        `observations`, `disturbances`, `terminated` and `events`, or `None` if they
+        follow from other fields. Read the latter instead.
     - `state_names`, `control_names`, `state_units`, `control_units`, `event_names`:
-        tuples of strings.
-    - `time_unit`: a string.
+        tuples of strings. `time_unit`: a string.
 
     !!! example
 
@@ -68,10 +71,13 @@ class Trajectory(eqx.Module):
 
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)
-        trajectory = dlx.rollout(
-            env, zero, key=jax.random.key(0), horizon=100, x0=[0.1, 0.0]
-        )
-        trajectory.total_cost, trajectory.states.shape, trajectory[:10].costs
+        options = dict(key=jax.random.key(0), horizon=100, x0=[0.1, 0.0])
+        trajectory = dlx.rollout(env, zero, **options)
+        trajectory.states.shape, trajectory[:10].total_cost
+        ```
+
+        ```text
+        ((101, 2), Array(0.655, dtype=float32))
         ```
     """
 
@@ -85,8 +91,8 @@ class Trajectory(eqx.Module):
     ended: Array
     result: Result
     dt: Array
-    # Arrays that follow from others are computed lazily: to write them out would cost a
-    # batch more than the simulation does.
+    # Arrays that follow from others are computed when they are read. To write them out
+    # would take a batch longer than the simulation.
     recorded_times: Array | None
     recorded_observations: Array | None
     recorded_disturbances: Array | None
@@ -106,28 +112,28 @@ class Trajectory(eqx.Module):
 
     @property
     def events(self) -> Events:
-        """The events of each step, [`delucax.dynamics.Events`][] with a leading axis of
-        T: `times` and `kinds` have the shape `(T, max_events)`, and the states `before`
-        and `after` them `(T, max_events, n)`.
+        """The events of each step: [`delucax.dynamics.Events`][] with a leading axis of
+        length T. `times` and `kinds` have shape `(T, max_events)`, `before` and `after`
+        have shape `(T, max_events, n)`.
 
         **Raises:** `ValueError` if they were not kept.
         """
         if self.recorded_events is None:
             raise ValueError(
-                "Trajectory: events must be kept to be read: give keep= with 'events', "
-                f"got {self.keep}."
+                f"Trajectory: keep must hold 'events' to read them, got {self.keep}. "
+                "Pass keep= to rollout."
             )
         return self.recorded_events
 
     def event_list(self) -> list[tuple[float, str]]:
-        """The events of one trajectory, each as its time and name, in their order.
+        """The events of one trajectory in order, each as `(time, name)`.
 
-        **Raises:** `ValueError` if they were not kept, or of a batch.
+        **Raises:** `ValueError` if they were not kept, or for a batch.
         """
         if self.batch_shape:
             raise ValueError(
-                "Trajectory: event_list is of one trajectory, got a batch: index it, "
-                "as in trajectory[0]."
+                "Trajectory: event_list needs one trajectory, got a batch. Index it, "
+                "as in trajectory[0].event_list()."
             )
         times, kinds = np.asarray(self.events.times), np.asarray(self.events.kinds)
         at = kinds >= 0
@@ -136,12 +142,12 @@ class Trajectory(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """The leading axes that `jax.vmap` put there; `()` for one trajectory."""
+        """The shape of the batch that `jax.vmap` made; `()` for one trajectory."""
         return self.total_cost.shape
 
     @property
     def times(self) -> Array:
-        """`t_k = k dt`, shape `(T + 1,)`."""
+        """The times `k dt`, shape `(T + 1,)`."""
         if self.recorded_times is not None:
             return self.recorded_times
         times = jnp.arange(self.steps + 1) * self.dt[..., None]
@@ -149,7 +155,7 @@ class Trajectory(eqx.Module):
 
     @property
     def observations(self) -> Array | None:
-        """The observations given to the controller, shape `(T, p)`."""
+        """The observations that the controller got, shape `(T, p)`."""
         if self.recorded_observations is None and "observations" in self.keep:
             return None if self.states is None else self.states[..., :-1, :]
         return self.recorded_observations
@@ -171,9 +177,8 @@ class Trajectory(eqx.Module):
 
     @property
     def failed(self) -> Array:
-        """Whether a step failed, the run diverged, or a learner refused an update:
-        `result` is not `successful`, `plan_failed`, `estimate_failed` or
-        `filter_failed`."""
+        """Whether `result` is a failure other than `plan_failed`, `estimate_failed` and
+        `filter_failed`, which the controller handles."""
         handled = (
             RESULTS.successful,
             RESULTS.plan_failed,
@@ -184,12 +189,12 @@ class Trajectory(eqx.Module):
 
     @property
     def incident_counts(self) -> dict[str, Array]:
-        """At how many steps each of `incidents` happened."""
+        """The number of steps at which each kind of incident happened."""
         return {name: jnp.sum(now, -1) for name, now in self._incidents().items()}
 
     @property
     def incident_times(self) -> dict[str, Array]:
-        """When each of `incidents` happened first; NaN where it never did."""
+        """The time of the first incident of each kind; NaN if there was none."""
 
         def first(now):
             k = jnp.argmax(now, -1, keepdims=True)
@@ -201,21 +206,23 @@ class Trajectory(eqx.Module):
     def _incidents(self) -> dict[str, Array]:
         if self.incidents is None:
             raise ValueError(
-                "Trajectory: incidents must be kept to be counted: give keep= with "
-                "'incidents', got it without."
+                f"Trajectory: keep must hold 'incidents' to count them, got "
+                f"{self.keep}. Pass keep= to rollout."
             )
         return self.incidents
 
     def __getitem__(self, index: Any) -> "Trajectory":
-        """Members of a batch, or a stretch of time of one trajectory.
+        """Members of a batch, or a part of one trajectory.
 
-        Of a batch, `trajectory[i]` and `trajectory[2:5]` pick members. Of one
-        trajectory, `trajectory[start:stop]` are the steps from `start` up to `stop`,
-        with the states at both ends; `total_cost` is then theirs, and includes the
-        final cost only if the last step is among them.
+        For a batch, `trajectory[i]` and `trajectory[2:5]` pick members. For one
+        trajectory, `trajectory[start:stop]` holds the steps from `start` up to `stop`,
+        with the states at both ends. Its `total_cost` is the cost of these steps, and
+        includes the final cost if the last step is among them.
 
-        **Raises:** `ValueError` if one trajectory is indexed by anything but a slice
-        of step 1; `IndexError` beyond the batch.
+        **Arguments:** `index`: an integer or a slice.
+
+        **Raises:** `ValueError` if the index of one trajectory is not a slice with a
+        step of 1; `IndexError` beyond the batch.
         """
         if self.batch_shape:
             size = self.batch_shape[0]
@@ -227,21 +234,21 @@ class Trajectory(eqx.Module):
             return jax.tree.map(lambda leaf: leaf[index], self)
         if not isinstance(index, slice) or index.step not in (None, 1):
             raise ValueError(
-                "Trajectory: one trajectory takes a slice such as trajectory[10:20]; "
-                f"got {index!r}."
+                "Trajectory: index must be a slice such as trajectory[10:20] for one "
+                f"trajectory, got {index!r}."
             )
-        # As of a list, an index beyond the end is clipped.
+        # An index beyond the end is clipped, like that of a list.
         start, stop, _ = index.indices(self.steps)
         stop = max(stop, start)
         if self.states is None or (self.costs is None and "costs" not in self.keep):
             raise ValueError(
-                "Trajectory: states and costs must be kept to slice in time; got "
-                "keep= without them."
+                "Trajectory: keep must hold 'states' and 'costs' to slice in time, got "
+                f"{self.keep}."
             )
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
-        # A failure by incidents is dropped if none of them is in the slice.
+        # A failure by incidents is dropped if none of these incidents is in the slice.
         result, is_end = self.result, stop == self.steps
         for name, kind in INCIDENTS.items():
             if incidents is not None and name in incidents:
@@ -270,11 +277,13 @@ class Trajectory(eqx.Module):
         )
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """A tidy table, one row a time: `time`, states, controls, `cost`.
+        """A table with one row per time: `time`, states, controls, disturbances and
+        `cost`.
 
-        A state or control whose name is taken gets `state` or `control` before it. A
-        batch has its index in the columns `batch` (`batch0`, `batch1`, ... if it has
-        several axes). The last row of each trajectory has no control or cost.
+        A batch has its index in the column `batch`, or in the columns `batch0`,
+        `batch1`, ... if it has several axes. If a name is already in use, `state`,
+        `control` or `disturbance` is put before it. The last row of each trajectory has
+        no control, disturbance or cost.
 
         **Returns:** a `pandas.DataFrame`.
 
@@ -299,7 +308,7 @@ class Trajectory(eqx.Module):
             width[-2] = (0, shape[-1] - array.shape[-2])
             array = np.pad(array, width, constant_values=np.nan)
             for i, name in enumerate(names):
-                # Names are the user's: two may be the same, or one of ours.
+                # A user's names may be the same, or be one of these columns.
                 name = f"{kind} {name}" if name in columns else name
                 name = f"{name} {i}" if name in columns else name
                 columns[name] = array[..., i]
@@ -315,15 +324,15 @@ class Trajectory(eqx.Module):
         return pd.DataFrame({k: np.ravel(v) for k, v in columns.items()})
 
     def statistics(self) -> dict[str, Array]:
-        """How the total cost is spread over a batch, and how its members ended.
+        """Statistics of the total cost over a batch, and of how its members ended.
 
-        `"5%"`, `"25%"`, `"50%"`, `"75%"` and `"95%"` are quantiles of the total cost
-        over the members whose cost is finite (NaN if there are none), `"mean"` is their
-        mean; `"finite"` is the fraction of these members, `"successful"` that of the
-        members that are not `failed`, and `"terminated"` that of the members whose
-        episode ended early. One trajectory is a batch of one. Works under `jax.jit`.
+        One trajectory counts as a batch of one. It works under `jax.jit`.
 
-        **Returns:** a dictionary from these names to scalars.
+        **Returns:** a dictionary to scalars. `"5%"`, `"25%"`, `"50%"`, `"75%"`, `"95%"`
+        and `"mean"` are quantiles and the mean of the total cost, over the members
+        whose cost is finite (NaN if there are none). `"finite"` is the fraction of
+        these members, `"successful"` the fraction that is not `failed`, `"terminated"`
+        the fraction whose episode terminated.
 
         !!! example
 
@@ -341,7 +350,7 @@ class Trajectory(eqx.Module):
         finite = jnp.isfinite(total)
         total = jnp.where(finite, total, jnp.nan)
         levels = (5, 25, 50, 75, 95)
-        # Members that diverged are counted apart: a mean with infinity tells nothing.
+        # Members that diverged are left out, because they would make the mean infinite.
         quantiles = jnp.nanquantile(total, jnp.array(levels, total.dtype) / 100)
         return {f"{q}%": value for q, value in zip(levels, quantiles, strict=True)} | {
             "mean": jnp.nanmean(total),
@@ -351,12 +360,12 @@ class Trajectory(eqx.Module):
         }
 
     def summary(self) -> "pandas.DataFrame":
-        """One row for a trajectory, one a member for a batch: cost, length, outcome.
+        """A table of costs, lengths and outcomes, with one row per trajectory.
 
-        Columns: `total_cost`, `final_cost`, `mean_cost` (per step), `length`,
-        `terminated`, `result`; and for each kind of incident that happened, such as
-        `failed_plan`, the number of steps `failed_plan_count` and the time of the
-        first, `failed_plan_time`.
+        The columns are `total_cost`, `final_cost`, `mean_cost` (per step), `length`,
+        `terminated` and `result`. Each kind of incident that happened, such as
+        `failed_plan`, adds two columns: `failed_plan_count`, the number of its steps,
+        and `failed_plan_time`, the time of the first.
 
         **Returns:** a `pandas.DataFrame`.
 
@@ -366,7 +375,7 @@ class Trajectory(eqx.Module):
 
         given = self.total_cost, self.length, self.final_cost
         total, length, final = map(np.ravel, given)
-        # A result that is statically a success has no batch axis, but broadcasts.
+        # A result that is statically a success has no batch axis.
         codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
         result_of = lambda c: jax.tree.map(lambda _: np.asarray(c), RESULTS.successful)
         words = [RESULTS[result_of(code)] or "successful" for code in codes]
