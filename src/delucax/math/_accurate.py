@@ -1,4 +1,4 @@
-"""Products of matrices in more digits than their precision has."""
+"""Matrix products with more digits than the precision of their factors."""
 
 import itertools
 import math
@@ -13,12 +13,12 @@ from ._norms import power_of_two
 
 
 _SMALL = 2**15
-"""Up to so many scalar products one loop over the sums, which XLA compiles in half the
-time, is as fast as several matrix products."""
+"""Up to this number of scalar products, one loop over the sums is as fast as several
+matrix products, and XLA compiles it in half the time."""
 _PARTS = 8
 _LONG = 64
 _LONGEST = 512
-"""Up to so many terms one slice of the factors is enough in double precision."""
+"""Up to this number of terms, one slice of the factors suffices in double precision."""
 
 
 @full_precision
@@ -27,24 +27,24 @@ def product(
 ) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
     """The product of two matrices plus the `added` ones, and entrywise error bounds.
 
-    It is accurate even under cancellation. The bounds count all rounding, but no
+    It is accurate even under cancellation. The bounds include all rounding, but not
     underflow.
     """
-    # Static sizes decide: one of the two is compiled. NumPy is slow at loops.
+    # Static sizes decide, so only one of the two is compiled. NumPy is slow at loops.
     if on_host() or left.size * right.shape[1] > _SMALL:
         return _by_slices(left, right, *added)
     return _term_by_term(left, right, *added)
 
 
 def _term_by_term(left, right, *added):
-    """By exact parts of each product, and the rounding error of each sum.
+    """The product by the exact parts of each term and the rounding error of each sum.
 
     Source: Ogita, Rump and Oishi, 2005.
     """
     eps, k = xp.finfo(left.dtype).eps, left.shape[1]
     column, row = left[:, :, None], right[None]
     (high, low), (high_row, low_row) = _halves(column), _halves(row)
-    # Products without rounding: no fused operation changes these sums.
+    # These products have no rounding, so fused operations do not change the sums.
     middle, off = _sum(high * low_row, low * high_row)
     term, error = _sum(high * high_row, middle)
     off = off + error + low * low_row
@@ -53,7 +53,7 @@ def _term_by_term(left, right, *added):
         total, error = _sum(one[0], other[0])
         return total, one[1] + other[1] + error, one[2] + other[2]
 
-    # A reduction is one loop, even of a batch, and nothing in it is stored.
+    # A reduction is one loop, also for a batch, and stores nothing.
     terms, zero = (term, off, xp.abs(term)), xp.zeros((), left.dtype)
     total, off, size = lax.reduce(terms, (zero, zero, zero), add, (1,))
     for part in added:
@@ -64,27 +64,28 @@ def _term_by_term(left, right, *added):
 
 
 def _by_slices(left, right, *added):
-    """By slices of the factors of so few bits that their products are exact, in any
-    order of summation and with fused operations. The remainders of the factors are
-    small, and so is the rounding of their products, which are added last.
+    """The product by slices of the factors. Slices have so few bits that their products
+    are exact, in any order of summation and with fused operations. The remainders of
+    the factors are small, and so is the rounding of their products, which are added
+    last.
 
     Source: Ozaki, Ogita, Oishi and Rump, 2012.
     """
     (n, k), m, dtype = left.shape, right.shape[1], left.dtype
     eps, digits = xp.finfo(dtype).eps, xp.finfo(dtype).nmant + 1
-    # A long sum leaves few bits to a slice.
+    # A long sum leaves few bits to a slice: the sum of k products of two slices must
+    # fit into the digits.
     count = 1 if digits > 50 and k <= _LONGEST else 2
     bits = int((digits - math.log2(count * k)) / 2)
-    # k products of two slices of so many bits sum up without rounding.
     both = xp.concatenate([left, right.T])
-    # Scaled so that the k-th column and the k-th row have like size.
+    # Scaled, so that each column and the row that it meets have about the same size.
     across, down = (xp.max(xp.abs(M), axis=0) for M in (both[:n], both[n:]))
     unit = power_of_two(xp.sqrt(down) / xp.sqrt(xp.where(across > 0, across, 1)))
     unit = xp.where(unit > 0, unit, 1)
     both = both * xp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
     power = power_of_two(xp.max(xp.abs(both), axis=1, keepdims=True))
     power = lax.max(power, xp.finfo(dtype).tiny)
-    # Entries rounded to ever smaller steps, the slices between, and the remainders.
+    # Entries are rounded to smaller and smaller steps. Slices are the differences.
     step = 2.0 ** (bits * np.arange(1, count + 1)[:, None, None] - 2)
     step = step.astype(dtype)
     whole = power * (xp.round(both / power * step) / step)
@@ -111,8 +112,8 @@ def _by_slices(left, right, *added):
 def product_in_parts(
     left: Float[Array, "n k"], right: Float[Array, "k m"]
 ) -> Float[Array, "n m"]:
-    """The product of two matrices, whose error is at most `units_of_sum(k)` units of
-    rounding of the product of their absolute values: a long sum is taken in parts.
+    """The product of two matrices, with long sums taken in parts. Its error is at most
+    `units_of_sum(k)` units of rounding of the product of the absolute values.
 
     Source: Higham, 2002, sections 3.1 and 4.2; Jeannerod and Rump, 2013.
     """
@@ -132,8 +133,8 @@ def product_in_parts(
 
 
 def units_of_sum(k: int) -> int:
-    """The most units of rounding by which `product_in_parts` is off, in any order of
-    the sums of `k` products."""
+    """The bound of the error of `product_in_parts`, in units of rounding, for sums of
+    `k` products in any order."""
     return k if k < _LONG else -(-k // _PARTS) + _PARTS
 
 

@@ -9,7 +9,7 @@ from ._linear_solve import solve
 
 _ORDER = 13
 _NEAR = 5.37
-"""The norm up to which the Padé approximant is exact to rounding, in float64 too."""
+"""Up to this norm the Padé approximant is exact to rounding, also in float64."""
 _MAX_SQUARINGS = 32
 
 
@@ -33,14 +33,14 @@ def exponential(A: Square) -> Square:
         high = sum(a * power for a, power in zip(c[4:], powers[1:], strict=True))
         return low + powers[-1] @ high
 
-    # The approximant is p(A) / p(-A), and of p the even and the odd part are known.
+    # The approximant p(A) / p(-A), from the even part V and the odd part U of p.
     V, U = even(c[::2]), A @ even(c[1::2])
     start = solve(V - U, V + U)
 
-    # Of fixed length, which reverse mode needs.
+    # A loop of fixed length, which reverse mode needs.
     def double(k, E):
         more = k < squarings
-        # Zero where it is not used: what overflows there must not reach a derivative.
+        # Unused powers are set to zero, because an overflow would reach the derivative.
         safe = xp.where(more, E, 0)
         return xp.where(more, safe @ safe, E)
 

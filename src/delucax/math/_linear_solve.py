@@ -1,4 +1,4 @@
-"""Linear solves, with an elimination of its own for small matrices."""
+"""Linear solves, with an elimination for small matrices."""
 
 import functools
 from collections.abc import Callable
@@ -17,15 +17,16 @@ from .._typing import Array, BoolScalar, Square
 SMALL = 8
 """Matrices up to this size are eliminated here, larger ones by LAPACK.
 
-LAPACK is called for each matrix of a batch, and slower for one of this size too.
+LAPACK is called once for each matrix of a batch. For small matrices it is slower even
+without a batch.
 """
 
 
 def full_precision(function: Callable) -> Callable:
-    """`function` with products in the precision of their arguments.
+    """`function`, with matrix products in the full precision of their arguments.
 
-    Accelerators round the arguments of a float32 product to fewer bits by default, and
-    repeated squaring amplifies that.
+    By default, accelerators round the arguments of a float32 product to fewer bits.
+    Repeated squaring would amplify that.
     """
 
     @functools.wraps(function)
@@ -39,7 +40,7 @@ def full_precision(function: Callable) -> Callable:
 
 
 def solve(matrix: Square, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """`matrix^-1 right`; not finite where `matrix` is singular."""
+    """`matrix^-1 right`; not finite if `matrix` is singular."""
     return factorised(matrix)(right)
 
 
@@ -48,10 +49,9 @@ def factorised(
     solver: lx.AbstractLinearSolver | None = None,
     tags: Any = (),
 ) -> Callable[[Inexact[Array, "m k"]], Inexact[Array, "n k"]]:
-    """`right -> matrix^-1 right`, for more than one right side in turn.
+    """The function `right -> matrix^-1 right`, for several right sides in turn.
 
-    A `solver` that is given may need `tags` of the matrix. NumPy solves a stack of
-    equations, too.
+    A given `solver` may need `tags` of the matrix. On NumPy, `matrix` may be a stack.
     """
     if on_host():
         return functools.partial(_by_lapack, matrix, isinstance(solver, lx.QR))
@@ -60,7 +60,8 @@ def factorised(
             return lambda right: right / matrix
         solver = _Elimination() if len(matrix) <= SMALL else lx.LU()
     operator = lx.MatrixLinearOperator(matrix, tags)
-    # The state is computed once. Lineax differentiates the solve, not the elimination.
+    # The factorisation is computed once and not differentiated: Lineax differentiates
+    # the solve.
     constant = lx.MatrixLinearOperator(lax.stop_gradient(matrix), tags)
     state = solver.init(constant, {})
 
@@ -71,7 +72,7 @@ def factorised(
 
 
 def _by_lapack(matrix: Any, least_squares: bool, right: Any) -> Any:
-    """The solution on the host, NaN where there is none."""
+    """The solution on the host, NaN if there is none."""
     if least_squares:
         basis, matrix = np.linalg.qr(matrix)
         right = basis.T @ right
@@ -80,14 +81,14 @@ def _by_lapack(matrix: Any, least_squares: bool, right: Any) -> Any:
     except np.linalg.LinAlgError:
         if matrix.ndim == 2:
             return np.full_like(right, np.nan)
-        # One of a stack is singular.
+        # One matrix of the stack is singular.
         rights = np.broadcast_to(right, (len(matrix), *right.shape[-2:]))
         pairs = zip(matrix, rights, strict=True)
         return np.stack([_by_lapack(M, False, b) for M, b in pairs])
 
 
 def cholesky(matrix: Any) -> Any:
-    """The lower factor; NaN where `matrix` is not definite."""
+    """The lower Cholesky factor; NaN if `matrix` is not definite."""
     try:
         return xp.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
@@ -97,9 +98,9 @@ def cholesky(matrix: Any) -> Any:
 class _Elimination(lx.AbstractLinearSolver):
     """Gauss-Jordan elimination with partial pivoting, for a matrix and a vector.
 
-    Rows stay in place, and one loop takes what is above and below the diagonal. The
-    error of the solution has the same bound as that of substitution with triangular
-    factors (Higham, 2002, section 14.4).
+    Rows stay in place, and one loop eliminates above and below the diagonal. The error
+    of the solution has the same bound as that of substitution with triangular factors
+    (Higham, 2002, section 14.4).
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
@@ -111,11 +112,11 @@ class _Elimination(lx.AbstractLinearSolver):
         n = len(vector)
         rows = xp.arange(n)
 
-        # Of a batch of vectors with one matrix, the matrix is eliminated once.
+        # For a batch of vectors with one matrix, the matrix is eliminated once.
         def step(k, carry):
             matrix, x, unused, order = carry
             column = _entry(matrix, k, axis=1)
-            # The pivot is the largest entry in a row that has had none.
+            # The pivot is the largest entry among the rows that had no pivot yet.
             pivot = xp.argmax(xp.where(unused, xp.abs(column), -1))
             here = rows == pivot
             value = _entry(column, pivot)
@@ -142,7 +143,7 @@ class _Elimination(lx.AbstractLinearSolver):
 
 
 def _entry(array, k, axis=0):
-    """Without a test of whether `k` is negative."""
+    """Entry or row `k`, without a test of whether `k` is negative."""
     return lax.dynamic_index_in_dim(
         array, k, axis, keepdims=False, allow_negative_indices=False
     )
@@ -156,8 +157,8 @@ def is_definite(matrix: Square) -> BoolScalar:
     if n == 1:
         return matrix[0, 0] > 0
 
-    # Elimination without exchanges, whose pivots are the squares of Cholesky's
-    # diagonal. What is left moves to the upper left corner.
+    # Elimination without exchanges. Its pivots are the squares of the diagonal of the
+    # Cholesky factor. The rest moves to the upper left corner.
     def step(rest, _):
         pivot = rest[0, 0]
         rest = rest - rest[:, :1] * (rest[0] / pivot)
@@ -168,12 +169,12 @@ def is_definite(matrix: Square) -> BoolScalar:
 
 
 def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
-    """The symmetric part."""
+    """The symmetric part of `X`."""
     return (X + X.mT) / 2
 
 
 def no_tangent(tree: Any) -> Any:
-    """The zero tangent of a tree, integers and flags included."""
+    """The zero tangent of a tree, also of its integers and booleans."""
 
     def zero(x):
         if xp.issubdtype(x.dtype, xp.inexact):
@@ -186,12 +187,12 @@ def no_tangent(tree: Any) -> Any:
 def lu_solve(
     matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
-    """`solve` by LAPACK at every size, of complex matrices too."""
+    """`solve` by LAPACK at every size, also for complex matrices."""
     return factorised(matrix, lx.LU())(right)
 
 
 def eigenvalues(matrix: Square) -> Complex[Array, " n"]:
-    """Of a matrix that is not finite NaN."""
+    """The eigenvalues, NaN if `matrix` is not finite."""
     if not on_host():
         return xp.linalg.eigvals(matrix)
     values: Any
@@ -199,5 +200,5 @@ def eigenvalues(matrix: Square) -> Complex[Array, " n"]:
         values = np.linalg.eigvals(matrix)
     except np.linalg.LinAlgError:
         values = np.full(len(matrix), np.nan)
-    # NumPy returns real numbers if all are.
+    # NumPy returns real numbers if all eigenvalues are real.
     return values.astype(np.result_type(matrix, np.complex64))

@@ -1,4 +1,4 @@
-"""Lyapunov, Stein and Sylvester equations of stable matrices, and Gramians over a
+"""Lyapunov, Stein and Sylvester equations with stable matrices, and Gramians over a
 finite time, by doubling."""
 
 from jaxtyping import Float
@@ -13,17 +13,16 @@ from ._norms import largest, relative_size
 _REFINEMENTS = 3
 _SIGN_STEPS = 60
 MAX_DOUBLINGS = 60
-"""2**60 steps: a spectral radius closer to 1 is not resolved in float64."""
+"""Enough for 2**60 steps. float64 does not resolve a spectral radius closer to 1."""
 
 
 def lyapunov(
     discrete: bool, A: Square, Q: Square, refinements: int = _REFINEMENTS
 ) -> Square:
     """The solution of `A'X + XA + Q = 0`, or in discrete time of `X = A'XA + Q`, for a
-    stable `A`; in continuous time with at most so many refinements.
+    stable `A`. `refinements` bounds the refinements in continuous time.
 
-    It is differentiated as the linear solve that it is, to any order and in either
-    mode.
+    It is differentiated as a linear solve, to any order and in either mode.
     """
 
     def solved(A):
@@ -31,7 +30,7 @@ def lyapunov(
             return lambda _, right: smith(A, None, right)[0]
         return lambda _, right: stable_sylvester(A, None, right, refinements)[0]
 
-    # The transposed equation is that of A'. The doubling is never differentiated.
+    # The transposed equation is that with A'. The doubling is never differentiated.
     return lax.custom_linear_solve(
         lambda X: X - A.T @ X @ A if discrete else A.T @ X + X @ A,
         Q if discrete else -Q,
@@ -43,9 +42,10 @@ def lyapunov(
 def smith(
     A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
-    """`X = A X B + C` for stable `A` and `B` (default `A'`), and the doublings taken.
+    """The solution of `X = A X B + C` for stable `A` and `B` (`A'` by default), and the
+    number of doublings.
 
-    `X_2k = X_k + A^k X_k B^k`, the sum of the first 2k terms of the series.
+    `X_2k = X_k + A^k X_k B^k` is the sum of the first 2k terms of the series.
 
     Source: Smith, 1968.
     """
@@ -61,11 +61,11 @@ def smith(
         left, right = powers if len(powers) == 2 else (powers[0], powers[0].T)
         change = matmul(matmul(left, X), right)
         X = X + change
-        # A NaN compares false, so that a lane that diverges stops.
+        # A NaN compares false, so that a diverging member of a batch stops.
         relative = relative_size(change, X)
         return X, tuple(matmul(power, power) for power in powers), relative, k + 1
 
-    # Nothing is to be done where C is zero, as at the start of a refinement.
+    # With a zero C, as at the start of a refinement, there is nothing to do.
     unknown = xp.where(largest(C) != 0, xp.asarray(xp.inf, C.dtype), 0)
     start = (C, powers, unknown, xp.asarray(0))
     X, *_, iterations = while_loop(more, body, start)
@@ -78,10 +78,11 @@ def stable_sylvester(
     C: Float[Array, "n m"],
     refinements: int = _REFINEMENTS,
 ) -> tuple[Float[Array, "n m"], Array]:
-    """`A X + X B = C` for stable `A` and `B` (default `A'`), and the steps taken.
+    """The solution of `A X + X B = C` for stable `A` and `B` (`A'` by default), and the
+    number of steps.
 
-    By the sign iteration of `A`, of `B`, and of `C` beside them. Iterative refinement
-    recovers what it loses of a wide spectrum.
+    By the sign iteration. Iterative refinement recovers the digits that it loses for a
+    wide spectrum.
     """
     eps = xp.finfo(C.dtype).eps
     other = A.T if B is None else B
@@ -97,7 +98,7 @@ def stable_sylvester(
         left, right = matmul(A, candidate), matmul(candidate, other)
         left_over = C - left - right
         relative = relative_size(left_over, left, right, C)
-        # The first round solves, those after it refine.
+        # The first round solves, the others refine.
         better = (relative < residual) | (k == 0)
         X = xp.where(better, candidate, X)
         residual = xp.where(better, relative, residual)
@@ -111,10 +112,10 @@ def stable_sylvester(
 
 
 def _by_sign(A, B, C):
-    """`X` of `A X + X B = C`, and the steps taken.
+    """The solution of `A X + X B = C`, and the number of steps.
 
-    The sign iteration `A <- (A + A^-1) / 2` takes `A` and `B` to `-I`, and
-    `C <- (C + A^-1 C B^-1) / 2` to `-2 X`.
+    The sign iteration `A <- (A + A^-1) / 2` takes `A` and `B` to `-I`, while
+    `C <- (C + A^-1 C B^-1) / 2` goes to `-2 X`.
 
     Source: Roberts, 1971; Higham, 2008, section 5 (the scaling).
     """
@@ -132,7 +133,7 @@ def _by_sign(A, B, C):
         right = inverses[0].T if len(pair) == 1 else inverses[1]
         sizes = [largest(M) for M in pair], [largest(M) for M in inverses]
         ratio = (sum(sizes[1]) / sum(sizes[0])) ** 0.5
-        # Near the limit, where the scale is one up to a half, it is left out.
+        # Near the limit the scale is close to 1 and is left out.
         scale = xp.where(xp.abs(ratio - 1) < 0.5, 1, ratio)
         after = [
             (scale * M + inverse / scale) / 2
@@ -140,7 +141,7 @@ def _by_sign(A, B, C):
         ]
         product = matmul(matmul(inverses[0], C), right)
         C = (scale * C + product / scale) / 2
-        # A NaN compares false, so that a lane that diverges stops.
+        # A NaN compares false, so that a diverging member of a batch stops.
         change = sum(largest(M + unit) for M, unit in zip(after, units, strict=True))
         return tuple(after), C, change, k + 1
 
@@ -153,8 +154,8 @@ def _by_sign(A, B, C):
 def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     """The integral of `exp(A s) Q exp(A' s)` over `s` from 0 to `time`.
 
-    Over the whole time the exponential of `-A` would overflow where `A` is stiff. It is
-    taken over a short part, with `|A| t < 1`, which is then doubled.
+    If `A` is stiff, the exponential of `-A` over the whole time would overflow. It is
+    taken over a short time with `|A| t < 1`, which is then doubled.
 
     Source: Van Loan, 1978.
     """
@@ -168,11 +169,12 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     power = blocks[n:, n:].T
     W = power @ blocks[:n, n:]
 
-    # W(2t) = W(t) + exp(A t) W(t) exp(A' t); of fixed length, which reverse mode needs.
+    # W(2t) = W(t) + exp(A t) W(t) exp(A' t), in a loop of fixed length, which reverse
+    # mode needs.
     def double(carry, k):
         W, power = carry
         more = k < doublings
-        # Zero where it is not used: what overflows there must not reach a derivative.
+        # Unused powers are set to zero, because an overflow would reach the derivative.
         safe_power = xp.where(more, power, 0)
         W_next = W + safe_power @ W @ safe_power.T
         return (W_next, xp.where(more, safe_power @ safe_power, power)), None

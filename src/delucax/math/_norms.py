@@ -10,17 +10,17 @@ from .._typing import Array
 
 _SMALL = 16
 ULPS = 4
-"""The rounding error of a residual `F(x) - x`, in units of the last place of `x`."""
+"""The rounding error of a residual `F(x) - x`, in units in the last place of `x`."""
 
 
 def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Array:
-    """The Euclidean norm with gradient 0 (not NaN) at 0.
+    """The Euclidean norm, with the gradient 0 (not NaN) at 0.
 
     **Arguments:**
 
-    - `x`: any array.
-    - `axis`: the axis to reduce; `None` for all.
-    - `keepdims`: keep the reduced axis with size 1.
+    - `x`: an array of any shape.
+    - `axis`: the axis to reduce, the last one by default; `None` for all axes.
+    - `keepdims`: keep the reduced axis with size 1; false by default.
 
     **Returns:** the norm along `axis`.
 
@@ -33,37 +33,42 @@ def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Ar
 
         jax.grad(dlx.math.safe_norm)(jnp.zeros(3))
         ```
+
+        ```text
+        Array([0., 0., 0.], dtype=float32)
+        ```
     """
     x = xp.asarray(x)
     squared = xp.sum(x * x, axis=axis, keepdims=keepdims)
-    # The square root of a masked one: its gradient is finite where it is not taken.
+    # The square root is taken of 1 where the norm is 0, so that its gradient is finite.
     at_zero = squared == 0
     return xp.where(at_zero, 0.0, xp.sqrt(xp.where(at_zero, 1.0, squared)))
 
 
 def within_ball(x: Array, radius: ArrayLike) -> Array:
-    """The nearest point of a ball in the Euclidean (Frobenius) norm, with a finite
-    gradient everywhere."""
+    """The point of the ball of `radius` that is nearest to `x`, in the Euclidean
+    (Frobenius) norm. The gradient is finite everywhere."""
     norm = safe_norm(x, axis=None)
-    # Inside, the factor is exactly 1, and so is its derivative of `x`.
+    # Inside of the ball, the factor is exactly 1.
     over = norm > radius
     return xp.where(over, radius / xp.where(over, norm, 1), 1).astype(x.dtype) * x
 
 
 def clip(x: ArrayLike, low: Any, high: Any) -> Array:
-    """`x` kept between `low` and `high`, either of which may be infinite.
+    """Clip `x` to the range from `low` to `high`, either of which may be infinite.
 
-    `jnp.clip` by comparisons: its own minimum and maximum must pass on a NaN of the
-    limits, which costs a batch on CPU as much as all the rest of a pendulum's step. A
-    NaN in `x` is kept; NaN limits are ignored. The gradient goes to `x` within the
-    limits and on them, and to the limit outside.
+    On CPU it is faster than `jnp.clip` for a batch, because it uses comparisons.
+    `jnp.clip` must also propagate a NaN of the limits, which takes as long as the rest
+    of a pendulum's step. Here NaN limits are ignored. A NaN in `x` stays NaN. The
+    gradient goes to `x` where it is within the limits or on them, and to the limit
+    elsewhere.
 
     **Arguments:**
 
-    - `x`: any array.
+    - `x`: an array of any shape.
     - `low`, `high`: the limits, numbers or arrays that broadcast against `x`.
 
-    **Returns:** the clipped array, of the dtype that the three promote to.
+    **Returns:** the clipped array, of the dtype to which the three promote.
 
     !!! example
 
@@ -72,6 +77,10 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
         import jax.numpy as jnp
 
         dlx.math.clip(jnp.array([-3.0, 0.5, 3.0]), -2.0, 2.0)
+        ```
+
+        ```text
+        Array([-2. ,  0.5,  2. ], dtype=float32)
         ```
     """
     x = xp.where(x > high, high, x)
@@ -85,19 +94,19 @@ def size(matrix: Array) -> Array:
 
 
 def largest(matrix: Array) -> Array:
-    """The size of the largest entry."""
+    """The absolute value of the largest entry."""
     if _is_large(matrix):
         return abs(matrix).max()
-    # Sizes are taken beforehand too, as XLA leaves out the reduction of a single entry.
+    # `abs` is also taken first, because XLA leaves out the reduction of a single entry.
     join = lambda a, b: lax.max(xp.abs(a), xp.abs(b))
     return _reduced(join, xp.abs(matrix), matrix.ndim)
 
 
 def largest_of_each(*matrices: Array) -> tuple[Array, ...]:
-    """The sizes of the largest entries of matrices of one shape."""
+    """The absolute values of the largest entries of matrices of one shape."""
     if on_host() or not _is_large(matrices[0]):
         return tuple(map(largest, matrices))
-    # One loop over all, in which nothing is stored.
+    # One loop over all matrices, which stores nothing.
     join = lambda a, b: tuple(map(lax.max, a, b))
     zero = xp.zeros((), matrices[0].dtype)
     return lax.reduce(
@@ -106,13 +115,14 @@ def largest_of_each(*matrices: Array) -> tuple[Array, ...]:
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
-    """The norm of an equation's residual over the sum of the norms of its terms."""
+    """The norm of an equation's residual, divided by the sum of the norms of its terms.
+    """
     return relative_and_total_size(error, xp.stack(terms))[0]
 
 
 def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
-    """The norm of an equation's residual, or of a stack of residuals, over the sum of
-    the norms of its stacked terms; and this sum."""
+    """The norm of an equation's residual (or of a stack of residuals), divided by the
+    sum of the norms of its stacked terms; and this sum."""
     unit = _unit(terms)
     total = xp.sum(_norm(terms * unit))
     # `lax.max` propagates NaN, as a comparison would not.
@@ -121,13 +131,13 @@ def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
 
 
 def one_if_zero(x: Array) -> Array:
-    """Numbers, with 1 for each that is zero."""
+    """`x`, with 1 in place of each zero."""
     return x + (x == 0)
 
 
 def _unit(matrix):
-    """A factor for entries whose squares may overflow or underflow. It makes the
-    largest one 4, as the reciprocal of a number of any size may itself underflow."""
+    """A factor for matrices whose squared entries may overflow or underflow. It makes
+    the largest entry 4 and not 1, because the factor itself may underflow."""
     return 4 / lax.max(largest(matrix), 2 * xp.finfo(matrix.dtype).tiny)
 
 
@@ -143,30 +153,31 @@ def _is_large(matrix):
 
 
 def _reduced(join, array, axes):
-    """A reduction of so many last axes, of few entries.
+    """A reduction of few entries over the last `axes` axes.
 
-    XLA on CPU hands a plain sum or maximum to a library with a pool of threads, which
-    takes twice as long to compile, and for a batch of small matrices to run. It does
-    not know these operations, which are those of numbers that are not negative.
+    XLA on CPU hands a plain sum or maximum to a library with a pool of threads. That
+    takes twice as long to compile, and also to run for a batch of small matrices. XLA
+    does not recognise these operations, which are valid for numbers that are not
+    negative.
     """
     last = range(array.ndim)[-axes:]
     return lax.reduce(array, xp.zeros((), array.dtype), join, tuple(last))
 
 
 def power_of_two(x: Array) -> Array:
-    """A power of two near each number, to the last bit, which `jnp.exp2` is not."""
-    # Rounded to no digit of the mantissa.
+    """A power of two near each number. It is exact, unlike `jnp.exp2`."""
+    # Rounded to a mantissa without digits.
     return lax.reduce_precision(x, xp.finfo(x.dtype).nexp, 0)
 
 
 def relative_drift(
     drift: Array, jacobian: Array, x: Array, u: Array, *, is_map: bool
 ) -> Array:
-    """The scaled residual of an equilibrium, the largest entry of
+    """The scaled residual of an equilibrium: the largest entry of
+    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`.
 
-    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`. The drift of a map is
-    `F(x) - x`, less the rounding of `x_i`. Leading axes are times, along which the unit
-    is that of the largest value.
+    The drift of a map is `F(x) - x`; the rounding of `x_i` is subtracted from its size.
+    Leading axes are times, and the unit is that of the largest value over time.
     """
     largest = lambda z: xp.max(xp.abs(z).reshape(-1, z.shape[-1]), axis=0)
     terms = xp.abs(jacobian) @ xp.concatenate(
@@ -180,10 +191,10 @@ def relative_drift(
 
 
 def units_of(z: Array) -> Array:
-    """The size of each entry; for one that is zero up to rounding that of the largest
-    entry, at most 1, and 1 if all are zero."""
+    """The absolute value of each entry. An entry that is zero up to rounding gets that
+    of the largest entry, at most 1; or 1 if all are zero."""
     size = xp.abs(z)
     largest = xp.max(size, initial=0)
-    # A state at rest at zero still needs a unit in which its drift is judged.
+    # A state that rests at zero needs a unit for its drift, too.
     floor = xp.where(largest > 0, xp.minimum(largest, 1), 1)
     return xp.where(size > 100 * xp.finfo(z.dtype).eps * floor, size, floor)

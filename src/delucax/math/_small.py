@@ -1,4 +1,4 @@
-"""Products too small to be worth a call into a linear-algebra library."""
+"""Products that are too small for a call of a linear-algebra library."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,13 +9,14 @@ from jaxtyping import Array, ArrayLike
 
 
 _UNROLL: ContextVar[int] = ContextVar("delucax_unroll", default=32)
-"""Products of up to as many terms are written out."""
+"""Products of up to this number of terms are written out."""
 
 
 @contextmanager
 def products_whole() -> Iterator[None]:
-    """Within, no product is written out: in a program that differentiates it twice, it
-    would be hundreds of operations, and is computed for a whole trajectory at once."""
+    """A context in which no product is written out. Use it for a program that
+    differentiates products twice, for a whole trajectory at once: each product would
+    become hundreds of operations."""
     token = _UNROLL.set(0)
     try:
         yield
@@ -24,10 +25,10 @@ def products_whole() -> Iterator[None]:
 
 
 def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
-    """`matrix @ vector`, written out entry by entry where the matrix is small.
+    """The product `matrix @ vector`, written out entry by entry if the matrix is small.
 
-    For a feedback gain of a few entries this is about 1.5 times faster in a simulation
-    loop, and under `jax.vmap` it fuses with what surrounds it.
+    For a feedback gain with a few entries this is about 1.5 times faster in a
+    simulation loop. Under `jax.vmap`, XLA fuses it with the operations around it.
 
     **Arguments:**
 
@@ -35,6 +36,8 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
     - `vector`: shape `(n,)`.
 
     **Returns:** the product, shape `(m,)`.
+
+    **Raises:** `ValueError` if the shapes do not fit.
 
     !!! example
 
@@ -44,6 +47,10 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
 
         dlx.math.matvec(jnp.eye(2), jnp.array([1.0, 2.0]))
         ```
+
+        ```text
+        Array([1., 2.], dtype=float32)
+        ```
     """
     matrix, vector = jnp.asarray(matrix), jnp.asarray(vector)
     if matrix.ndim != 2 or vector.shape != matrix.shape[1:]:
@@ -51,7 +58,8 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
             "matvec: matrix and vector must have shapes (m, n) and (n,), got "
             f"{matrix.shape} and {vector.shape}."
         )
-    # Entry by entry XLA fuses the product; as `dot` it calls a library for each member.
+    # XLA fuses a product that is written out. For `@` it calls a library for each
+    # member of a batch.
     m, n = matrix.shape
     if m * n == 0 or m * n > _UNROLL.get():
         return matrix @ vector
@@ -65,14 +73,16 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
 
 
 def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
-    """The scalar `vector' matrix vector`, small matrices written out.
+    r"""The quadratic form $v^\top M v$, written out if the matrix is small.
 
     **Arguments:**
 
-    - `matrix`: shape `(n, n)`.
-    - `vector`: shape `(n,)`.
+    - `matrix`: $M$, shape `(n, n)`.
+    - `vector`: $v$, shape `(n,)`.
 
     **Returns:** a scalar.
+
+    **Raises:** `ValueError` if the shapes do not fit.
 
     !!! example
 
@@ -82,13 +92,17 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
 
         dlx.math.quadratic_form(jnp.eye(2), jnp.array([1.0, 2.0]))
         ```
+
+        ```text
+        Array(5., dtype=float32)
+        ```
     """
     vector = jnp.asarray(vector)
     return dot(vector, matvec(matrix, vector))
 
 
 def dot(a: Array, b: Array) -> Array:
-    """The sum of the products of two vectors, a few written out."""
+    """The scalar product of two vectors, written out if they are short."""
     (n,) = a.shape
     if n == 0 or n > _UNROLL.get():
         return a @ b

@@ -1,8 +1,8 @@
 """Times as steps of a grid.
 
-A time `k dt` is rounded, and so are the times that are compared with it. Comparisons
-are therefore of the numbers of steps, which are whole where the times are meant to be
-equal.
+A time `k dt` is rounded, and so is the time that it is compared with. Times are
+therefore compared by their numbers of steps, which are whole numbers if the times are
+meant to be equal.
 """
 
 from typing import Any, NamedTuple, TypeVar
@@ -31,16 +31,16 @@ def check_steps(count: int, dtype: Any, what: str, where: str) -> None:
     most = most_steps(dtype)
     if count > most:
         raise ValueError(
-            f"{where}: {what} has {count} steps, but times in {jnp.dtype(dtype).name} "
-            f"resolve only {most}; use double precision (JAX_ENABLE_X64=1) or "
-            "shorter pieces."
+            f"{where}: {what} must have at most {most} steps in "
+            f"{jnp.dtype(dtype).name}, whose times resolve no more, got {count}. Use "
+            "double precision (JAX_ENABLE_X64=1) or a shorter horizon."
         )
 
 
 def step_at(t: Any, dt: Any, count: int, where: str) -> Array:
-    """The step of `count` that time `t` belongs to, `round(t / dt)`.
+    """The step to which time `t` belongs, `round(t / dt)`, in a horizon of `count`.
 
-    A NaN time maps to step -1, which is before the first.
+    A NaN time gives step -1, before the first.
     """
     steps = t / dt
     check_steps(count, jnp.result_type(steps), "the horizon", where)
@@ -54,24 +54,24 @@ def row_at(tree: _T, k: Array) -> _T:
 
 
 class Position(NamedTuple):
-    """A time in steps: the nearest whole number, and how far it is from there."""
+    """A time in steps: the nearest whole number, and the distance from it."""
 
     whole: Array
     off: Array
 
 
 def position(t: Any, dt: Any, origin: Any, eps: float) -> Position:
-    """Where `t` is, in steps of `dt` from `origin`.
+    """The position of `t` in steps of `dt` from `origin`.
 
-    It is on a step if it is as close to one as rounding by `eps` of the times and of
-    `dt` can put it. The quotient is taken in two parts, because its own rounding would
-    be another error of the size of those.
+    It counts as on a step if a rounding by `eps` of the times and of `dt` explains its
+    distance from the step. The quotient is computed in two parts, because its own
+    rounding would be as large as those.
     """
     t, dt, origin = (lax.stop_gradient(jnp.asarray(a)) for a in (t, dt, origin))
     dtype = jnp.result_type(t, dt, origin)
     t, dt, origin = (a.astype(dtype) for a in (t, dt, origin))
     info, since = jnp.finfo(dtype), t - origin
-    # The product of the coarse quotient, a whole number, with each part of dt is exact.
+    # The coarse quotient is a whole number. Its product with each part of dt is exact.
     coarse = lax.reduce_precision(since / dt, info.nexp, info.nmant // 2 - 1)
     coarse = jnp.round(coarse)
     high = lax.reduce_precision(dt, info.nexp, (info.nmant + 1) // 2)
@@ -83,7 +83,7 @@ def position(t: Any, dt: Any, origin: Any, eps: float) -> Position:
 
 
 def coarsest(*arrays: Array) -> float:
-    """The relative rounding of the least precise of some arrays."""
+    """The relative rounding of the least precise array."""
     return max(float(jnp.finfo(a.dtype).eps) for a in arrays)
 
 
@@ -91,14 +91,14 @@ def coarsest(*arrays: Array) -> float:
 def step_between(times: Vector, where: str) -> Any:
     """The step of a grid of times; `None` for a single time.
 
-    It is the first one, or the average one where the grid does not start at 0, because
-    the difference of two late times is rounded. If the precision of the times is too
-    coarse for the steps, it is NaN, or an error where the times are concrete.
+    It is the first step. If the grid does not start at 0 it is the average step,
+    because the difference of two late times is rounded. If the precision of the times
+    is too coarse for the steps, it is NaN, or an error if the times are concrete.
     """
     check_steps(times.shape[0], times.dtype, "the horizon", where)
     if times.shape[0] == 1:
         return None
-    # The rounding of late times is spread over all steps by the average.
+    # The average spreads the rounding of late times over all steps.
     average = (times[-1] - times[0]) / (times.shape[0] - 1)
     dt = xp.where(times[0] == 0, times[1], average)
     last = xp.maximum(xp.abs(times[0]), xp.abs(times[-1]))
@@ -106,14 +106,14 @@ def step_between(times: Vector, where: str) -> Any:
     if is_concrete(apart) and not np.all(apart):
         raise ValueError(
             f"{where}: times in {times.dtype.name} are too coarse for steps of "
-            f"{dt:.3g} at {last:.6g}; use double precision (JAX_ENABLE_X64=1) or times "
-            "from 0."
+            f"{dt:.3g} at {last:.6g}. Use double precision (JAX_ENABLE_X64=1), or "
+            "times from 0."
         )
     return xp.where(apart, dt, xp.nan)
 
 
 def reached(times: Array, mark: Array, dt: Any) -> Array:
-    """Which of `times`, a grid of step `dt`, are `mark` or later."""
+    """Which of `times`, a grid with step `dt`, are at `mark` or later."""
     if dt is None:
         return times >= mark
     eps = coarsest(times, mark)
