@@ -69,15 +69,15 @@ def split():
         (plant, {"x_ref": np.ones(3)}, r"x_ref must have shape \(2,\)"),
         (task, {"dynamics.dt": -1.0}, "dt must be positive"),
         (task, {"dynamics.A": np.eye(3)}, "B must have as many rows as A"),
-        (task, {"dynamics": plant(3)}, "cost does not fit a state of size 3 .*Q has"),
+        (task, {"dynamics": plant(3)}, "cost must fit a state of size 3 .*Q has"),
         (task, {"dynamics": plant(3), "cost": cost(3), "disturbance": d.Zero(2)},
-            "disturbance has size 2 where 3 is expected"),
+            "disturbance must have size 3, got size 2"),
         (noisy, {"dynamics": plant(3), "cost": cost(3)},
-            "disturbance has size 2 where 3 is expected"),
+            "disturbance must have size 3, got size 2"),
         (lambda: noisy(initial_state=np.ones(2)),
             {"dynamics": plant(3), "cost": cost(3), "disturbance": d.Zero(3)},
             r"initial_state must have shape \(3,\)"),
-        (task, {"cost.R": np.ones(2)}, "cost does not fit .*control of size 1"),
+        (task, {"cost.R": np.ones(2)}, "cost must fit .*control of size 1"),
         (task, {"control_bounds.0": 5.0}, "control_bounds must have low <= high"),
         (task, {"control_bounds.0": [1.0, 2.0]}, r"control_bounds must be .*\(1,\)"),
         (task, {"initial_state": [np.nan, 0.0]}, "initial_state must be finite"),
@@ -88,12 +88,12 @@ def split():
         (split, {"gains.1": {"a": jnp.array(0.7)}}, "gains must sum to 1"),
         (split, {"base.K": [[-1.0, 2.0]]}, "K must not be negative"),
         (lambda: d.Constant(1.0, size=2) + d.Constant(2.0, size=2),
-            {"terms.0": d.Constant(1.0, size=3)}, "must be of one size"),
+            {"terms.0": d.Constant(1.0, size=3)}, "must have the same size"),
         (lambda: (plant(), {"p": plant()}), {"1.p.dt": -1.0}, "dt must be positive"),
         (lambda: dlx.controllers.LQR(dlx.LinearDynamics(A, B), np.eye(2), np.eye(1)),
-            {"K": np.ones((3, 3))}, r"LQR: shapes do not fit each other: K .*\(3, 3\)"),
+            {"K": np.ones((3, 3))}, r"LQR: shapes must fit each other, got K .*\(3, 3\)"),
         (lambda: dlx.make("single_compartment"),
-            {"dynamics.dynamics.system.resistance": [1.0, 2.0]}, "cannot work with"),
+            {"dynamics.dynamics.system.resistance": [1.0, 2.0]}, "does not accept"),
     ],
 )  # fmt: skip
 def test_what_the_constructor_refuses(make, changes, match):
@@ -148,7 +148,7 @@ def test_defaults_follow_the_dynamics(n):
     # That there is no noise was said, and is not the default.
     calm = dlx.Environment(drift, cost(1), d.Zero(3))
     fewer = dlx.Discretized(Drift(), 0.1, substeps=2)
-    with user_error(match="disturbance has size 3 where 2 is expected"):
+    with user_error(match="disturbance must have size 2, got size 3"):
         dlx.replace(calm, {"dynamics": fewer})
     batch = jax.vmap(lambda _: task())(jnp.arange(4))
     new = jax.vmap(lambda _: task(n))(jnp.arange(4))
@@ -235,7 +235,7 @@ def test_a_batch_of_modules(key):
         dlx.replace(one, {"high": high.at[2].set(-9.0)})
     rows = jax.vmap(jax.vmap(lambda a, b: d.Uniform(a, b, size=1)))
     grid = rows(jnp.stack([low, low]), jnp.stack([high, high]))
-    with user_error(match="member 2 of a batch. This is member 1 of a batch"):
+    with user_error(match="member 2 of a batch. It is member 1 of a batch"):
         dlx.replace(grid, {"high": grid.high.at[1, 2].set(-9.0)})
     ends = jax.jit(lambda high: dlx.replace(one, {"high": high}).high)
     assert_close(ends(-9 * high), -9.0)  # traced, so that it cannot be looked at
@@ -265,7 +265,7 @@ def test_a_large_batch(monkeypatch):
     assert 32 <= len(_paths._members(batch)) <= 64
     with user_error(match="member 321 of a batch"):
         dlx.replace(batch, {"high": batch.high.at[321].set(-2.0)})
-    with pytest.warns(UserWarning, match="Uniform is a batch of 500 members, of which"):
+    with pytest.warns(UserWarning, match="Uniform is a batch of 500 members, and only"):
         dlx.replace(batch, {"high": 2 * batch.high})
 
 
@@ -309,7 +309,7 @@ def test_ranges_are_checked_by_their_ends(how, key):
     for ranges in LEGAL:
         under(how, draw(ranges, window), key)
     for ranges in CROSSED:
-        with user_error(match="stop must be at least.*ranges of randomise allow it"):
+        with user_error(match="stop must be at least.*within the ranges of randomise"):
             under(how, draw(ranges, window), key)
     pendulum = lambda x: dlx.replace(
         dlx.make("pendulum"), {"dynamics.system.length": x}

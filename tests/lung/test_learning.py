@@ -204,7 +204,7 @@ def test_wrong_arguments(breaths):
         lung.explore(dlx.make("pendulum"), 3, key=KEY)
     with user_error(match="system must be an AbstractLung"):
         lung.LungModel(dlx.systems.Pendulum())
-    with user_error(match="trees must be of one structure"):
+    with user_error(match="trees must have the same structure"):
         stack([lung.SingleCompartment(), lung.BalloonLung()])
 
 

@@ -1,4 +1,4 @@
-"""The fields of modules: their kinds, paths, names and files; stacks of modules."""
+"""Modules: kinds of fields, paths to leaves, names, files and stacks."""
 
 from ._fields import (
     AbstractConstraint as AbstractConstraint,

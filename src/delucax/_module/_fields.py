@@ -1,4 +1,4 @@
-"""Kinds of fields: constants of the physics, trainable weights, functions."""
+"""Kinds of fields: physical constants, trainable weights, functions."""
 
 import abc
 import dataclasses
@@ -23,10 +23,10 @@ _FUNCTION = "delucax_function"
 
 
 class AbstractConstraint(eqx.Module):
-    """A set of valid values, with a smooth bijection to it from the real numbers.
+    """A set of valid values, with a smooth bijection from the real numbers to it.
 
-    Training moves the unconstrained value and the model gets the constrained one, so
-    that no step of any optimiser can leave the set.
+    Training changes an unconstrained value, and the model gets the constrained one. So
+    no step of any optimiser can leave the set.
     """
 
     @abc.abstractmethod
@@ -43,7 +43,8 @@ class AbstractConstraint(eqx.Module):
 
 
 class _Positive(AbstractConstraint):
-    """The constraint `value > 0`: training moves the logarithm, so a step is relative.
+    """The constraint that values are above zero. Training changes the logarithm, so
+    steps are relative.
 
     !!! example
 
@@ -68,9 +69,9 @@ class _Positive(AbstractConstraint):
 
 
 def _strictly_inside(value: Array, low: float, high: float) -> Array:
-    """`value` off the ends of an open interval, which rounding may put it on."""
-    # exp and the sigmoid round to 0 and to the ends far out, where the logarithm of
-    # `unconstrain` is infinite and the gradient gone for good.
+    """`value`, moved off the ends of an open interval, where rounding may put it."""
+    # Far out, exp and the sigmoid round to the ends. There the logarithm in
+    # `unconstrain` is infinite, and the gradient would stay zero.
     dtype = jnp.result_type(value)
     tiny, ends = jnp.finfo(dtype).tiny, np.asarray([low, high], dtype)
     inner = np.nextafter(ends, ends[::-1])
@@ -84,21 +85,37 @@ positive = _Positive()
 
 
 class bounded(AbstractConstraint):
-    """The constraint `low < value < high`; training moves the logit.
+    r"""The constraint $\mathrm{low} < x < \mathrm{high}$ of a [`delucax.parameter`][]
+    or [`delucax.weight`][].
+
+    Training changes the logit of the value, so that no step can leave the interval.
 
     **Arguments:**
 
     - `low`: the lower end, a number.
     - `high`: the upper end, a number above `low`.
 
-    **Raises:** `ValueError` if `low >= high`.
+    **Raises:** `ValueError` if `low` is not below `high`.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
+        from jaxtyping import Array
 
-        damping = dlx.parameter(0.1, constraint=dlx.bounded(0.0, 1.0))
+        class Decay(dlx.AbstractSystem):
+            state_names, control_names = ("x",), ("u",)
+            rate: Array = dlx.parameter(0.1, constraint=dlx.bounded(0.0, 1.0))
+
+            def vector_field(self, t, x, u, w):
+                return u - self.rate * x
+
+        Decay(rate=0.5).vector_field(0.0, jnp.ones(1), jnp.zeros(1), None)
+        ```
+
+        ```text
+        Array([-0.5], dtype=float32)
         ```
     """
 
@@ -115,7 +132,6 @@ class bounded(AbstractConstraint):
         return _strictly_inside(value, self.low, self.high)
 
     def unconstrain(self, value: Array) -> Array:
-        # The logit of the part of the way from one end to the other.
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def holds(self, value):
@@ -126,10 +142,11 @@ class bounded(AbstractConstraint):
 
 
 def as_float_array(value: Any) -> Any:
-    """A number as a weakly typed float array; anything else as it is.
+    """A number as a weakly typed float array; anything else unchanged.
 
-    A weak type follows the precision of what it meets, so one module serves float32
-    and float64 alike. Integers become floats; arrays of numbers keep their precision.
+    A weakly typed number takes the precision of the arrays that it is combined with, so
+    one module serves float32 and float64. Integers become floats. Arrays of numbers
+    keep their precision.
     """
     if on_host():
         return _as_host_array(value)
@@ -138,35 +155,35 @@ def as_float_array(value: Any) -> Any:
     if isinstance(value, bool | int | float | np.number) or (
         isinstance(value, np.ndarray) and value.ndim == 0
     ):
-        # Of a Python number, as an array of NumPy would have a strong type. And not by
-        # `jnp.asarray`, which would compile a program; while something else is traced,
-        # the number is known nevertheless.
+        # From a Python number, because a NumPy array would give a strong type. Not by
+        # `jnp.asarray`, which would compile a program. The number is known even while
+        # something else is traced.
         with jax.ensure_compile_time_eval():
             return jax.device_put(float(value))
     if isinstance(value, np.ndarray | list | tuple | jax.Array):
         try:
             array = _as_array(value)
-        except (TypeError, ValueError):  # ragged, or not of numbers
+        except (TypeError, ValueError):  # ragged, or not numbers
             return value
         return array if eqx.is_inexact_array(array) else array.astype(float)
     return value
 
 
 def _as_array(value: Any) -> Array:
-    """`jnp.asarray(value)`, which would compile a program for each shape."""
+    """`jnp.asarray(value)`, without compiling a program for each shape."""
     leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
     if isinstance(value, jax.Array) or any(isinstance(leaf, Tracer) for leaf in leaves):
         return jnp.asarray(value)
-    # None would be NaN, and a string may name a dtype.
+    # NumPy would take None for NaN, and a string for the name of a dtype.
     if any(leaf is None or isinstance(leaf, str) for leaf in leaves):
         raise TypeError
     dtype = jnp.result_type(float, *leaves)
-    # A copy, as JAX may share the memory of an array that is changed later.
+    # A copy, because JAX may share the memory of an array that the user changes later.
     return jax.device_put(np.array(value, dtype))
 
 
 def _as_host_array(value: Any) -> Any:
-    """Numbers as an array of NumPy, in the precision that JAX would give them."""
+    """Numbers as a NumPy array, in the precision that JAX would give them."""
     if value is None:
         return value
     try:
@@ -182,19 +199,20 @@ def _as_host_array(value: Any) -> Any:
 def parameter(
     default: Any = dataclasses.MISSING, *, constraint: AbstractConstraint | None = None
 ) -> Any:
-    """A field that holds a constant of the physics.
+    """Declare a field that holds a physical constant.
 
-    A number given for it becomes a (weakly typed) floating-point array leaf, so that it
-    can be differentiated, batched under `jax.vmap`, and changed without compiling
-    again. A bare `float` field would be static under `eqx.filter_jit`: every value
-    would compile anew and its gradient would be `None`.
+    A number in such a field becomes a floating-point array leaf. You can differentiate
+    with respect to it, batch it under `jax.vmap`, and change it without compiling
+    again. A plain `float` field would be static under `eqx.filter_jit`: each new value
+    would compile again, and its gradient would be `None`.
 
     **Arguments:**
 
-    - `default`: the default value, a number or an array; the field is required if it is
-        left out.
-    - `constraint`: the valid values, [`delucax.positive`][] or [`delucax.bounded`][].
-        Checked when a module is made, and kept by `delucax.training.fit`.
+    - `default`: the default value, a number or an array. Without it, the field is
+        required.
+    - `constraint`: the valid values, [`delucax.positive`][] or a [`delucax.bounded`][];
+        none by default. It is checked when a module is made, and `delucax.training.fit`
+        keeps it.
 
     **Returns:** a dataclass field.
 
@@ -212,6 +230,12 @@ def parameter(
 
             def vector_field(self, t, x, u, w):
                 return jnp.stack([x[1], u[0] - self.stiffness * x[0]])
+
+        Oscillator(stiffness=4.0).stiffness
+        ```
+
+        ```text
+        Array(4., dtype=float32, weak_type=True)
         ```
     """
     return _field("parameter", default, constraint)
@@ -220,14 +244,14 @@ def parameter(
 def weight(
     default: Any = dataclasses.MISSING, *, constraint: AbstractConstraint | None = None
 ) -> Any:
-    """A field that holds trainable weights: an array, a number, or a whole network.
+    """Declare a field that holds trainable weights: an array, a number, or a network.
 
-    These are the only fields that `delucax.training.fit` moves unless told otherwise.
+    By default, `delucax.training.fit` changes these fields and no others.
 
     **Arguments:**
 
-    - `default`: the default value; the field is required if it is left out.
-    - `constraint`: the valid values, as in [`delucax.parameter`][].
+    - `default`: the default value. Without it, the field is required.
+    - `constraint`: the valid values, as in [`delucax.parameter`][]; none by default.
 
     **Returns:** a dataclass field.
 
@@ -242,6 +266,12 @@ def weight(
 
             def __call__(self, t, y, state):
                 return -self.gain * y[:1], state
+
+        Proportional().gain
+        ```
+
+        ```text
+        Array(1., dtype=float32, weak_type=True)
         ```
     """
     return _field("weight", default, constraint)
@@ -250,7 +280,7 @@ def weight(
 def _field(role: str, default: Any, constraint: AbstractConstraint | None) -> Any:
     given: dict[str, Any] = {"default": default}
     if isinstance(default, list | np.ndarray | jax.Array):
-        # A dataclass wants what can be changed, or has no hash, from a function.
+        # A dataclass takes a mutable or unhashable default only from a function.
         given = {"default_factory": lambda: default}
     metadata = {_ROLE: role, _CONSTRAINT: constraint}
     return eqx.field(**given, converter=_as_value, metadata=metadata)
@@ -263,8 +293,8 @@ def _as_value(value: Any) -> Any:
 class StaticFunction(eqx.Module):
     """A plain function as a module without leaves.
 
-    A function among the leaves of a module makes `jax.jit` refuse the module as an
-    argument; inside this it is part of the structure.
+    `jax.jit` refuses a module with a function among its leaves. In this wrapper the
+    function is part of the structure.
     """
 
     function: Callable = eqx.field(static=True)
@@ -277,24 +307,24 @@ class StaticFunction(eqx.Module):
 
 
 def as_module(value: Any) -> Any:
-    """A plain function as a `StaticFunction`; anything else as it is."""
+    """A plain function as a `StaticFunction`; anything else unchanged."""
     is_plain = callable(value) and jax.tree_util.all_leaves([value])
     return StaticFunction(value) if is_plain else value
 
 
 def function_field(default: Any = dataclasses.MISSING) -> Any:
-    """A field that holds a function: plain, or a module with a `__call__`."""
+    """A field that holds a function: a plain one, or a module with a `__call__`."""
     return eqx.field(default=default, converter=as_module, metadata={_FUNCTION: True})
 
 
 def fields_of(node: Any) -> dict[str, dataclasses.Field]:
-    """The fields of a module, or of another dataclass, by name; none of other nodes."""
+    """The fields of a module or another dataclass, by name; none for other nodes."""
     fields = dataclasses.fields(node) if dataclasses.is_dataclass(node) else ()
     return {field.name: field for field in fields}
 
 
 def children_of(node: Any) -> dict[str, Any]:
-    """The children of a node, by their names in paths."""
+    """The children of a node, by the names that they have in paths."""
     if isinstance(node, Mapping):
         return {str(key): child for key, child in node.items()}
     if isinstance(node, tuple | list) and not hasattr(node, "_fields"):
@@ -307,8 +337,8 @@ _Part = TypeVar("_Part", bound=eqx.Module)
 
 
 def parts_of(module: Any, kind: type[_Part]) -> list[_Part]:
-    """The modules of a class inside of another one, or of any pytree; not those inside
-    of them."""
+    """The modules of class `kind` inside of a module or pytree. Modules inside of these
+    are left out."""
     is_part = lambda node: isinstance(node, kind) and node is not module
     nodes = jax.tree.leaves(module, is_leaf=is_part)
     return [node for node in nodes if is_part(node)]
@@ -317,13 +347,13 @@ def parts_of(module: Any, kind: type[_Part]) -> list[_Part]:
 def marked_leaves(
     tree: Any,
 ) -> Iterator[tuple[tuple, Any, str | None, AbstractConstraint | None]]:
-    """`(path, leaf, role, constraint)` of every leaf, as the innermost `parameter()` or
-    `weight()` declares."""
+    """`(path, leaf, role, constraint)` of every leaf. The innermost `parameter()` or
+    `weight()` field on its path declares the role and the constraint."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         node, role, constraint = tree, None, None
         for key in path:
             name, children = path_string((key,)), children_of(node)
-            if name not in children:  # of a node that is known to JAX alone
+            if name not in children:  # inside a node that only JAX can flatten
                 break
             if name in (fields := fields_of(node)):
                 role = fields[name].metadata.get(_ROLE, role)
@@ -352,8 +382,8 @@ def check_parameters(module: eqx.Module) -> None:
 
 
 def check_function(value: Any, name: str, where: str, of: str = "") -> None:
-    """Raise unless `value` is a function. `of` says what its arguments are, such as
-    " of time"."""
+    """Raise unless `value` is a function. `of` describes its arguments in the message,
+    as in " of time"."""
     if not callable(value):
         raise ValueError(
             f"{where}: {name} must be a function{of}, got {shortened(value)}."
@@ -361,8 +391,8 @@ def check_function(value: Any, name: str, where: str, of: str = "") -> None:
     inner = value.function if isinstance(value, StaticFunction) else value
     if isinstance(inner, type):
         raise ValueError(
-            f"{where}: {name} must be a function{of}, got the class {inner.__name__} "
-            f"where {inner.__name__}(...) may be meant."
+            f"{where}: {name} must be a function{of}, got the class {inner.__name__}. "
+            f"You may mean an instance, {inner.__name__}(...)."
         )
 
 
@@ -371,7 +401,7 @@ def _check_numbers(value: Any, name: str, field: dataclasses.Field) -> None:
     is_missing = value is None and field.default not in (dataclasses.MISSING, None)
     for leaf in [None] if is_missing else jax.tree.leaves(value):
         is_number = eqx.is_inexact_array(leaf)
-        # The leaves of a network may be anything.
+        # The other leaves of a network may be anything.
         is_alone = leaf is value or field.metadata[_ROLE] == "parameter"
         if is_alone and not (callable(leaf) or is_number):
             raise ValueError(
@@ -387,10 +417,10 @@ def _check_numbers(value: Any, name: str, field: dataclasses.Field) -> None:
 
 
 def check_module(module: eqx.Module) -> None:
-    """Raise unless `module` is one that its constructor would have made.
+    """Raise unless the constructor could have made `module`.
 
-    This runs its `__check_init__`, and looks at what needs no code of its own: its
-    parameters, and the shapes in the annotations of its fields.
+    This checks its parameters, runs its `__check_init__`, and checks the shapes in the
+    annotations of its fields.
     """
     check_parameters(module)
     for cls in type(module).__mro__:
@@ -400,11 +430,11 @@ def check_module(module: eqx.Module) -> None:
 
 
 def _check_shapes(module: eqx.Module) -> None:
-    """Raise unless a size that several fields name, such as `n`, is the same in all."""
+    """Raise unless a size that several annotations name, such as `n`, is the same."""
     shapes = []
     with jaxtyped("context"):
         fields = [(field, _hints(field)) for field in dataclasses.fields(module)]
-        # A sum such as T+1 is known when T is.
+        # A sum such as T+1 comes last, because it is known only if T is.
         fields.sort(key=lambda pair: any("+" in hint.dim_str for hint in pair[1]))
         for field, hints in fields:
             value: Any = getattr(module, field.name, None)
@@ -414,12 +444,12 @@ def _check_shapes(module: eqx.Module) -> None:
             shapes.append(f"{field.name} of shape {dims} is {value.shape}")
             if not any(isinstance(value, hint) for hint in hints):
                 raise ValueError(
-                    f"{type(module).__name__}: shapes do not fit each other: "
+                    f"{type(module).__name__}: shapes must fit each other, got "
                     f"{'; '.join(shapes)}."
                 )
 
 
 def _hints(field: dataclasses.Field) -> list[Any]:
-    """The shapes that the annotation of a field has."""
+    """The jaxtyping annotations of a field."""
     hints = typing.get_args(field.type) or (field.type,)
     return [h for h in hints if isinstance(h, type) and issubclass(h, AbstractArray)]

@@ -11,7 +11,10 @@ def indexed_names(letter: str, size: int) -> tuple[str, ...]:
 def names_of(
     given: int | Sequence[str], letter: str, argument: str, where: str
 ) -> tuple[str, ...]:
-    """Names; indexed ones if their number is given. Raises `ValueError` otherwise."""
+    """The given names, or indexed names if `given` is their number.
+
+    **Raises:** `ValueError` if it is neither.
+    """
     if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
         return indexed_names(letter, given)
     if isinstance(given, tuple | list) and all(isinstance(n, str) for n in given):

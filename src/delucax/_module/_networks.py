@@ -1,4 +1,4 @@
-"""Networks whose first weights are drawn by one program, whatever their sizes."""
+"""Networks whose initial weights are drawn by one program, whatever their sizes."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,8 @@ def mlp(
     activation: Callable = jnp.tanh,
     **options: Any,
 ) -> eqx.nn.MLP:
-    """A fully connected network, linear at its end, that compiled functions take."""
+    """A fully connected network with a linear last layer. Its functions are modules, so
+    that compiled functions take it as an argument."""
     functions = as_module(activation), as_module(jax.nn.identity)
     given = inputs, outputs, width, depth, *functions
     if isinstance(options["key"], Tracer):
@@ -31,12 +32,12 @@ def mlp(
 
 
 def _drawn(*given: Any, key: Any, **options: Any) -> eqx.nn.MLP:
-    """The network of `eqx.nn.MLP` with the same key.
+    """The network that `eqx.nn.MLP` makes from the same key.
 
-    A generator of random numbers takes half a second to compile, and Equinox has two
-    of them for each layer and network. Here all keys are one batch. A number depends on
-    its place alone: more are drawn than needed, so that other networks share the
-    program.
+    A random number generator takes half a second to compile, and Equinox compiles two
+    for each layer of each network. Here all keys are one batch. A number depends only
+    on its key and its place, so more numbers may be drawn than needed. Networks of
+    other sizes then share the program.
     """
     blank = eqx.filter_eval_shape(eqx.nn.MLP, *given, key=key, **options)
     drawn = [part for layer in blank.layers for part in (layer.weight, layer.bias)]
@@ -63,7 +64,7 @@ _traced = eqx.filter_jit(_drawn)
 
 @eqx.filter_jit
 def _uniform(key: Any, limits: Any, columns: int) -> Any:
-    """For each of the limits two rows of numbers within them."""
+    """Two rows of numbers for each limit, uniform within plus and minus the limit."""
     pairs = jax.vmap(jr.split)(jr.split(key, len(limits)))
     row = lambda key, limit: jr.uniform(
         key, (columns,), limit.dtype, minval=-limit, maxval=limit
@@ -72,5 +73,5 @@ def _uniform(key: Any, limits: Any, columns: int) -> Any:
 
 
 def _at_least(start: int, needed: int) -> int:
-    """`start`, doubled until it is enough."""
+    """`start`, doubled until it reaches `needed`."""
     return start * 2 ** max(0, math.ceil(math.log2(needed / start)))

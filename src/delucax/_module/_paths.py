@@ -24,7 +24,8 @@ from ._fields import (
 _T = TypeVar("_T")
 
 _MOST_MEMBERS = 4096
-"""Members of a batch that are checked, a millisecond each or less."""
+"""The largest number of members of a batch that are checked. A check takes up to a
+millisecond."""
 
 
 def get_path(tree: PyTree, path: str) -> Any:
@@ -35,13 +36,15 @@ def get_path(tree: PyTree, path: str) -> Any:
     - `tree`: any pytree of modules, sequences and dictionaries.
     - `path`: names joined by dots; a whole number indexes a sequence.
 
-    **Raises:** `ValueError` naming the part that is not there, and the close ones.
+    **Returns:** the node.
+
+    **Raises:** `ValueError` if a part of the path does not exist.
     """
     return _nodes_along(tree, path)[-1]
 
 
 def _nodes_along(tree: Any, path: str) -> list[Any]:
-    """The nodes on the way from the root to that at `path`, both included."""
+    """The nodes from the root to the one at `path`, both included."""
     nodes = [tree]
     for part in path.split(".") if path else ():
         children = children_of(nodes[-1])
@@ -54,8 +57,8 @@ def _nodes_along(tree: Any, path: str) -> list[Any]:
 
 
 def with_values(tree: _T, values: Mapping[str, Any]) -> _T:
-    """A copy of `tree` with arrays at paths, which are not checked: they may be traced,
-    and as many as a loop needs."""
+    """A copy of `tree` with the arrays `values` at their paths, without checks. Use it
+    inside of traced code and loops."""
     if not values:
         return tree
     at = lambda tree: [get_path(tree, path) for path in values]
@@ -63,7 +66,7 @@ def with_values(tree: _T, values: Mapping[str, Any]) -> _T:
 
 
 def by_path(flat: Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """The entries of a vector as arrays by their paths."""
+    """The entries of a vector, cut into arrays by path."""
     values, at = {}, 0
     for path, shape in shapes.items():
         size = math.prod(shape)
@@ -73,27 +76,30 @@ def by_path(flat: Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Arr
 
 
 def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
-    """A copy of `tree` with the named leaves replaced.
+    """Replace leaves by their paths: a copy of `tree` with new values.
 
-    Nothing compiles again: a number that replaces a [`delucax.parameter`][] becomes the
-    same kind of leaf. All changes are made before any is checked, so values that only
-    fit together are given in one call. The defaults that an environment derives from
-    its dynamics, its disturbance and an initial state of zeros, follow new dynamics.
-    Then every module above a change runs the checks of its constructor. In a batch from
-    `jax.vmap` every member is checked; of more than 4096 only a sample is, with a
-    warning: those with extreme numbers, and others spread evenly. Of traced values only
-    the shapes are checked.
+    Nothing compiles again, because a number that replaces a [`delucax.parameter`][]
+    becomes the same kind of leaf. If you replace the dynamics of an environment, the
+    fields that it derived from the old dynamics follow: its default disturbance, and an
+    initial state of zeros.
+
+    After all changes, every module above a change runs the checks of its constructor.
+    Pass values that only fit together in one call. In a batch from `jax.vmap`, every
+    member is checked. In a batch of more than 4096, only a sample is checked, with a
+    warning: the members with extreme numbers, and others spread evenly. For traced
+    values, only shapes are checked.
 
     **Arguments:**
 
     - `tree`: any pytree, for example an environment or a controller.
-    - `changes`: from a path (names joined by dots; whole numbers index sequences) to
-        its new value.
+    - `changes`: a dictionary from paths to new values. A path is a string of names
+        joined by dots, such as `"dynamics.system.length"`; whole numbers index
+        sequences.
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path is not in the tree or is part of another one, or
-    if the values are not valid.
+    **Raises:** `ValueError` if a path does not exist or is part of another path, or if
+    the values are not valid.
 
     !!! example
 
@@ -102,6 +108,11 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
 
         env = dlx.make("pendulum")
         longer = dlx.replace(env, {"dynamics.system.length": 1.2})
+        longer.dynamics.system.length
+        ```
+
+        ```text
+        Array(1.2, dtype=float32, weak_type=True)
         ```
     """
     if not isinstance(changes, Mapping):
@@ -113,7 +124,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     changed = tree
     for path, value in changes.items():
         changed = _with(changed, path, value)
-    # The deepest first: what follows by default is in place when an owner is checked.
+    # The deepest first, so that derived defaults are in place when an owner is checked.
     for path in _owners(changes):
         before = get_path(tree, path)
         changed = _with_defaults(changed, path, before, changes)
@@ -122,7 +133,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
 
 
 def check_paths(changes: Mapping[Any, Any], where: str) -> None:
-    """Raise unless the keys are paths, of which none goes through another."""
+    """Raise unless the keys are paths, and none of them is part of another."""
     for path in changes:
         if not isinstance(path, str):
             raise ValueError(
@@ -134,21 +145,20 @@ def check_paths(changes: Mapping[Any, Any], where: str) -> None:
             above = ".".join(parts[:end])
             if above in changes:
                 raise ValueError(
-                    f"{where}: paths must not overlap, got {above!r} and {path!r}, "
-                    "which is part of it; make the second change in the first value."
+                    f"{where}: paths must not overlap, got {above!r} and {path!r}. "
+                    "Make the second change in the value of the first."
                 )
 
 
 def _with(tree: Any, path: str, value: Any) -> Any:
-    """A copy of `tree` with `value`, converted as its owner does, at `path`."""
+    """A copy of `tree` with `value` at `path`, converted as its owner would."""
     names, nodes = path.split("."), _nodes_along(tree, path)
     for parent, name in zip(nodes, names, strict=False):
         field = fields_of(parent).get(name)
         if field is not None and field.metadata.get("static", False):
             raise ValueError(
-                f"replace: {path!r} is part of the structure of "
-                f"{type(parent).__name__}, not a leaf; build it anew with another "
-                f"{name}."
+                f"replace: {path!r} must be a leaf, got {name}, which is part of the "
+                f"structure of {type(parent).__name__}. Construct a new one instead."
             )
     *_, parent, old = nodes
     if isinstance(parent, eqx.Module):
@@ -163,8 +173,8 @@ def _with(tree: Any, path: str, value: Any) -> Any:
 def _with_defaults(
     tree: Any, path: str, before: Any, changes: Mapping[str, Any]
 ) -> Any:
-    """A copy of `tree` in which the defaults that the node at `path` derived from a
-    changed part are derived from the new one."""
+    """A copy of `tree` with new defaults in the node at `path`, where these derive from
+    a part that changed."""
     node = get_path(tree, path)
     if type(node) is not type(before) or not hasattr(node, "__replaced__"):
         return tree
@@ -180,32 +190,32 @@ def _is_within(path: str, other: str) -> bool:
 
 
 def _owners(changes: Mapping[str, Any]) -> list[str]:
-    """The paths of all nodes above the changes, the deepest first."""
+    """The paths of all nodes above the changes, with the deepest first."""
     parts = [path.split(".") for path in changes]
     owners = {".".join(p[:end]) for p in parts for end in range(len(p))}
     return sorted(owners, key=lambda path: (-len(path.split(".")), not path, path))
 
 
 def _check(module: Any, before: Any) -> None:
-    """Run the checks of one owner of a change, which was `before`."""
+    """Run the checks of one module above a change; it was `before`."""
     error = _error_of(module)
     if error is None:
         return
     if type(before) is type(module) and _error_of(before) is not None:
-        # Its shapes are not those of one module, so it may be a batch.
+        # `before` is not a valid module either, so both may be batches.
         check_parameters(module)
         _check_members(module, before)
     elif isinstance(error, ValueError):
         raise error
     else:
         raise ValueError(
-            f"replace: {type(module).__name__} cannot work with these values: {error}"
+            f"replace: {type(module).__name__} does not accept these values: {error}"
         ) from error
 
 
 def _error_of(module: Any) -> Exception | None:
-    """The validation error of a module, if any. A batch from `jax.vmap` has one, as its
-    shapes are not those of one module."""
+    """The validation error of a module, if any. A batch from `jax.vmap` has one,
+    because its shapes are not those of one module."""
     try:
         if isinstance(module, eqx.Module):
             check_module(module)
@@ -214,8 +224,8 @@ def _error_of(module: Any) -> Exception | None:
 
 
 def _check_members(module: eqx.Module, before: eqx.Module) -> None:
-    """Run the checks of the members of a batch, as `before` was."""
-    # A batch of batches has members that are valid only in their own members.
+    """Run the checks of the members of a batch; it was `before`."""
+    # A member may be a batch itself, of which only the members are valid.
     valid = lambda m: _error_of(m) is None or any(map(valid, _members(m).values()))
     like = next(filter(valid, _members(before).values()), None)
     if like is None:  # not a batch, or a traced one
@@ -225,20 +235,20 @@ def _check_members(module: eqx.Module, before: eqx.Module) -> None:
         try:
             _check(member, like)
         except ValueError as error:
-            raise ValueError(f"{error} This is member {place} of a batch.") from error
+            raise ValueError(f"{error} It is member {place} of a batch.") from error
     count = len(jax.tree.leaves(eqx.filter(module, eqx.is_array))[0])
     if 0 < len(members) < count:
         warnings.warn(
-            f"replace: {type(module).__name__} is a batch of {count} members, of which "
-            f"{len(members)} were checked; all are in a batch of at most "
-            f"{_MOST_MEMBERS}.",
+            f"replace: {type(module).__name__} is a batch of {count} members, and only "
+            f"{len(members)} of them were checked. In a batch of up to "
+            f"{_MOST_MEMBERS}, all are.",
             stacklevel=2,
         )
 
 
 def _members(module: eqx.Module) -> dict[int, eqx.Module]:
-    """The members of a batch by their place, at most `_MOST_MEMBERS` of them; none if
-    the arrays of `module` share no leading axis or are traced."""
+    """Members of a batch by their place, at most `_MOST_MEMBERS`. There are none if the
+    arrays of `module` share no leading axis or are traced."""
     arrays, rest = eqx.partition(module, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
     lengths = {leaf.shape[:1] for leaf in leaves}
@@ -253,9 +263,9 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
 
 
 def _sampled(leaves: list[Any], count: int) -> np.ndarray:
-    """The members of a large batch to look at: those with the smallest or the largest
-    entry of an array, and others spread evenly."""
-    # A constraint breaks at an extreme first.
+    """The members of a large batch to check: those with the smallest or largest entry
+    of an array, because extremes violate a constraint first, and others spread evenly.
+    """
     half = _MOST_MEMBERS // 2
     flat = [np.asarray(a).reshape(count, -1) for a in leaves if eqx.is_inexact_array(a)]
     ends = [end for a in flat for end in (np.argmin(a, axis=0), np.argmax(a, axis=0))]

@@ -1,4 +1,4 @@
-"""Functions and classes by their names, `"module:qualified.name"`, and back."""
+"""The names of functions and classes, `"module:qualified.name"`, and their import."""
 
 import importlib
 import sys
@@ -10,8 +10,8 @@ import numpy as np
 
 _TRUSTED = ("delucax", "diffrax", "equinox", "lineax", "optax", "optimistix")
 
-# Of JAX and NumPy only what is meant for arrays: both hold helpers that read files or
-# run strings.
+# JAX and NumPy hold helpers that read files or run strings, so only their functions for
+# arrays are trusted.
 _JAX = (
     "jax.nn",
     "jax.numpy",
@@ -30,8 +30,8 @@ _JAX = (
 def qualified_name(thing: Any) -> str | None:
     """The importable name of `thing`; `None` if it has none.
 
-    A public name is preferred to the module that a thing is defined in, which a later
-    version of its library may move.
+    A public name is preferred, because a later version of a library may move the
+    private module in which a thing is defined.
     """
     module = getattr(thing, "__module__", None)
     name = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
@@ -41,8 +41,8 @@ def qualified_name(thing: Any) -> str | None:
     for place in places:
         if name and _look_up(place, name) is thing:
             return f"{place}:{name}"
-    # A constant of a module, or a lambda that a module gives a name. In a notebook or
-    # script, names come to mean other things.
+    # A constant of a module, or a lambda that a module binds to a name. Not in a
+    # notebook or script, where names may be bound again.
     for place in places if module != "__main__" else ():
         for name, value in list(vars(sys.modules.get(place, types)).items()):
             if value is thing:
@@ -53,7 +53,7 @@ def qualified_name(thing: Any) -> str | None:
 def import_named(name: str, trust: tuple[str, ...]) -> Any:
     """Import the function or class called `name`.
 
-    **Raises:** `ValueError` if its module is not trusted, or if there is no such thing.
+    **Raises:** `ValueError` if its module is not trusted, or if it does not exist.
     """
     module, _, path = name.partition(":")
     package = module.partition(".")[0]
@@ -61,7 +61,7 @@ def import_named(name: str, trust: tuple[str, ...]) -> Any:
     fail = lambda why: ValueError(f"it needs {name!r}, {why}")
     if not is_asked_for and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
         raise fail(
-            f"and {package!r} is not a package that is trusted; if you trust it, give "
+            f"and the package {package!r} is not trusted. If you trust it, pass "
             f"trust=({package!r},)."
         )
     try:
@@ -71,7 +71,7 @@ def import_named(name: str, trust: tuple[str, ...]) -> Any:
     thing = _look_up(module, path)
     if thing is None:
         hint = " Define it before you load." if package == "__main__" else ""
-        moved = "which is not there: it may have been renamed or moved since."
+        moved = "which does not exist: it may have been renamed or moved since."
         raise fail(f"{moved}{hint}")
     origin = getattr(thing, "__module__", None) or type(thing).__module__
     if package == "jax":
@@ -82,8 +82,8 @@ def import_named(name: str, trust: tuple[str, ...]) -> Any:
         others = _TRUSTED if package in _TRUSTED else ()
         fits = _is_in(origin, (*others, *trust, package))
     if not fits and not is_asked_for:
-        hint = f"if you trust it, give trust=({module!r},)."
-        raise fail(f"which is not among what is trusted; {hint}")
+        hint = f"If you trust it, pass trust=({module!r},)."
+        raise fail(f"which is not trusted. {hint}")
     return thing
 
 
@@ -100,10 +100,10 @@ def _candidate_modules(module: str) -> tuple[str, ...]:
 
 
 def _look_up(module: str, path: str) -> Any:
-    """The thing at `path` in a module that is imported; `None` if it is not there.
+    """The thing at `path` in an imported module; `None` if it does not exist.
 
-    A path goes on from a class, never from a module that another one imports, nor from
-    the inside of a function.
+    A path goes from a class to its members. It never goes into a module that another
+    one imports, nor into a function.
     """
     thing = sys.modules.get(module)
     for i, part in enumerate(path.split(".")):

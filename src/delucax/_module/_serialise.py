@@ -1,7 +1,7 @@
-"""Modules and trajectories in files, without pickle: names, numbers and structure.
+"""Modules and trajectories in files, without pickle.
 
-The file is three parts: a line with the format, its version and a SHA-256 of the rest;
-a line of JSON that describes the structure; and the bytes of the arrays.
+A file has three parts: a line with the format, its version and a SHA-256 of the rest; a
+line of JSON that describes the structure; and the bytes of the arrays.
 """
 
 import dataclasses
@@ -38,19 +38,19 @@ _PARTIALS: dict[str, Any] = {
 
 
 def save(path: str | os.PathLike, obj: Any) -> None:
-    """Write a module, a trajectory, or any pytree of them, to a file.
+    """Save a module, a trajectory, or any pytree of these to a file.
 
-    What is written is the class of every module by its name, its fields, and the bytes
-    of its arrays; functions are written by name. The file appears whole or not at all.
+    The file holds the name of the class of every module, its fields, and the bytes of
+    its arrays. Functions are saved by name. If writing fails, no partial file is left.
 
     **Arguments:**
 
     - `path`: the file to write.
-    - `obj`: a module, trajectory, array, number, string, or a tuple, list or dictionary
-        of such.
+    - `obj`: a module, trajectory, array, number or string, or a tuple, list or
+        dictionary of these.
 
-    **Raises:** `ValueError` naming the place of a thing that has no name to find it by,
-    such as a lambda; `OSError` if the file cannot be written.
+    **Raises:** `ValueError` if something has no name, such as a lambda; the message
+    says where it is. `OSError` if the file cannot be written.
 
     !!! example
 
@@ -60,6 +60,11 @@ def save(path: str | os.PathLike, obj: Any) -> None:
 
         dlx.save("controller.dlx", dlx.controllers.Linear(jnp.ones((1, 2))))
         controller = dlx.load("controller.dlx")
+        controller(0.0, jnp.array([1.0, 2.0]), None)
+        ```
+
+        ```text
+        (Array([-3.], dtype=float32), None)
         ```
     """
     path = _file(path, "save")
@@ -78,27 +83,27 @@ def save(path: str | os.PathLike, obj: Any) -> None:
 
 
 def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
-    """Read what [`delucax.save`][] wrote.
+    """Load what [`delucax.save`][] wrote.
 
-    Nothing in the file is run: classes and functions are looked up by name, and only in
-    packages that are trusted. What was loaded calls the functions that the file names,
-    so only load files from sources that you trust.
+    Loading runs no code from the file: classes and functions are looked up by name, and
+    only in trusted packages. But the loaded object calls the functions that the file
+    names. Only load files from sources that you trust.
 
     **Arguments:**
 
     - `path`: the file to read.
-    - `trust`: packages or modules whose classes and functions the file may name,
-        besides delucax, Diffrax, Equinox, Lineax, Optax and Optimistix, the public
-        functions of JAX and NumPy, and what you defined yourself in the running
-        notebook or script; none by default.
+    - `trust`: names of more packages or modules whose classes and functions the file
+        may use; none by default. Always trusted are delucax, Diffrax, Equinox, Lineax,
+        Optax, Optimistix, the public functions of JAX and NumPy, and what you defined
+        in the running notebook or script.
 
-    **Returns:** the object, of the same structure: a function compiled for the one that
-    was saved does not compile again. Arrays in double precision are narrowed, with a
-    warning, where JAX is in single precision.
+    **Returns:** the object, with the same structure. A function that was compiled for
+    the saved object does not compile again. If JAX is in single precision, arrays in
+    double precision are rounded, with a warning.
 
-    **Raises:** `ValueError` if the file is damaged, foreign or of a newer version, or
-    names what is not trusted, not there, or no longer has the same fields; `OSError` if
-    it cannot be read.
+    **Raises:** `ValueError` if the file is damaged, not from delucax or from a newer
+    version, or if it names something that is not trusted, does not exist or has other
+    fields now. `OSError` if it cannot be read.
 
     !!! example
 
@@ -107,6 +112,11 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
 
         dlx.save("pendulum.dlx", dlx.make("pendulum"))
         env = dlx.load("pendulum.dlx")
+        env.horizon
+        ```
+
+        ```text
+        200
         ```
     """
     path = _file(path, "load")
@@ -125,8 +135,8 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
         raise ValueError(f"load: '{path}' cannot be used: {error}") from error
     if reader.narrowed:
         warnings.warn(
-            f"load: '{path}' holds arrays in double precision, which are read in "
-            "single precision; set jax_enable_x64 to keep them.",
+            f"load: '{path}' holds arrays in double precision, which were rounded to "
+            "single precision. Set jax_enable_x64 to keep their precision.",
             stacklevel=2,
         )
     return obj
@@ -136,7 +146,7 @@ def _file(path: Any, where: str) -> Path:
     path = as_path(path, "path", where)
     if path.is_dir():
         raise ValueError(
-            f"{where}: path must be that of a file, got the folder '{path}'."
+            f"{where}: path must be the path of a file, got the folder '{path}'."
         )
     return path
 
@@ -151,13 +161,13 @@ def _checked(path: Path) -> tuple[bytes, bytes]:
     is_ours = len(words) == 3 and words[0] == _MAGIC and words[1].isdecimal()
     if not is_ours or int(words[1]) < 1:
         raise ValueError(
-            f"load: '{path}' is not a file that delucax.save wrote, or its beginning "
-            "is damaged."
+            f"load: '{path}' must be a file from delucax.save; it is not, or its "
+            "beginning is damaged."
         )
     if int(words[1]) > _VERSION:
         raise ValueError(
-            f"load: '{path}' has format {words[1]}, newer than the {_VERSION} that "
-            "this version of delucax reads; update delucax."
+            f"load: '{path}' has format {words[1]}, but this version of delucax reads "
+            f"formats up to {_VERSION}. Update delucax."
         )
     if hashlib.sha256(body).hexdigest() != words[2]:
         raise ValueError(f"load: '{path}' is damaged: its checksum does not match.")
@@ -178,8 +188,8 @@ def _split(payload: bytes, descriptions: list[dict[str, Any]]) -> list[np.ndarra
 class _Writer:
     """Describes a tree in JSON, and collects its arrays.
 
-    What is neither a number, a string nor `None` is a dictionary, whose first key is
-    its kind.
+    Numbers, strings and `None` stand for themselves. Anything else is a dictionary,
+    whose first key is its kind.
     """
 
     def __init__(self):
@@ -195,7 +205,7 @@ class _Writer:
             return {kind.__name__: repr(node)}
         if isinstance(node, Tracer):
             raise ValueError(
-                f"save: {path} is being traced; save outside of jit, grad and vmap."
+                f"save: {path} is traced by JAX. Save outside of jit, grad and vmap."
             )
         if isinstance(node, jax.Array | np.ndarray | np.generic):
             return self.array(node, path)
@@ -246,21 +256,21 @@ class _Writer:
         name = qualified_name(thing)
         if name is not None:
             return name
-        remedy = "Hold numbers, strings, arrays, modules, or functions by name."
+        remedy = "Use numbers, strings, arrays, modules, or functions with a name."
         if isinstance(thing, type):
             remedy = "Define the class at the top level of a module."
         elif callable(thing):
             remedy = (
-                "In place of a lambda, or a function made inside another, use one that "
-                "is defined at the top level of a module, or an eqx.Module with a "
-                "`__call__`."
+                "Use a function that is defined at the top level of a module, or an "
+                "eqx.Module with a `__call__`, not a lambda or a function inside of "
+                "another."
             )
         raise ValueError(
-            f"save: {path} is {thing!r}, which has no name to find it by. {remedy}"
+            f"save: {path} must have a name to import it by, got {thing!r}. {remedy}"
         )
 
     def result(self, node: Any, path: str) -> dict[str, Any]:
-        """An outcome, by the names of its items: their numbers differ by version."""
+        """A result, by the names of its items, because their numbers may change."""
         enumeration, (value,) = node._enumeration, jax.tree.leaves(node)
         names = {_number(item): n for n, item in enumeration._name_to_item.items()}
         return {
@@ -276,8 +286,8 @@ class _Writer:
             again = getattr(owner, name, None)
             if getattr(again, "__func__", None) is not held["__func__"]:
                 raise ValueError(
-                    f"save: {path} is the method {name!r} of {type(owner).__name__}, "
-                    "which does not have it under that name."
+                    f"save: {path} is a method with the name {name!r}, but "
+                    f"{type(owner).__name__} has another one under this name."
                 )
             return {"method": name, "of": self.describe(owner, f"{path}.__self__")}
         names = [field.name for field in dataclasses.fields(node)]
@@ -288,9 +298,9 @@ class _Writer:
 
 
 class _Reader:
-    """Builds the tree that was described.
+    """Builds a tree from its description.
 
-    `build_KIND` takes what is under the key of that kind, and the whole description.
+    `build_KIND` takes the value of the key KIND, and the whole description.
     """
 
     def __init__(self, arrays: list[np.ndarray], trust: tuple[str, ...]):
@@ -313,8 +323,8 @@ class _Reader:
         return jax.device_put(self.fitted(self.arrays[content]))
 
     def build_weak(self, content, node):
-        # A weak type has the precision that is current, and is kept by what is written
-        # into a weakly typed array.
+        # A weak type takes the current precision. Setting entries of a weakly typed
+        # array keeps its type.
         array = self.arrays[content]
         if array.ndim == 0:
             return jax.device_put(array.item())
@@ -359,7 +369,7 @@ class _Reader:
     def build_method(self, content, node):
         method = getattr(self.build(node["of"]), content, None)
         if not hasattr(method, "__func__"):
-            raise ValueError(f"it needs the method {content!r}, which is not there.")
+            raise ValueError(f"it needs the method {content!r}, which does not exist.")
         return method
 
     def build_partial(self, content, node):
@@ -377,16 +387,16 @@ class _Reader:
     def class_of(self, name: str, base: type, what: str) -> Any:
         cls = import_named(name, self.trust)
         if not (isinstance(cls, type) and issubclass(cls, base)):
-            raise ValueError(f"it needs a {what}, and {name!r} is not one.")
+            raise ValueError(f"it needs a {what}, but {name!r} is none.")
         return cls
 
     def fitted(self, array: np.ndarray) -> np.ndarray:
-        """`array` in the precision that JAX has switched on."""
+        """`array` in the precision of JAX's current setting."""
         narrow = array.astype(jax.dtypes.canonicalize_dtype(array.dtype), copy=False)
         is_whole = array.dtype.kind in "iu"
         if is_whole and not np.array_equal(narrow, array):
             raise ValueError(
-                "it holds whole numbers that need 64 bits; set jax_enable_x64."
+                "it holds whole numbers that need 64 bits. Set jax_enable_x64."
             )
         self.narrowed |= not is_whole and narrow.dtype != array.dtype
         return narrow
@@ -400,6 +410,6 @@ def _number(item: Any) -> int:
 def _check_fields(name: str, known: list[str], written: list[str]) -> None:
     if known != written:
         raise ValueError(
-            f"{name!r} has changed since it was written: its fields are {known}, those "
-            f"of the file {written}."
+            f"{name!r} has changed since it was saved: it has the fields {known}, and "
+            f"the file has {written}."
         )

@@ -1,4 +1,4 @@
-"""Several modules of one structure as one, and apart again."""
+"""Stacks of modules that have the same structure."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -11,9 +11,12 @@ from jax.core import Tracer
 
 
 def stack(trees: Iterable[Any]) -> Any:
-    """Modules of one structure as one, each array with a leading axis over them.
+    """Stack modules of the same structure into one. Each array gets a leading axis over
+    the modules, for `jax.vmap`.
 
-    **Arguments:** `trees`: the modules.
+    **Arguments:**
+
+    - `trees`: the modules, at least one.
 
     **Returns:** the stacked module.
 
@@ -32,7 +35,7 @@ def stack(trees: Iterable[Any]) -> Any:
         raise ValueError("stack: trees must not be empty.")
     structures = {jax.tree.structure(eqx.filter(tree, eqx.is_array)) for tree in trees}
     if len(structures) > 1:
-        raise ValueError("stack: trees must be of one structure.")
+        raise ValueError("stack: trees must have the same structure.")
 
     def together(*leaves):
         if not eqx.is_array(leaves[0]):
@@ -45,9 +48,11 @@ def stack(trees: Iterable[Any]) -> Any:
 
 
 def unstack(tree: Any) -> list[Any]:
-    """The modules that [`delucax.lung.stack`][] made one of.
+    """Take a stack from [`delucax.lung.stack`][] apart.
 
-    **Arguments:** `tree`: the stacked module.
+    **Arguments:**
+
+    - `tree`: the stacked module.
 
     **Returns:** a list of modules.
 
@@ -65,7 +70,7 @@ def unstack(tree: Any) -> list[Any]:
 
 
 def taken(tree: Any, index: Any) -> Any:
-    """The stacked modules at an index."""
+    """The stacked modules at an index or a slice."""
     is_array = lambda a: eqx.is_array(a) or isinstance(a, np.ndarray)
     at = lambda a: jnp.asarray(a[index]) if is_array(a) else a
     return jax.tree.map(at, tree)
@@ -77,6 +82,6 @@ def count_of(tree: Any) -> int:
 
 
 def _is_plain(leaf: Any) -> bool:
-    """Whether NumPy can stack and slice it, which compiles nothing for each shape."""
+    """Whether NumPy can stack and slice it, without compiling a program per shape."""
     is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     return not isinstance(leaf, Tracer) and not is_key
