@@ -33,7 +33,7 @@ DOORS = {
 @pytest.mark.parametrize("table", [TABLE, TABLE["x"]], ids=["table", "column"])
 def test_a_table_is_refused_in_a_line(name, table):
     kind = type(table).__name__
-    match = rf"{name} must .*got a {kind}; `.to_numpy\(\)`"
+    match = rf"{name} must .*got a {kind} \(`.to_numpy\(\)`"
     with as_a_user(), pytest.raises(ValueError, match=match) as raised:
         DOORS[name](table)
     assert len(str(raised.value)) < 300

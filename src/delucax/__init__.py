@@ -1,7 +1,7 @@
 """Differentiable control in continuous time.
 
-Write `dx/dt = f(t, x, u, w)` as a module, let Diffrax integrate it, close the loop with
-a controller, and differentiate, `vmap` or `jit` the whole.
+Write a system `dx/dt = f(t, x, u, w)` as a module, let Diffrax integrate it, and close
+the loop with a controller. You can differentiate, `vmap` and `jit` the whole loop.
 """
 
 from importlib import import_module as _import_module
@@ -103,7 +103,8 @@ _name, _names = _lazily(
 
 
 def __getattr__(name: str):
-    """Packages and names, imported at first use: the command line needs few."""
+    """Packages and names, imported at first use, so that the command line starts
+    quickly."""
     if name == "__version__":
         from importlib.metadata import version
 

@@ -1,7 +1,7 @@
 """Checks of arguments.
 
-A function `as_...` converts and checks, one `check_...` checks alone. Both raise a
-`ValueError` that names the argument and what was expected.
+A function `as_...` converts and checks; a function `check_...` only checks. Both raise
+a `ValueError` that names the argument, what was expected, and what was given.
 """
 
 import functools
@@ -29,17 +29,17 @@ Shape = tuple[int, ...]
 
 
 def is_concrete(x: Any) -> bool:
-    """Whether `x` has a value now, and is not being traced."""
+    """Whether `x` has a value now, that is, whether it is not traced."""
     return not isinstance(x, Tracer)
 
 
 _HOW_TO_GET = {
     "AbstractCost": " (wrap a function with `delucax.costs.Function`)",
     "AbstractPlanner": " (such as `delucax.planning.ILQR()`)",
-    "AbstractDynamics": " (discretise a system with `delucax.Discretized`; of an "
-    "environment give its `dynamics`)",
-    "AbstractSystem": " (wrap a function with `delucax.system`; of an environment give "
-    "its `dynamics.system`)",
+    "AbstractDynamics": " (discretise a system with `delucax.Discretized`; for an "
+    "environment pass its `dynamics`)",
+    "AbstractSystem": " (wrap a function with `delucax.system`; for an environment "
+    "pass its `dynamics.system`)",
     "LinearSystem": " (`delucax.linearize` makes one)",
 }
 
@@ -47,8 +47,8 @@ _HOW_TO_GET = {
 def check_instance(
     value: Any, kind: type, name: str, where: str, hint: str | None = None
 ) -> None:
-    """Raise unless `isinstance(value, kind)`. `hint` replaces the default hint of the
-    message, which says how to make one."""
+    """Raise unless `value` is an instance of `kind`. The message says how to make one,
+    by `hint` if it is given."""
     if not isinstance(value, kind):
         called = kind.__name__
         article = "an" if called[0] in "AEIOU" else "a"
@@ -60,7 +60,7 @@ def check_instance(
 
 
 def check_key(key: Any, where: str) -> Any:
-    """`key`, if it is one random key."""
+    """`key`, or an error unless it is one random key."""
     if eqx.is_array(key):
         if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
             return key
@@ -82,7 +82,8 @@ def _error(value: Any, name: str, where: str, rule: str) -> ValueError:
 def _as_array(
     value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
 ) -> Array:
-    """`value` as a floating-point array whose shape fits, as `rule` says."""
+    """`value` as a floating-point array, or an error unless its shape `fits`. `rule`
+    describes the shape in the message."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or not fits(array.shape):
         if not eqx.is_array(array):
@@ -102,8 +103,9 @@ def as_vector(value: Any, size: int, name: str, where: str) -> Array:
 def as_entries(
     value: Any, size: int | None, name: str, where: str, each: str = "entry"
 ) -> Array:
-    """`value`, a number for all or a vector with one for `each`, as a floating-point
-    array. The vector has `size` entries; any number of them if that is `None`."""
+    """`value` as a floating-point array: one number for all, or a vector with an entry
+    for `each`. The vector has `size` entries, or any number of them if `size` is
+    `None`."""
     rule = f"be a number or have shape ({size},)"
     if size is None:
         rule = f"be a number or a vector with an entry for each {each}"
@@ -111,12 +113,13 @@ def as_entries(
 
 
 def _fits(size: int | None) -> Callable[[Shape], bool]:
-    """Whether a shape is that of a number, or of a vector of `size`, if it is given."""
+    """A test of whether a shape is that of a number or of a vector. If `size` is given,
+    the vector must have this size."""
     return lambda shape: len(shape) <= 1 and (size is None or shape in ((), (size,)))
 
 
 def check_real(array: Array, name: str, where: str) -> None:
-    """Raise if an array is complex: its imaginary part would be lost on the way."""
+    """Raise if an array is complex, because its imaginary part would be lost later."""
     if jnp.iscomplexobj(array):
         raise ValueError(f"{where}: {name} must be real, got dtype {array.dtype}.")
 
@@ -130,7 +133,7 @@ def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
 def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     """`value` as a symmetric matrix of finite entries, or a stack of them (`ndim=3`).
 
-    An asymmetry of the size of rounding is averaged away.
+    An asymmetry by rounding is averaged out.
     """
     matrix = as_matrix(value, name, where, ndim=ndim)
     if matrix.shape[-2] != matrix.shape[-1]:
@@ -150,7 +153,8 @@ def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Arr
 def as_bounds(
     value: Any, where: str, name: str = "bounds", size: int | None = None
 ) -> Bounds | None:
-    """`value` as `(low, high)`, each a number or a vector (of `size`, if given)."""
+    """`value` as `(low, high)`, each a number or a vector (of `size`, if that is
+    given)."""
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
@@ -162,7 +166,7 @@ def as_bounds(
             _as_array(end, name, where, rule, fits)
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
-        raise _error(value, name, where, "be numbers or vectors of one size")
+        raise _error(value, name, where, "be numbers or vectors of the same size")
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):
             raise ValueError(
@@ -177,15 +181,15 @@ def check_control_bounds(value: Any, size: int, where: str) -> Bounds | None:
     for end in bounds or ():
         if end.shape not in ((), (size,)):
             raise ValueError(
-                f"{where}: bounds must be numbers or vectors of {size} entries, one "
-                f"for each control, got shape {end.shape}."
+                f"{where}: bounds must be numbers or have shape ({size},), with an "
+                f"entry for each control, got shape {end.shape}."
             )
     return bounds
 
 
 def bounds_field(where: str, name: str = "bounds", **options: Any) -> Any:
-    """A field that holds `(low, high)`, converted and checked by `as_bounds`; `options`
-    are those of a field."""
+    """A field that holds `(low, high)`, converted and checked by `as_bounds`. `options`
+    go to `eqx.field`."""
     converter = functools.partial(as_bounds, where=where, name=name)
     return eqx.field(converter=converter, **options)
 
@@ -198,17 +202,17 @@ def check_finite(array: Any, name: str, where: str) -> None:
 
 
 def number_at(tree: Any, path: str, kind: str, within: str, where: str) -> Array:
-    """The finite number or array at a path that an argument names."""
+    """The finite number or array at a path; `kind` is the argument that names it."""
     try:
         value = get_path(tree, path)
     except ValueError as error:
         raise ValueError(f"{where}: {kind}: {error}") from error
     if not eqx.is_inexact_array(value):
         raise ValueError(
-            f"{where}: {kind} names {path!r}, which must have a number in the {within} "
-            f"to start from, got {shortened(value)}."
+            f"{where}: {kind} names {path!r}, whose start value in the {within} must "
+            f"be a number, got {shortened(value)}."
         )
-    check_finite(value, f"{kind}[{path!r}] (to start from)", where)
+    check_finite(value, f"{kind}[{path!r}] (the start value)", where)
     return value
 
 
@@ -240,15 +244,15 @@ def check_step(dt: Any, where: str, name: str = "dt") -> None:
 def check_number(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is a finite real scalar; traced values are not inspected."""
     if isinstance(value, int | float) and np.isfinite(value):
-        return  # without an array of JAX, which takes 0.1 ms
+        return  # quickly, because to make a JAX array takes 0.1 ms
     array = _as_array(value, name, where, "be a number", lambda shape: shape == ())
     check_real(array, name, where)
     check_finite(array, name, where)
 
 
 def as_number(value: Any, name: str, where: str) -> Any:
-    """`value` as a scalar: a Python number if it is concrete, so that it stays concrete
-    while other things are traced."""
+    """`value` as a scalar. A concrete value becomes a Python number, so that it stays
+    concrete while other things are traced."""
     if isinstance(value, Tracer):
         return _as_array(value, name, where, "be a number", lambda shape: shape == ())
     number = np.asarray(value)
@@ -283,7 +287,7 @@ def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) ->
 
 
 def check_bool(value: Any, name: str, where: str) -> bool:
-    """`value` as a bool, if it is True or False."""
+    """`value` as a bool, or an error unless it is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise _error(value, name, where, "be True or False")
     return bool(value)
@@ -300,7 +304,7 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
 def check_at_most(
     value: int, most: int, name: str, where: str, of: str | None = None
 ) -> None:
-    """Raise if a count exceeds `most`, which is the number `of` something."""
+    """Raise if a count exceeds `most`, the number of the things that `of` names."""
     if value > most:
         limit = most if of is None else f"the {most} {of}"
         raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")
@@ -309,8 +313,8 @@ def check_at_most(
 def as_rows(
     value: Any, size: int, name: str, where: str, steps: int | None = None
 ) -> Array:
-    """`value` as a real array of shape `(steps, size)`; `steps` is any number if it is
-    `None`."""
+    """`value` as a real array of shape `(steps, size)`, with any number of steps if
+    `steps` is `None`."""
     rows = "steps" if steps is None else steps
     rule = f"have shape ({rows}, {size}), a row for each step"
     fits = lambda s: len(s) == 2 and s[1] == size and steps in (None, s[0])
@@ -341,7 +345,7 @@ def check_keywords(
 
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-"""Replaces an infinite bound of a space, as Gymnasium advises."""
+"""The stand-in for an infinite bound of a space, as Gymnasium advises."""
 
 
 def check_vector(value: Any, name: str, where: str) -> None:
@@ -351,14 +355,14 @@ def check_vector(value: Any, name: str, where: str) -> None:
 
 
 def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
-    """Raise unless `R`, where it is concrete, is positive definite or, if not
-    `definite`, semidefinite."""
+    """Raise unless `R` is positive definite, or semidefinite if `definite` is false.
+    Traced matrices are skipped."""
     if not is_concrete(R):
         return
     array = np.asarray(R)
     least, *_ = eigenvalues = np.linalg.eigvalsh(array)
-    # Eigenvalues of a symmetric matrix are off by a few eps times the largest (Weyl). A
-    # semidefinite matrix made as a product C'C is off by more, the more rows it has.
+    # The computed eigenvalues of a symmetric matrix are off by a few eps times the
+    # largest (Weyl). For a semidefinite product C'C the error grows with its rows.
     rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
     slack = -rounding if definite else 100 * len(array) * rounding
     if least < -slack or definite and least <= 0:
@@ -372,8 +376,8 @@ def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
 def as_finite(
     value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
 ) -> Array:
-    """`value` as a floating-point array of finite entries whose shape fits, as the
-    `rule` says, or an error."""
+    """`value` as a floating-point array of finite entries, or an error unless its shape
+    `fits`. `rule` describes the shape in the message."""
     array = _as_array(value, name, where, rule, fits)
     check_finite(array, name, where)
     return array
@@ -389,7 +393,7 @@ def finite_vector(value: Any, size: int, name: str, where: str) -> Array:
 def finite_rows(
     value: Any, size: int, name: str, where: str, steps: int | None = None
 ) -> Array:
-    """`value` as `as_rows` has it, with finite entries, or an error."""
+    """`value` by `as_rows`, or an error unless its entries are finite."""
     rows = as_rows(value, size, name, where, steps)
     check_finite(rows, name, where)
     return rows

@@ -14,8 +14,8 @@ from ._typing import Array
 
 
 def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
-    """The shapes of what `function` returns for arrays of `shapes`, traced once for all
-    functions that differ in the values of their arrays alone."""
+    """The shapes of what `function` returns for arrays of `shapes`. Functions that only
+    differ in the values of their arrays are traced once."""
     dtype = jnp.result_type(float)
     inputs = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     leaves, structure = jax.tree.flatten(function)
@@ -35,24 +35,24 @@ def _traced(structure: Any, arrays: Any, inputs: Any) -> Any:
 
 
 def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
-    """Raise unless `cost` takes states and controls of these `sizes`."""
+    """Raise unless `cost` accepts states and controls of these `sizes`."""
     n, m = sizes
     try:
         output_of(cost, (), (n,), (m,))
         output_of(cost.final, (), (n,))
-    except jax.errors.JAXTypeError:  # not traceable: it still works outside of jit
+    except jax.errors.JAXTypeError:  # not traceable, but it works outside of jit
         return
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"{where}: {name} does not fit a state of size {n} and a control of size "
-            f"{m}: {error}"
+            f"{where}: {name} must fit a state of size {n} and a control of size {m}, "
+            f"but calling it failed: {error}"
         ) from error
 
 
 def checked_names(
     names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
 ) -> tuple[str, ...]:
-    """`names` as a tuple of `size`; indexed names if there are none."""
+    """`names` as a tuple of `size` names; indexed names if there are none."""
     if names is None:
         return indexed_names(letter, size)
     if isinstance(names, str) or len(names) != size:
@@ -63,7 +63,7 @@ def checked_names(
 def check_matrices(
     A: Any, B: Any, C: Any, E: Any, where: str
 ) -> tuple[Array, Array, Any, Any]:
-    """`A`, `B`, `C`, `E` as matrices whose shapes fit."""
+    """`A`, `B`, `C`, `E` as matrices, or an error unless their shapes fit."""
     A = as_matrix(A, "A", where)
     n = A.shape[0]
     if A.shape != (n, n) or n == 0:
@@ -90,7 +90,7 @@ def check_time_invariant(model: Any, name: str, where: str) -> None:
     if model.is_time_varying:
         raise ValueError(
             f"{where}: {name} must be time-invariant, got matrices at {len(model.A)} "
-            "times; `dynamics.at(t)` are those at one time."
+            "times. Use `dynamics.at(t)` for those at one time."
         )
 
 
@@ -103,8 +103,8 @@ def state_network(
     key: Any,
     where: str,
 ) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
-    """The names of states and controls, and a network of both with as many outputs as
-    there are states."""
+    """The names of the states and of the controls, and a network from both to as many
+    outputs as there are states."""
     check_key(key, where)
     names = names_of(states, "x", "states", where)
     inputs = names_of(controls, "u", "controls", where)

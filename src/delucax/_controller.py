@@ -1,4 +1,5 @@
-"""The protocols of controllers, the counter of incidents, and how to call both."""
+"""The protocols of controllers, the counter of incidents, and functions that call
+them."""
 
 import abc
 from collections.abc import Callable
@@ -18,20 +19,30 @@ from ._typing import PRNGKey, RealScalar
 
 
 class AbstractController(eqx.Module):
-    """A feedback law with a state of its own.
+    r"""A controller: a feedback law with a state.
 
-    [`delucax.rollout`][] makes the calls, in this order at each step: `__call__` acts
-    on the observation; the environment saturates and steps; `applied` gets the control
-    that was really applied, and its cost. Trained weights are fields; what is learned
-    or remembered along the way lives in the state, a pytree of arrays.
+    $$(u_k, s_{k+1}) = \pi(t_k, y_k, s_k)$$
 
-    A controller that draws at each step keeps a random key in its state: `init` puts
-    it there, and each call splits it. A wrapper gives each part a key of its own.
+    Subclass it and write `__call__`. Trained weights are fields. What the controller
+    learns or remembers during an episode is its state $s$, a pytree of arrays, which
+    starts with `init`.
+
+    At each step [`delucax.rollout`][] makes these calls: `__call__` acts on the
+    observation; the environment clips the control and steps; `applied` gets the clipped
+    control and its cost.
+
+    A controller that draws random numbers at each step keeps a random key in its state.
+    `init` puts it there, and each call splits it. A wrapper gives each part its own
+    key.
+
+    **Raises:** `ValueError` at construction if a [`delucax.parameter`][] or
+    [`delucax.weight`][] is not finite or violates its constraint.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
         from jaxtyping import Array
 
         class Damper(dlx.AbstractController):
@@ -40,16 +51,19 @@ class AbstractController(eqx.Module):
             def __call__(self, t, y, state):
                 return -self.gain * y[1:], state
 
-        import jax
-        env = dlx.make("pendulum")
-        dlx.rollout(env, Damper(), key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        Damper()(0.0, jnp.array([0.1, 2.0]), None)
         ```
 
-    !!! example "One that draws"
+        ```text
+        (Array([-2.], dtype=float32), None)
+        ```
+
+    !!! example "A controller that draws random numbers"
 
         ```python
         import delucax as dlx
         import jax
+        import jax.numpy as jnp
 
         class Dither(dlx.AbstractController):
             def init(self, *, key=None):
@@ -59,8 +73,13 @@ class AbstractController(eqx.Module):
                 state, now = jax.random.split(state)
                 return jax.random.normal(now, (1,), y.dtype), state
 
-        env = dlx.make("pendulum")
-        dlx.rollout(env, Dither(), key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        state = Dither().init(key=jax.random.key(0))
+        u, state = Dither()(0.0, jnp.zeros(2), state)
+        u.shape
+        ```
+
+        ```text
+        (1,)
         ```
     """
 
@@ -68,9 +87,10 @@ class AbstractController(eqx.Module):
         check_parameters(self)
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
-        """The state at the start of an episode; none by default.
+        """The state at the start of an episode; `None` by default.
 
-        **Arguments:** `key`: a random key, for controllers that draw.
+        **Arguments:** `key`: a random key for controllers that draw random numbers, or
+            `None`.
 
         **Returns:** a pytree of arrays.
         """
@@ -84,20 +104,20 @@ class AbstractController(eqx.Module):
         **Arguments:**
 
         - `t`: time, a scalar.
-        - `y`: observation, a vector.
+        - `y`: observation, shape `(p,)`.
         - `state`: the controller's state.
 
-        **Returns:** `(u, state)`, `u` a vector of the control's size.
+        **Returns:** `(u, state)`: the control, shape `(m,)`, and the new state.
         """
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
-        """The state after the step, given the saturated control and its cost; by
-        default the state as it is.
+        """The state after a step, given the control that was applied and its cost; by
+        default the state unchanged.
 
         **Arguments:**
 
-        - `u`: the control that was applied.
-        - `cost`: its stage cost.
+        - `u`: the control after clipping, shape `(m,)`.
+        - `cost`: its stage cost, a scalar.
         - `state`: the controller's state.
 
         **Returns:** the new state.
@@ -107,16 +127,17 @@ class AbstractController(eqx.Module):
 
     @property
     def learns_from_cost(self) -> bool:
-        """Whether `applied` learns from the cost, which [`delucax.simulate`][] does not
-        know; by default whether a controller among its fields does."""
+        """Whether `applied` learns from the cost; by default, whether a controller
+        among the fields does. [`delucax.simulate`][] has no cost and refuses such a
+        controller."""
         return any(p.learns_from_cost for p in parts_of(self, AbstractController))
 
 
 class AbstractLearner(AbstractController):
-    """A controller that learns online from a counterfactual loss.
+    """A controller that learns online, with a counterfactual loss of its policy.
 
-    `loss` and `fresh` are for meta-controllers such as
-    [`delucax.controllers.Adaptive`][]; [`delucax.rollout`][] does not call them.
+    Meta-controllers such as [`delucax.controllers.Adaptive`][] call `loss` and `fresh`;
+    [`delucax.rollout`][] does not.
 
     !!! example
 
@@ -139,20 +160,24 @@ class AbstractLearner(AbstractController):
 
         ScaledGuess().loss(0.0, jnp.ones(()))
         ```
+
+        ```text
+        Array(1., dtype=float32)
+        ```
     """
 
     @abc.abstractmethod
     def loss(self, t: RealScalar, state: PyTree) -> Array:
-        """The counterfactual loss of the policy held in `state`.
+        """The counterfactual loss of the policy in `state`.
 
-        **Arguments:** `t`: time. `state`: the learner's state.
+        **Arguments:** `t`: time, a scalar. `state`: the learner's state.
 
         **Returns:** a scalar.
         """
 
     @abc.abstractmethod
     def fresh(self, state: PyTree, key: PRNGKey | None) -> PyTree:
-        """A state that shares what `state` has observed, but has learned nothing.
+        """A state with the observations of `state`, which has learned nothing yet.
 
         **Arguments:** `state`: the learner's state. `key`: a random key, or `None`.
 
@@ -190,16 +215,20 @@ class AbstractStochasticPolicy(AbstractController):
 
         Coin().log_prob(0.0, jnp.zeros(2), None, jnp.ones(1))
         ```
+
+        ```text
+        Array(-0.693, dtype=float32)
+        ```
     """
 
     @abc.abstractmethod
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
-        """The log-probability with which `__call__(t, y, state)` gives `u`.
+        """The log-probability (density) with which `__call__(t, y, state)` returns `u`.
 
         **Arguments:**
 
         - `t`: time, a scalar.
-        - `y`: observation, a vector.
+        - `y`: observation, shape `(p,)`.
         - `state`: the controller's state, before the call.
         - `u`: a control, shape `(m,)`.
 
@@ -207,16 +236,16 @@ class AbstractStochasticPolicy(AbstractController):
         """
 
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array | None:
-        """The entropy of the draw.
+        """The entropy of the control's distribution.
 
         **Arguments:**
 
         - `t`: time, a scalar.
-        - `y`: observation, a vector.
+        - `y`: observation, shape `(p,)`.
         - `state`: the controller's state, before the call.
 
-        **Returns:** a scalar; or `None` (the default) where there is no closed form.
-        Callers then take `-log_prob` of the control that was drawn.
+        **Returns:** a scalar; or `None` (the default) if there is no closed form.
+        Callers then use `-log_prob` of the drawn control.
         """
         del t, y, state
         return None
@@ -228,16 +257,20 @@ class AbstractStochasticPolicy(AbstractController):
 
 
 class Tally(eqx.Module):
-    """How often something went wrong in a controller, kept in the controller's state.
+    """A counter of incidents in a controller, such as failed plans. Keep it in the
+    controller's state.
 
-    [`delucax.rollout`][] reads every tally in the state, however deep, after each step:
-    the steps at which one rose are in `trajectory.incidents`. Wrappers need not forward
-    them.
+    After each step, [`delucax.rollout`][] looks for all tallies in the state. The steps
+    at which a count rose are in `trajectory.incidents`. Wrappers of controllers need
+    not forward tallies.
+
+    **Arguments:**
+
+    - `name`: what is counted, in the singular, such as `"failed_plan"`.
 
     **Attributes:**
 
-    - `name`: what is counted, in the singular, such as `"failed_plan"`.
-    - `count`: a whole number, 0 at first.
+    - `count`: an integer scalar, 0 at first.
 
     **Raises:** `ValueError` for the name `"clipped_control"`, which a rollout counts
     itself.
@@ -277,9 +310,9 @@ class Tally(eqx.Module):
         return f"Tally({self.name!r}, count={shortened(self.count)})"
 
     def add(self, happened: Array) -> "Tally":
-        """The tally, one higher if something happened.
+        """The tally, one higher if an incident happened.
 
-        **Arguments:** `happened`: a boolean.
+        **Arguments:** `happened`: a boolean scalar.
 
         **Returns:** the new tally.
         """
@@ -287,7 +320,7 @@ class Tally(eqx.Module):
 
 
 def initial_state(controller: AbstractController, key: PRNGKey | None) -> PyTree:
-    """The state that a controller begins with; arrays of NumPy become JAX's."""
+    """The first state of a controller, with JAX arrays in place of NumPy arrays."""
 
     def as_array(leaf):
         return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
@@ -301,11 +334,13 @@ def replay(
     record: tuple[Array, ...],
     act: Callable[..., tuple[PyTree, PyTree]],
 ) -> PyTree:
-    """The measurements of `act` at each step of a recorded run.
+    """Run a controller along a record, and measure something at each step.
 
-    `measured, state = act(t, y, state, u, ...)` calls the controller, from `state` on
-    and along `record`: the times, observations, applied controls and costs, and what
-    else `act` takes. Then its `applied` is called with the control and the cost.
+    `record` holds times, observations, applied controls and costs, and more arguments
+    of `act`. At each step, `measured, state = act(t, y, state, u, ...)` calls the
+    controller, starting from `state`; then `applied` gets the control and the cost.
+
+    **Returns:** what `act` measured at each step.
     """
     state, static = eqx.partition(state, eqx.is_array)
 
@@ -319,7 +354,7 @@ def replay(
 
 
 def tallies(state: PyTree) -> dict[str, Array]:
-    """The sum of the tallies of each name in a controller's state."""
+    """The counts in a controller's state, by name. Tallies of one name are summed."""
     counts: dict[str, Any] = {}
     for tally in parts_of([state], Tally):
         counts[tally.name] = counts.get(tally.name, 0) + jnp.sum(tally.count)
@@ -329,20 +364,19 @@ def tallies(state: PyTree) -> dict[str, Array]:
 def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:
     """The error for an observation of the wrong size."""
     return ValueError(
-        f"{type(controller).__name__}: expects an observation of size {expected}, got "
-        f"size {y.shape[0] if y.ndim else 0}. If it was made for the encoded "
-        "observation, give it features=env.encode."
+        f"{type(controller).__name__}: the observation must have size {expected}, got "
+        f"size {y.shape[0] if y.ndim else 0}. If the controller was made for encoded "
+        "observations, pass features=env.encode when you make it."
     )
 
 
 def check_stochastic(policy: Any, name: str, where: str) -> AbstractStochasticPolicy:
-    """`policy`, if it knows the probability of what it draws, or an error."""
+    """`policy`, or an error unless it is an `AbstractStochasticPolicy`."""
     if isinstance(policy, AbstractStochasticPolicy):
         return policy
     raise ValueError(
-        f"{where}: the {name} must draw its controls and have "
-        "log_prob(t, y, state, u), as a delucax.AbstractStochasticPolicy, got "
-        f"{type(policy).__name__}."
+        f"{where}: the {name} must be a delucax.AbstractStochasticPolicy, which has "
+        f"log_prob(t, y, state, u), got {type(policy).__name__}."
     )
 
 

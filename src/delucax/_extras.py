@@ -5,13 +5,13 @@ from typing import Any
 
 
 def extra(module: str, name: str) -> Any:
-    """The module, which the optional extra `name` installs.
+    """Import a module that the optional extra `name` installs.
 
-    **Raises:** `ImportError` that names the extra, if the module is not there.
+    **Raises:** `ImportError` if the module is not installed; it says how to install it.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f'{module} is not installed: pip install "delucax[{name}]".'
+            f'{module} is not installed. Run: pip install "delucax[{name}]"'
         ) from error

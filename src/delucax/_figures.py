@@ -1,4 +1,4 @@
-"""The style of figures, and a figure that a notebook shows. Imports Matplotlib."""
+"""The style of figures, and figures in notebooks. It imports Matplotlib."""
 
 import io
 import re
@@ -12,19 +12,20 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from PIL import Image
 
 
-# Okabe and Ito (2008): distinguishable by colour-blind readers too. Its yellow and
-# black are left out: one vanishes on white paper, the other on a dark page.
+# The palette of Okabe and Ito (2008), which colour-blind readers can distinguish.
+# Without its yellow, which vanishes on white paper, and its black, which vanishes on a
+# dark page.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINE_STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
 NEUTRAL = "0.5"
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows, whether or not it has a plotting backend."""
+    """A figure that a notebook shows even without a plotting backend."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        # Twice the pixels, shown at the nominal size: sharp on a dense screen. With few
-        # colours a third of the size, which counts in a notebook that is kept.
+        # Twice the pixels, shown at the nominal size, are sharp on a dense screen. Few
+        # colours make the image a third as large, which matters in a saved notebook.
         buffer, small = io.BytesIO(), io.BytesIO()
         self.savefig(buffer, format="png", dpi=2 * self.dpi, transparent=False)
         image = quantised(Image.open(buffer).convert("RGB"), 255)
@@ -35,24 +36,24 @@ class NotebookFigure(Figure):
 
 def quantised(image: Image.Image, colours: int) -> Image.Image:
     """An image in its main colours."""
-    # Of Pillow's methods the one that keeps both thin pale lines and pure white.
+    # The only one of Pillow's methods that keeps both thin pale lines and pure white.
     method = Image.Quantize.MAXCOVERAGE
     return image.quantize(colours, method, dither=Image.Dither.NONE)
 
 
 def color_of(index: int) -> str:
-    """The colour of line `index`; the palette repeats after six."""
+    """The colour of line `index`. The palette repeats after six."""
     return PALETTE[index % len(PALETTE)]
 
 
 def line_style(index: int) -> dict[str, Any]:
-    """The colour and dashes of line `index`: solid until the colours come round."""
+    """The colour and dashes of line `index`. The first six lines are solid."""
     dashes = LINE_STYLES[index // len(PALETTE) % len(LINE_STYLES)]
     return {"color": color_of(index), "linestyle": dashes}
 
 
 def style_axes(ax: Axes, *, size: float, ticks: tuple[int, int] = (8, 4)) -> None:
-    """A light grid, two spines, few ticks, and no offset hidden in a corner."""
+    """Set a light grid, two spines, few ticks, and tick labels without an offset."""
     ax.grid(True, color=NEUTRAL, alpha=0.2, linewidth=0.6)
     ax.set_axisbelow(True)
     for side in ("top", "right"):
@@ -68,13 +69,13 @@ def style_axes(ax: Axes, *, size: float, ticks: tuple[int, int] = (8, 4)) -> Non
 
 
 def with_unit(name: str, unit: str) -> str:
-    """`"angle [rad]"`; the name alone where the unit is not known."""
+    """A label such as `"angle [rad]"`; the name alone if the unit is empty."""
     return f"{name} [{unit}]" if unit else name
 
 
 def wrapped(text: str, width: int) -> str:
-    """`text` in lines of about `width` characters, broken at spaces, and after `_` in
-    words that are longer than a line. Mathematics between dollar signs is left whole.
+    """`text` in lines of about `width` characters, broken at spaces. Words that are
+    longer than a line are broken after `_`. A text with mathematics is not broken.
     """
     if "$" in text:
         return text
@@ -93,7 +94,7 @@ def wrapped(text: str, width: int) -> str:
 def top_legend(
     figure: Figure, entries: Sequence[tuple[Line2D, str]], **style: Any
 ) -> None:
-    """A legend above all panels, of handles and their labels."""
+    """Add a legend above all panels; `entries` are pairs of a handle and its label."""
     handles, labels = zip(*entries, strict=True)
     place = {"loc": "outside upper center", "frameon": False}
     figure.legend(list(handles), list(labels), **place, **style)

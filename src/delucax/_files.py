@@ -11,7 +11,7 @@ from ._message import shortened
 
 
 def as_path(value: Any, name: str, where: str) -> Path:
-    """`value` as a path; raises `ValueError` if it is none."""
+    """`value` as a path, or an error if it is none."""
     if not isinstance(value, str | os.PathLike):
         raise ValueError(
             f"{where}: {name} must be the path of a file, got {shortened(value)}."
@@ -23,8 +23,8 @@ def as_path(value: Any, name: str, where: str) -> Path:
 def replaced(path: Path) -> Iterator[BinaryIO]:
     """A temporary file beside `path`, which replaces it at the end of the block.
 
-    If the block raises, `path` is unchanged. The content is on the disk before the file
-    is renamed, so that a crash leaves the old file or the new one. A device, such as
+    If the block raises, `path` stays unchanged. The content is on the disk before the
+    file is renamed, so a crash leaves either the old or the new file. A device, such as
     `/dev/stdout`, is written to directly.
 
     **Raises:** `OSError` if the file cannot be written.

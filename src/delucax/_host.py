@@ -1,13 +1,13 @@
-"""One text for two array libraries: NumPy where nothing is traced, else JAX.
+"""One code for two array libraries: NumPy if nothing is traced, JAX otherwise.
 
-A design such as a Riccati equation is solved once, and compiling it would take a
-thousand times as long as solving it. So what is written with `xp`, `lax` and the loops
-below runs on NumPy when all its arguments are concrete arrays, and compiled under
+A design, such as a Riccati equation, is solved once. To compile it would take a
+thousand times as long as to solve it. Code that is written with `xp`, `lax` and the
+loops below runs on NumPy if all its arguments are concrete arrays, and with JAX under
 `jax.jit`, `jax.vmap` and `jax.grad`.
 
-NumPy differs in two ways from which such a text must keep off. It changes an array in
-place where JAX makes a new one: `a = a + b`, not `a += b`. And of two Python numbers
-`where` makes an array of double precision.
+Such code must avoid two differences. NumPy changes an array in place where JAX makes a
+new one, so write `a = a + b`, not `a += b`. And NumPy's `where` of two Python numbers
+makes an array in double precision.
 """
 
 import functools
@@ -31,14 +31,14 @@ _OF_NUMPY = np.ndarray | np.generic
 
 
 def on_host() -> bool:
-    """Whether NumPy computes."""
+    """Whether code runs on NumPy now."""
     return _ON_HOST.get()
 
 
 def host_unless_traced(function: _F) -> _F:
     """Run a function on NumPy if none of its arguments is traced.
 
-    Its arguments are NumPy's arrays then, its results JAX's arrays in both cases.
+    It then gets NumPy arrays. Its results are JAX arrays in any case.
     """
 
     @functools.wraps(function)
@@ -49,7 +49,7 @@ def host_unless_traced(function: _F) -> _F:
         args, kwargs = jax.tree.unflatten(structure, map(_to_host, leaves))
         token = _ON_HOST.set(True)
         try:
-            # As in JAX: what overflows is infinite, what is undefined NaN.
+            # As in JAX, an overflow gives infinity and an invalid operation NaN.
             with np.errstate(all="ignore"):
                 value = function(*args, **kwargs)
         finally:
@@ -64,16 +64,16 @@ def _to_host(leaf: Any) -> Any:
 
 
 def _to_device(tree: Any) -> Any:
-    """The tree with JAX's arrays for NumPy's."""
+    """The tree, with JAX arrays in place of NumPy arrays."""
     arrays, others = eqx.partition(tree, lambda x: isinstance(x, _OF_NUMPY))
-    # All at once, and not by `jnp.asarray`, which compiles a program for each shape.
-    # Copies, as JAX may otherwise share the memory of an array that the user changes.
+    # Not by `jnp.asarray`, which compiles a program for each shape. Copies, because JAX
+    # may share the memory of an array that the user changes later.
     copies = jax.tree.map(lambda leaf: leaf.copy(), arrays)
     return eqx.combine(jax.device_put(copies), others)
 
 
 def compiled_unless_on_host(function: _F) -> _F:
-    """`eqx.filter_jit`."""
+    """`eqx.filter_jit`, or the function itself on NumPy."""
     compiled = eqx.filter_jit(function)
 
     @functools.wraps(function)
@@ -84,34 +84,34 @@ def compiled_unless_on_host(function: _F) -> _F:
 
 
 class custom_jvp(jax.custom_jvp):
-    """`jax.custom_jvp`; NumPy calls the function itself."""
+    """`jax.custom_jvp`, or the function itself on NumPy."""
 
     def __call__(self, *args: Any) -> Any:
         return self.fun(*args) if _ON_HOST.get() else super().__call__(*args)
 
 
 class _Operations:
-    """Operations of `jax.lax` on NumPy's arrays."""
+    """Operations of `jax.lax` on NumPy arrays."""
 
     max = staticmethod(np.maximum)
 
     @staticmethod
     def reduce_precision(x: Any, exponent_bits: int, mantissa_bits: int) -> Any:
-        """`x` rounded to so many bits of the mantissa."""
+        """`x`, rounded to `mantissa_bits` bits of the mantissa."""
         del exponent_bits
-        # The unit of the last bit that is kept. No power of two loses a digit.
+        # The unit of the last bit that is kept, a power of two, which divides exactly.
         unit = np.ldexp(x.dtype.type(1), np.frexp(x)[1] - 1 - mantissa_bits)
         return np.where(np.isfinite(x), np.rint(x / unit) * unit, x)
 
     @staticmethod
     def cummin(x: Any, *, reverse: bool = False) -> Any:
-        """The smallest entry so far, along the first axis."""
+        """The running minimum along the first axis."""
         step = -1 if reverse else 1
         return np.minimum.accumulate(x[::step])[::step]
 
     @staticmethod
     def cummax(x: Any, axis: int) -> Any:
-        """The largest entry so far."""
+        """The running maximum."""
         return np.maximum.accumulate(x, axis)
 
     @staticmethod
@@ -121,7 +121,7 @@ class _Operations:
 
 
 class _Namespace:
-    """Two modules of the same functions: one for NumPy, one for JAX."""
+    """Two modules with the same functions: one for NumPy, one for JAX."""
 
     def __init__(self, host: Any, device: Any) -> None:
         self._host, self._device = host, device
@@ -131,9 +131,9 @@ class _Namespace:
 
 
 xp: Any = _Namespace(np, jnp)
-"""`numpy` or `jax.numpy`, whichever computes."""
+"""`numpy` on the host, else `jax.numpy`."""
 lax: Any = _Namespace(_Operations, jax.lax)
-"""The like of `jax.lax`."""
+"""A part of `jax.lax` for NumPy on the host, else `jax.lax`."""
 
 
 def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C) -> _C:
@@ -146,7 +146,7 @@ def while_loop(proceed: Callable[[_C], Any], body: Callable[[_C], _C], start: _C
 
 
 def if_true(needed: Any, function: Callable[[_C], _C], value: _C) -> _C:
-    """`function(value)` if `needed`, else `value`; of a batch always computed."""
+    """`function(value)` if `needed`, else `value`. In a batch it is always computed."""
     if _ON_HOST.get():
         return function(value) if needed else value
     return jax.lax.cond(needed, function, lambda value: value, value)
@@ -162,7 +162,7 @@ def fori_loop(low: Any, high: Any, body: Callable[[Any, _C], _C], start: _C) -> 
 
 
 def scan(body: Callable, start: Any, xs: Any, *, reverse: bool = False) -> Any:
-    """`lax.scan`, of a given length."""
+    """`lax.scan` over arrays."""
     if not _ON_HOST.get():
         return jax.lax.scan(body, start, xs, reverse=reverse)
     rows = []
@@ -181,7 +181,7 @@ def vmap(function: _F) -> _F:
 
 
 def _rows(tree: Any) -> list:
-    """The trees of the rows of all arrays."""
+    """A tree for each row of the arrays."""
     leaves, structure = jax.tree.flatten(tree)
     return [jax.tree.unflatten(structure, row) for row in zip(*leaves, strict=True)]
 
@@ -196,22 +196,23 @@ def stop_gradient(tree: _C) -> _C:
 
 
 def entry(table: Any, *index: Any) -> Any:
-    """`table[index]`, of an index that is in bounds."""
+    """`table[index]`, for an index that is in bounds."""
     if _ON_HOST.get():
         return table[index]
-    # Nothing is clipped, which compiles sooner.
+    # Without clipping, which compiles faster.
     return table.at[index].get(mode="promise_in_bounds")
 
 
 def numbers(*values: Any, dtype: Any) -> Any:
-    """Numbers and flags as one vector.
+    """Numbers and booleans as one vector.
 
-    XLA compiles each operand of a concatenation as a program of its own, and these
-    selects as one.
+    XLA compiles each operand of a concatenation as a program of its own. It compiles
+    these selects as one.
     """
     if _ON_HOST.get():
         return np.array([float(value) for value in values], dtype)
-    # A constant: comparisons with an iota would be moved out of a loop, one by one.
+    # A constant, because XLA would move comparisons with an iota out of a loop, one by
+    # one.
     place = np.arange(len(values))
     vector = jnp.zeros(len(values), dtype)
     for k, value in enumerate(values):

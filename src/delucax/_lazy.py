@@ -1,4 +1,4 @@
-"""Packages whose names are imported at first use."""
+"""Packages that import their names at first use."""
 
 import importlib
 import sys
@@ -9,10 +9,10 @@ from typing import Any
 def lazily(
     package: str, places: dict[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package that imports names when they are used.
+    """The `__getattr__` and `__dir__` of a package that imports its names at first use.
 
-    **Arguments:** `package`: its name. `places`: the names that each module of it
-        gives, by that of the module.
+    **Arguments:** `package`: the name of the package. `places`: for each of its
+        modules, the names that it provides, separated by spaces.
     """
     module_of = {name: place for place in places for name in places[place].split()}
 

@@ -10,13 +10,13 @@ from jax.core import Tracer
 
 
 _MOST = 120
-"""The characters of a value that a message shows."""
+"""The largest number of characters of a value in a message."""
 
 
 def shortened(value: Any) -> str:
     """A value as an error message shows it, in a line or two."""
     if hasattr(value, "to_numpy"):  # tables and their columns
-        return f"a {type(value).__name__}; `.to_numpy()` makes it an array"
+        return f"a {type(value).__name__} (`.to_numpy()` makes it an array)"
     is_array = isinstance(value, np.ndarray | jax.Array)
     text = str(value) if is_array else repr(value)
     if len(text) <= _MOST:

@@ -19,7 +19,7 @@ from ._provenance import device, provenance
 
 
 FORMS = {".csv": "csv", ".parquet": "parquet", ".md": "markdown", ".tex": "latex"}
-"""The forms of a table by the ending of its file."""
+"""The formats of a table by the suffix of its file."""
 
 _NAMED = {"\\": "backslash", "~": "asciitilde", "^": "asciicircum"}
 _LATEX = str.maketrans({c: "\\" + c for c in "&%$#_{}"} | {"\n": " "})
@@ -29,7 +29,7 @@ _LATEX |= str.maketrans({c: f"\\text{name}{{}}" for c, name in _NAMED.items()})
 def as_text(
     form: str, columns: Sequence[str], rows: Sequence[Sequence], digits: int = 4
 ) -> str:
-    """The rows of a table in one of the forms `csv`, `markdown`, `latex` and `html`."""
+    """A table as text in one of the formats `csv`, `markdown`, `latex` and `html`."""
     if form == "csv":
         out = io.StringIO()
         csv.writer(out, lineterminator="\n").writerows([columns, *rows])
@@ -79,7 +79,7 @@ def _html(columns: Sequence[str], rows: Sequence[Sequence], is_number: list) -> 
 
 
 def _sort_key(value: float) -> str:
-    """The number as JavaScript reads it; NaN is empty, and sorts last."""
+    """The number as JavaScript reads it. NaN is empty, and so sorts last."""
     return json.dumps(value).replace("NaN", "")
 
 
@@ -93,7 +93,7 @@ def shown(value: Any, digits: int = 4) -> str:
 
 
 def escape(text: Any) -> str:
-    """A text as HTML shows it."""
+    """A text with the special characters of HTML escaped."""
     return html.escape(str(text))
 
 
@@ -103,8 +103,8 @@ class Page:
 
     **Arguments:**
 
-    - `title`: its heading.
-    - `parts`: pieces of HTML, to which the methods add.
+    - `title`: the heading of the page.
+    - `parts`: pieces of HTML, to which the methods append; none by default.
     """
 
     title: str
@@ -115,8 +115,8 @@ class Page:
 
         **Arguments:**
 
-        - `text`: what it says.
-        - `level`: 2 by default, as 1 is the title.
+        - `text`: the text of the heading.
+        - `level`: the level of the heading, 2 by default; the title has level 1.
         """
         self.parts.append(f"<h{level}>{escape(text)}</h{level}>")
 
@@ -125,19 +125,19 @@ class Page:
 
         **Arguments:**
 
-        - `text`: what it says.
-        - `kind`: its CSS class; `"made"` is faint.
+        - `text`: the text of the paragraph.
+        - `kind`: its CSS class, none by default; `"made"` is faint.
         """
         attribute = f' class="{kind}"' if kind else ""
         self.parts.append(f"<p{attribute}>{escape(text)}</p>")
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence]) -> None:
-        """Add a table, which a click on a heading sorts.
+        """Add a table, which sorts by a click on the heading of a column.
 
         **Arguments:**
 
-        - `columns`: the headings.
-        - `rows`: of each the values.
+        - `columns`: the headings of the columns.
+        - `rows`: the values of each row.
         """
         self.parts.append(as_text("html", columns, rows))
 
@@ -146,7 +146,7 @@ class Page:
 
         **Arguments:**
 
-        - `figure`: one of Matplotlib, or the path of an image.
+        - `figure`: a Matplotlib figure, or the path of an image.
         """
         if isinstance(figure, Path):
             content = base64.b64encode(figure.read_bytes()).decode()
@@ -158,11 +158,11 @@ class Page:
         self.parts.append(f"<figure>{drawn}</figure>")
 
     def provenance(self, folder: str | os.PathLike) -> None:
-        """Add what it was made with: the date, the commit, the device, the versions.
+        """Add a line with the date, the commit, the device and the versions.
 
         **Arguments:**
 
-        - `folder`: of the source, for the commit.
+        - `folder`: the folder of the source, to look up the commit.
         """
         made = provenance(Path(folder))
         versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items() if v)
@@ -176,21 +176,21 @@ class Page:
         )
 
     def write(self, path: str | os.PathLike) -> None:
-        """Write it to a file.
+        """Write the page to a file.
 
         **Arguments:**
 
         - `path`: the HTML file to write.
 
-        **Raises:** `OSError` if it cannot be written.
+        **Raises:** `OSError` if the file cannot be written.
         """
         with replaced(Path(path)) as file:
             file.write(str(self).encode())
 
 
 def _svg(figure: Any) -> str:
-    """The same text for the same figure: without a date, with names that a fixed salt
-    makes."""
+    """The figure as SVG. The same figure gives the same text, because there is no date
+    and a fixed salt makes the names."""
     out = io.StringIO()
     with extra("matplotlib", "plot").rc_context({"svg.hashsalt": "delucax"}):
         figure.savefig(out, format="svg", metadata={"Date": None})

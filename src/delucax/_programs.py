@@ -1,7 +1,7 @@
-"""Compiled programs on disk: JAX's persistent cache, in a folder of our own.
+"""Compiled programs on disk: JAX's persistent cache, in a folder of delucax.
 
-The command line, the tests and the benchmarks call this. The library does not, because
-the cache is a setting of the process.
+The command line, the tests and the benchmarks use it. The library does not, because the
+cache is a setting of the whole process.
 """
 
 import contextlib
@@ -15,25 +15,25 @@ import jax
 
 
 _LIMIT = 2**30
-"""Bytes that a folder of ours may hold when a process starts."""
+"""The largest size of a folder, in bytes, when a process starts."""
 
 
 def keep_programs(
     folder: str | Path | None = None, otherwise: Path | None = None
 ) -> Path | None:
-    """Keep what this process, and those that it starts, compile in a folder.
+    """Keep the programs that this process and its child processes compile in a folder.
+
+    All programs are kept, also those that compile quickly, unless
+    `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` is set. If the folder is too large, the
+    programs that were not used for the longest time are deleted. The folder in
+    `JAX_COMPILATION_CACHE_DIR` may be shared, so nothing is deleted there.
 
     **Arguments:**
 
-    - `folder`: the folder. By default that of `JAX_COMPILATION_CACHE_DIR`.
-    - `otherwise`: the folder if neither is given, by default one in the user's caches.
+    - `folder`: the folder; that in `JAX_COMPILATION_CACHE_DIR` by default.
+    - `otherwise`: the folder if neither is given; one in the user's caches by default.
 
-    Programs are kept however short their compilation was, unless
-    `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise. The programs that were
-    not used for longest are deleted if a folder has grown too large; the one that
-    `JAX_COMPILATION_CACHE_DIR` names may be shared, and is left as it is.
-
-    **Returns:** the folder, or `None` if nothing is kept: with
+    **Returns:** the folder; or `None` if nothing is kept, which is so with
     `JAX_ENABLE_COMPILATION_CACHE=false`, or after a warning if the folder cannot be
     written to.
     """
@@ -59,12 +59,12 @@ def keep_programs(
 
 
 def forget_programs() -> None:
-    """Keep no compiled programs on disk, and look for none there."""
+    """Keep no compiled programs on disk, and do not look for any there."""
     _set("jax_enable_compilation_cache", False)
 
 
 def user_folder(kind: str = "programs") -> Path:
-    """A folder of ours among the user's caches, by default that of programs."""
+    """The folder of delucax among the user's caches, for programs by default."""
     home = Path.home()
     if sys.platform == "win32":
         name, caches = "LOCALAPPDATA", home / "AppData" / "Local"
@@ -76,15 +76,15 @@ def user_folder(kind: str = "programs") -> Path:
 
 
 def _set(name: str, value: str | float | bool) -> None:
-    """Set an option of JAX, here and in processes that start from here."""
+    """Set an option of JAX, in this process and its child processes."""
     jax.config.update(name, value)
     os.environ[name.upper()] = str(value)
 
 
 def prune(folder: Path, limit: int) -> None:
-    """Delete programs until three quarters of `limit` are left, if there are more.
+    """If the programs exceed `limit` bytes, delete some until three quarters are left.
 
-    JAX's own limit needs another package, and a lock for every program that is read.
+    JAX's own limit needs another package, and locks every program that it reads.
     """
     programs = []
     for path in folder.glob("*-cache"):

@@ -32,15 +32,16 @@ def provenance(folder: Path) -> dict[str, Any]:
 
 
 def device() -> str:
-    """The kind of device that JAX computes on by default, and how many there are."""
+    """The kind and the number of the devices that JAX uses by default."""
     devices = jax.devices()
     kind = devices[0].device_kind
     return kind if len(devices) == 1 else f"{len(devices)} x {kind}"
 
 
 def _git(folder: Path) -> tuple[str | None, bool | None]:
-    """The commit, and whether files differ from it or Python files are not in it at
-    all; nothing outside a repository. Other new files may be what a run wrote."""
+    """The commit, and whether the files differ from it; `None` twice outside of a
+    repository. New files count only if they are Python files or notebooks, because a
+    run may write others."""
 
     def ask(*words: str) -> str:
         how: Any = dict(cwd=folder, timeout=20, check=True)

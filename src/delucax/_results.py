@@ -15,38 +15,40 @@ from ._typing import Array
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """Status of a computation.
+    """The status of a computation: success, or the reason of a failure.
 
-    Extends `diffrax.RESULTS` (which extends those of Optimistix and Lineax), so that
-    the message of a nested failure is kept. `RESULTS[result]` is the
-    message; `result == RESULTS.successful` tells whether it succeeded.
+    Test for success with `result == RESULTS.successful`. Read the message with
+    `RESULTS[result]`; it is empty for a success.
+
+    It extends `diffrax.RESULTS`, which extends those of Optimistix and Lineax, so that
+    the message of a nested failure is kept.
     """
 
     diverged = "The states or costs became NaN or infinite."
     stage_not_solved = (
-        "The stages of an implicit solver were not solved: take more substeps or a "
+        "The stages of an implicit solver were not solved. Take more substeps or a "
         "smaller dt, or give its root finder other tolerances or more steps."
     )
     beyond_precision = (
         "The solver reached max_steps. Its rtol is below the precision of the state, "
-        "so more steps may not help: increase rtol, or compute in float64."
+        "so more steps may not help. Increase rtol, or compute in float64."
     )
     not_stabilisable = (
-        "The pair (A, B) is not stabilisable: a mode that does not decay is "
-        "uncontrollable, or controllable only below the rounding of the data."
+        "The pair (A, B) is not stabilisable: the control does not reach a mode that "
+        "does not decay, or reaches it less than the rounding of the data."
     )
     not_stabilising = (
-        "There is no stabilising solution: an unstable mode may be undetectable in the "
-        "cost, or the cost may be unbounded below."
+        "There is no stabilising solution. Either the cost does not detect an unstable "
+        "mode, or the cost is unbounded below."
     )
     on_boundary = (
-        "The closed loop is on the boundary of stability, up to rounding: a mode there "
-        "is undetectable in the cost, or a slightly smaller weight would make the cost "
-        "unbounded below, or the precision is too low to tell."
+        "The closed loop is on the boundary of stability, up to rounding. Either the "
+        "cost does not detect a mode there, or a slightly smaller weight would make "
+        "the cost unbounded below, or the precision is too low to tell."
     )
     ill_posed = (
-        "The data are not those of a well-posed problem: not finite, a weight that is "
-        "not definite, a singular descriptor matrix, or a singular equation."
+        "The problem is not well posed: a number is not finite, a weight is not "
+        "definite, the descriptor matrix is singular, or the equation is singular."
     )
     not_separated = (
         "The spectra of the coefficients cannot be separated by a vertical line (in "
@@ -55,75 +57,74 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     not_converged = "The iteration did not converge within its step limit."
     unexciting = (
-        "The data are too few, or excite the system too little, to identify all "
-        "parameters: some direction among them is not identifiable. With throw=False "
-        "the fit is returned, and names it."
+        "The data do not identify all parameters: there are too few, or they excite "
+        "the system too little. With throw=False you get the fit, which names the "
+        "parameters that are not identified."
     )
     no_descent = (
-        "No step lowered the cost, although the gradient is not zero: the problem may "
+        "No step lowered the cost, although the gradient is not zero. The problem may "
         "not be smooth there, or the tolerance may be below rounding."
     )
     events_changed = (
-        "The events along the trajectory change from one iterate to the next, so that "
-        "the model of one does not tell of the other, and the iteration ended without "
-        "convergence: the best plan may be where an event is about to appear, or moves "
-        "to another interval. The plan is the best so far; other starts may lead to a "
-        "better one."
+        "The iteration did not converge, because the events along the trajectory "
+        "change from one iterate to the next. The best plan may be where an event "
+        "appears or moves to another interval. You get the best plan so far; another "
+        "start may lead to a better one."
     )
     too_many_events = (
-        "More events than max_events fell in one interval, and the state is held after "
-        "the last: they may accumulate, or a reset may leave its guard at zero. Raise "
+        "More than max_events events fell in one interval. The state is held after the "
+        "last. Events may accumulate, or a reset may leave its guard at zero. Raise "
         "max_events, take a smaller dt, add a mode in which the guard is not enabled, "
-        "or name an event that only tells of a crossing in crossing_events."
+        "or list an event that only reports a crossing in crossing_events."
     )
     beyond_guard = (
         "A state is beyond an enabled guard at the start of an interval or after a "
-        "reset, so its event cannot fire: start on the other side, or say in `enabled` "
-        "where the guard counts."
+        "reset, so its event cannot fire. Start on the other side of the guard, or "
+        "disable the event there with `enabled`."
     )
     grazing = (
-        "A guard touches zero and hardly crosses it: the derivatives of the event are "
-        "NaN."
+        "A guard touches zero and hardly crosses it, so the derivatives of its event "
+        "are NaN."
     )
     unknown_mode = "The mode of a state is not one of the modes of its system."
     plan_failed = (
-        'A plan of the controller did not succeed. Where "incidents" are in `keep`, '
-        "as by default, `trajectory.incident_counts` says how many did not."
+        "A plan of the controller did not succeed. `trajectory.incident_counts` has "
+        'their number, if `keep` holds "incidents", as by default.'
     )
     estimate_failed = (
-        'An estimate of the controller failed. Where "incidents" are in `keep`, as by '
-        "default, `trajectory.incident_counts` says how many did."
+        "An estimate of the controller failed. `trajectory.incident_counts` has their "
+        'number, if `keep` holds "incidents", as by default.'
     )
     filter_failed = (
-        "A safety filter found no control that keeps its barriers. Where "
-        '"incidents" are in `keep`, as by default, `trajectory.incident_counts` says '
-        "how often."
+        "A safety filter found no control that keeps its barriers. "
+        "`trajectory.incident_counts` has the number of times, if `keep` holds "
+        '"incidents", as by default.'
     )
     update_refused = (
-        'An update of a learner was not finite and was not made. Where "incidents" '
-        "are in `keep`, as by default, `trajectory.incident_counts` says how many were "
-        "not."
+        "An update of a learner was not finite and was not made. "
+        "`trajectory.incident_counts` has their number, if `keep` holds "
+        '"incidents", as by default.'
     )
     delay_beyond_memory = (
-        "A delay is negative, or longer than the memory of the dynamics: make them "
-        "with a longer memory, or keep the delay within it."
+        "A delay is negative, or longer than the memory of the dynamics. Construct the "
+        "dynamics with a longer memory, or keep the delay within it."
     )
     no_equilibrium = (
-        "There is no equilibrium near the guess: the least residual there is not zero. "
-        "Fix fewer states and controls, or start from another guess."
+        "There is no equilibrium near the guess: the smallest residual there is not "
+        "zero. Fix fewer states and controls, or start from another guess."
     )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "
-        "or gamma is below the least level that any controller attains."
+        "or gamma is below the smallest level that a controller can attain."
     )
     no_feasible_point = "The constraints cannot all hold: no point satisfies them."
     unbounded = (
         "The cost is unbounded below: it falls without end along a direction that "
-        "keeps within the constraints."
+        "satisfies the constraints."
     )
     inaccurate = (
-        "Rounding ended the iteration near the tolerance, but not within it: take a "
-        "larger one, or scale the data, or compute in float64."
+        "Rounding ended the iteration close to the tolerance, but not within it. Take "
+        "a larger tolerance, scale the data, or compute in float64."
     )
 
 
@@ -149,7 +150,7 @@ def promote(result: Result) -> Result:
 
 
 def choose(condition: Array, first: Any, second: Any) -> Result:
-    """`first` where the condition holds, else `second`."""
+    """The result `first` where the condition holds, else `second`."""
     if on_host():
         return first if condition else second
     return RESULTS.where(condition, first, second)
@@ -158,7 +159,7 @@ def choose(condition: Array, first: Any, second: Any) -> Result:
 def first_failure(first: Result, second: Result) -> Result:
     """`first` where it is a failure, else `second`.
 
-    A result that is statically known to be a success costs nothing.
+    A result that is statically a success adds nothing to the program.
     """
     if first is RESULTS.successful:
         return second
@@ -171,7 +172,7 @@ def first_of(results: Result | None) -> Result:
     """The first failure along the leading axis; success if there is none."""
     if results is None:
         return RESULTS.successful
-    # argmax of booleans is the first that holds, and the first entry if none does.
+    # `argmax` of booleans is the first true one, or the first entry if none is.
     failed = results._value != RESULTS.successful._value
     return jax.tree.map(lambda r: r[failed.argmax()], results)
 
@@ -185,7 +186,7 @@ _T = TypeVar("_T")
 
 
 def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
-    """`value`, or raise if `failed`, now if that is concrete, else at run time."""
+    """`value`, or an error if `failed`: now if that is concrete, else at run time."""
     if isinstance(failed, Tracer):
         return eqx.error_if(value, failed, message)
     if failed:
@@ -200,20 +201,21 @@ def raise_on_failure(
     it: str = "the solution",
     facts: Callable[[], str] = lambda: "",
 ) -> Any:
-    """`solution`; if `throw`, raise when its `result` is a failure, now if that is
-    concrete, else at run time.
+    """`solution`, or if `throw` is true, an error if its `result` is a failure: now if
+    that is concrete, else at run time.
 
-    `it` names the solution in the error; `facts` adds detail when it is concrete.
+    `it` names the solution in the error. `facts` adds details if the result is
+    concrete.
     """
     if not throw:
         return solution
     result = solution.result
     if isinstance(result._value, Tracer):
         failed = result != RESULTS.successful
-        # As `result.error_if` does, with the name before each message.
+        # Like `result.error_if`, with the name of the function before each message.
         words = [f"{where}: {m}" for m in result._enumeration._index_to_message]
         return eqx.branched_error_if(solution, failed, result._value, words)
-    # Compared by NumPy: JAX would compile a program.
+    # Compared by NumPy, because JAX would compile a program.
     if np.asarray(result._value) != RESULTS.successful._value:
         words = (
             f"{where}: {RESULTS[result]}",

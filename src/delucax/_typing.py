@@ -9,12 +9,12 @@ from jaxtyping import ArrayLike, Bool, Float, Key, Num, UInt32
 if TYPE_CHECKING:
     from jaxtyping import Array
 else:
-    # Of NumPy where it computes.
+    # Any, because on the host it is a NumPy array.
     Array = Any
 
 
 Numbers: TypeAlias = ArrayLike | list[Any] | tuple[Any, ...]
-"""What becomes an array: an array, a number, or nested lists of numbers."""
+"""Anything that becomes an array: an array, a number, or nested lists of numbers."""
 RealScalar: TypeAlias = Num[Array, ""] | int | float
 """A real number: a Python number or a rank-0 array."""
 Time: TypeAlias = RealScalar
@@ -23,19 +23,20 @@ Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""
 Square: TypeAlias = Float[Array, "n n"]
-"""A square matrix; all in one signature have the same size."""
+"""A square matrix. All in one signature have the same size."""
 State: TypeAlias = Float[Array, "states"]  # noqa: F821
 Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
 Disturbance: TypeAlias = Float[Array, "disturbances"] | None  # noqa: F821
 Observation: TypeAlias = Float[Array, "observations"]  # noqa: F821
 Scalar: TypeAlias = Float[Array, ""]
 Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
-"""`(low, high)`, each a number or one for each entry."""
+"""`(low, high)`, each a number or an array with one number for each entry."""
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
 Difference: TypeAlias = Callable[[Array, Array], Array]
-"""`(x, x_ref) -> deviation`, as a system measures it; it wraps angles."""
+"""A function `(x, x_ref) -> deviation`, such as `system.difference`, which wraps
+angles."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
 
@@ -45,9 +46,9 @@ if TYPE_CHECKING:
     _Given = TypeVar("_Given")
 
     class _Converted(Generic[_Read, _Given]):
-        """A field whose readers have another type than its constructor takes.
+        """A field whose type differs from that of the constructor's argument.
 
-        A static checker reads off `__set__` what the constructor takes.
+        A static checker takes the type of the argument from `__set__`.
         """
 
         def __get__(self, instance: Any, owner: Any = None) -> _Read: ...

@@ -90,7 +90,7 @@ def test_angles_wrap():
 
 
 def test_no_controller():
-    with pytest.raises(RuntimeError, match="gamma is below the least level"):
+    with pytest.raises(RuntimeError, match="gamma is below the smallest level"):
         HInfinity(dlx.LinearDynamics(A, B), Q, R, gamma=2.9)
 
 

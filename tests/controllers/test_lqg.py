@@ -213,5 +213,5 @@ def test_wrong_arguments():
         c.OutputFeedback(lqg.estimator, lqg.estimator)
     with user_error(match="estimator must be an AbstractEstimator, got LQR"):
         c.OutputFeedback(lqg.regulator, lqg.regulator)
-    with user_error(match="expects an observation of size 1, got size 2"):
+    with user_error(match="the observation must have size 1, got size 2"):
         lqg(0.0, jnp.zeros(2), lqg.init())

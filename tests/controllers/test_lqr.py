@@ -133,7 +133,7 @@ def test_wrong_arguments():
         LQR(dynamics, jnp.eye(3), R)
     with user_error(match=r"dare: Q must be a matrix, got shape \(2,\)"):
         LQR(dynamics, jnp.ones(2), R)
-    with user_error(match="expects an observation of size 2, got size 3"):
+    with user_error(match="the observation must have size 2, got size 3"):
         LQR(dynamics, Q, R)(0.0, jnp.zeros(3), None)
 
 

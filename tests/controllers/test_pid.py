@@ -198,7 +198,7 @@ def test_wrong_arguments(kind):
         kind(1.0, dt=DT, bounds=(1.0, -1.0))
     with user_error(match="bounds must be a pair"):
         kind(1.0, dt=DT, bounds=2.0)
-    with user_error(match="bounds must be numbers or vectors of one size"):
+    with user_error(match="bounds must be numbers or vectors of the same size"):
         kind(1.0, dt=DT, bounds=(jnp.zeros(2), jnp.ones(3)))
     with user_error(match="output must be an index from 0.*got .-1,"):
         kind(1.0, dt=DT, output=-1)
@@ -209,7 +209,7 @@ def test_wrong_arguments(kind):
     with user_error(match="selects component 2, but the observation has size 2"):
         pid = kind(1.0, dt=DT, output=2)
         pid(0.0, y, pid.init())
-    with user_error(match="observation of size 3, got size 2"):
+    with user_error(match="observation must have size 3, got size 2"):
         pid = kind(1.0, dt=DT, output=jnp.ones((1, 3)))
         pid(0.0, y, pid.init())
     with user_error(match=r"reference must have an entry for each of 1 loops.*\(2,\)"):

@@ -410,7 +410,7 @@ def test_wrong_records():
             run(kalman, YS, jnp.full((8, 1), jnp.inf))
         with user_error(match=r"t0 must be a number, got shape \(2,\)"):
             run(kalman, YS, t0=jnp.zeros(2))
-    with user_error(match="KalmanFilter: expects an observation of size 1, got size 2"):
+    with user_error(match="KalmanFilter: the observation must have size 1, got size 2"):
         kalman.update(0.0, jnp.zeros(2), kalman.init())
     with user_error(match=r"KalmanFilter: u must have shape \(1,\).*got \(3,\)"):
         kalman.predict(0.0, jnp.zeros(3), kalman.init())

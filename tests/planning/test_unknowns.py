@@ -138,7 +138,7 @@ def test_unknowns_that_are_not_there():
     with user_error(match="LinearSystem has no 'mass'"):
         path = {"dynamics.system.mass": (0.0, 1.0)}
         least_time(1.0, unknowns=Unknowns(parameters=path))
-    with user_error(match="must have a number in the problem to start from"):
+    with user_error(match="whose start value in the problem must be a number"):
         path = {"dynamics.system.C": (0.0, 1.0)}
         least_time(1.0, unknowns=Unknowns(parameters=path))
     with user_error(match="a system in continuous time"):

@@ -1,4 +1,5 @@
-"""Performance on CPU and derivatives by JAX internals: jaxprs, custom primitives."""
+"""Speed on CPU and special derivatives, by transformations of jaxprs and custom
+primitives."""
 
 from .._host import (
     compiled_unless_on_host as compiled_unless_on_host,

@@ -1,11 +1,12 @@
 """Speed of batches on CPU: a barrier against recomputation, small products without
 calls of a library, and a sequential `vmap`.
 
-XLA on CPU compiles each component of a loop's state into a program of its own and
-repeats in it all that the component depends on: both components of a pendulum's next
-state compute its sine, and every component of a Runge-Kutta step computes all the
-stages. For a batch it is about twice as fast to store such a value once, in cache. The
-barrier does nothing without a batch or on accelerators, where it would be slower.
+XLA on CPU compiles each component of a loop's state into a program of its own, and
+repeats in it everything on which the component depends. Both components of a pendulum's
+next state compute its sine, and every component of a Runge-Kutta step computes all the
+stages. For a batch it is about twice as fast to store such a value once, in cache.
+Without a batch or on accelerators that would be slower, so there the barrier does
+nothing.
 """
 
 import functools
@@ -28,7 +29,7 @@ _fence.multiple_results = True
 
 
 def fence(*values: Any) -> list[Any]:
-    """The same arrays; a batch of them, on CPU, is stored before it is used."""
+    """The same arrays. A batch on CPU is stored before it is used."""
     return _fence.bind(*values, batched=False)
 
 
@@ -37,12 +38,12 @@ def _same(*values, **_):
 
 
 def _stored(*values, batched):
-    # XLA moves nothing across a barrier, and so cannot repeat what is before it.
+    # XLA moves nothing across a barrier, so it cannot repeat the operations before it.
     return lax.optimization_barrier(list(values)) if batched else list(values)
 
 
 def _batch(values, dims, **_):
-    # Under `vmap` the parameter turns on: that is how the lowering knows of the batch.
+    # `vmap` turns the parameter on, which tells the lowering about the batch.
     return _fence.bind(*values, batched=True), dims
 
 
@@ -55,7 +56,7 @@ def _transpose(cotangents, *_, batched):
 
 
 def _fence_nonzero(values, batched):
-    """The values with those that are not symbolically zero behind a fence."""
+    """The values, behind a fence unless they are symbolically zero."""
     nonzero = [value for value in values if type(value) is not ad.Zero]
     fenced = iter(_fence.bind(*nonzero, batched=batched))
     return [v if type(v) is ad.Zero else next(fenced) for v in values]
@@ -75,16 +76,16 @@ mlir.register_lowering(
 _matmul = Primitive("matmul")
 _OUTER = 16
 _FEW = 8**3
-"""Up to so many scalar products a single product is a sum in the program."""
+"""Up to this number of scalar products, a product outside of a batch becomes a sum."""
 
 
 def matmul(left: Any, right: Any) -> Any:
-    """The product of two matrices; small ones, on CPU, without calls of a library.
+    """The product of two matrices. On CPU, small ones are computed without a library.
 
     XLA gives each product of a batch to its pool of threads, unless a flag turns the
-    pool off. For matrices of a few rows that takes ten times as long as the product.
-    And a loop over small arrays is compiled as a whole only if no library is called in
-    it: in less time, and without a call for each operation of each step.
+    pool off. For matrices with a few rows that takes ten times as long as the product
+    itself. Also, XLA compiles a loop over small arrays as a whole only if it calls no
+    library. It then compiles faster, and runs without a call for each operation.
     """
     if on_host() or left.shape[1] > _OUTER:
         return left @ right
@@ -99,8 +100,8 @@ def _product(left, right, *, precision, **_):
 def _sum_of_products(left, right, *, batched, precision):
     if not batched and left.size * right.shape[1] > _FEW:
         return jnp.matmul(left, right, precision=precision)
-    # Barriers, or what is fused with the sum is computed for each of its terms. For one
-    # product that is little, and compiles sooner than one more loop.
+    # Without barriers, operations that XLA fuses with the sum are computed for each of
+    # its terms. For a single product that is little work, and compiles faster.
     if batched:
         left, right = lax.optimization_barrier((left, right))
     terms = (
@@ -136,17 +137,17 @@ mlir.register_lowering(
 
 def hoisted(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
     """`function`, traced at `args`, with all arrays that it closes over as leaves."""
-    # Equinox looks into functions with a closure alone, such as this lambda.
+    # A lambda, because Equinox only looks into functions with a closure.
     return eqx.filter_closure_convert(lambda *args: function(*args), *args)
 
 
 def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)` of arrays, whose batches run sequentially on CPU.
+    """`function(*args)`, whose batches run one member after the other on CPU.
 
-    In a batch each iteration waits for the longest line search and the slowest member,
-    and on CPU nothing is gained in return: a sequential run is between equally fast and
-    six times as fast. Accelerators run the batch as one. The function needs a
-    derivative of its own, and arrays that it closes over as leaves.
+    In a batch, each iteration waits for the longest line search and the slowest member.
+    On CPU nothing is gained in return: a sequential run is as fast, or up to six times
+    faster. Accelerators run the batch as one. The function needs its own derivative
+    rule, and its closed-over arrays must be leaves.
     """
     arrays, static = eqx.partition((function, args), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
@@ -162,14 +163,14 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
 
 
 _lanes = Primitive("lanes")
-"""A program, and the batches that it is in, the outermost first: their sizes, and which
-arguments each of them batches. How they run is decided when the platform is known, so
-that a program is not traced in a way in which it is not run."""
+"""A program and its batches, the outermost first: for each, its size and which
+arguments it batches. The platform decides later how they run, so the program is traced
+only in the way in which it runs."""
 _lanes.multiple_results = True
 
 
 def _nested(over: Callable[..., Any]) -> Callable[..., Any]:
-    """The program with its batches run by `over`."""
+    """The function that runs the program, with its batches mapped by `over`."""
 
     def run(*values, program, batches):
         function = jaxpr_as_fun(program)
@@ -210,8 +211,8 @@ def _lanes_shapes(*_, program, batches):
     return outs, program.effects
 
 
-# Operations of JAX that are lowered late, such as `jnp.searchsorted`, may stay inside:
-# the program is lowered as a whole. Older versions of JAX have none.
+# JAX operations that are lowered late, such as `jnp.searchsorted`, may stay inside,
+# because the program is lowered as a whole. Older versions of JAX have none.
 _lanes.is_high = lambda *_, **__: False
 _lanes.def_impl(_nested(_sequentially))
 _lanes.def_effectful_abstract_eval(_lanes_shapes)

@@ -1,4 +1,4 @@
-"""Large programs, compiled for a short wait."""
+"""Faster compilation of large programs."""
 
 import functools
 import os
@@ -17,14 +17,14 @@ _OPTIONS: dict[str, Any] = {_LEVEL: 1, "xla_llvm_disable_expensive_passes": True
 
 
 def quickly_compiled(function: _F) -> _F:
-    """`eqx.filter_jit`, by LLVM's quick passes where JAX allows that: on CPU, and not
-    inside another `jax.jit`.
+    """`eqx.filter_jit` with LLVM's quick passes, on CPU and outside of another
+    `jax.jit`, where JAX allows it.
 
-    A program of some hundred kernels then compiles in about three quarters of the time
-    and runs up to a tenth slower. A level in `XLA_FLAGS` is kept.
+    A program with some hundred kernels then compiles in about three quarters of the
+    time, and runs up to a tenth slower. An optimisation level in `XLA_FLAGS` is kept.
     """
     whole = eqx.filter_jit(function)
-    # The overloads of `filter_jit` leave out the options of `jax.jit`, which it takes.
+    # Any, because the overloads of `filter_jit` lack the options of `jax.jit`.
     compiled: Any = eqx.filter_jit
     quick = compiled(function, compiler_options=_OPTIONS)
 

@@ -1,13 +1,13 @@
 """Small vectors as scalars: a transformation of jaxprs, for speed on CPU.
 
-A user writes `x[0]` and `jnp.stack([...])`. Left as they are, their gradient pads each
-component back to a vector and adds the vectors up, which XLA does not undo, and which
-costs a batch more than the physics. Here a function is traced, and replayed with every
-small vector held as its components: taking an entry of a stack is then no operation at
-all, forward or backward. The numbers are the same.
+A user writes `x[0]` and `jnp.stack([...])`. Their gradient pads each component back to
+a vector and adds the vectors up. XLA does not simplify that, and for a batch it takes
+longer than the physics. Here a function is traced, and replayed with every small vector
+held as its components. To take an entry of a stack is then no operation at all, forward
+or backward. The numbers are the same.
 
-A loop carries the state in the same way: each component of a batch is then a vector of
-its own that stays in registers.
+A loop carries the state in the same way. Each component of a batch is then a vector of
+its own, which stays in registers.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -23,13 +23,13 @@ from ._batches import fence
 
 
 COMPONENTS_UP_TO = 16
-"""Vectors with more entries are left whole, to keep programs short."""
+"""Longer vectors are left whole, to keep programs short."""
 
 _REPEATED_UP_TO = 300
-"""A value of more operations is stored."""
+"""A value that takes more operations is stored."""
 
 _STACKED_FIRST_UP_TO = 6
-"""Trajectories of more components are extended before they are stacked."""
+"""Trajectories with more components are extended before they are stacked."""
 
 _ELEMENTWISE = frozenset(
     "abs add and atan2 ceil clamp convert_element_type cos copy cosh div eq erf exp"
@@ -40,7 +40,7 @@ _ELEMENTWISE = frozenset(
 
 
 class _Components:
-    """A vector as its entries."""
+    """A vector, held as its entries."""
 
     def __init__(self, entries: Sequence[Any]):
         self.entries = tuple(entries)
@@ -49,7 +49,7 @@ class _Components:
 def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with its small vectors replaced by their components.
 
-    **Arguments:** `function`: of pytrees of arrays, to pytrees of arrays and `None`.
+    **Arguments:** `function`: maps pytrees of arrays to pytrees of arrays and `None`.
 
     **Returns:** a function with the same values and a faster gradient.
     """
@@ -90,8 +90,8 @@ def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     if out is not None:
         return out
     out = _bind(equation, map(_whole, values))
-    # The sines of `delucax.math` are stored once. A solve has several outputs, and a
-    # fence around them would ask for a cotangent of those that have none.
+    # The sines of `delucax.math` are stored once. A solve has several outputs; a fence
+    # around them would need cotangents that some do not have.
     single = primitive.name == "custom_jvp_call" and len(out) == 1 and shape == ()
     return fence(*out) if single else out
 
@@ -99,7 +99,7 @@ def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
 def _bind(equation: Any, values: Iterable[Any]) -> Sequence[Any]:
     primitive = equation.primitive
     bound = primitive.get_bind_params(equation.params)
-    # JAX before 0.11 returns the functions inside apart from the other parameters.
+    # JAX before 0.11 returns the inner functions and the other parameters separately.
     functions, bound = bound if isinstance(bound, tuple) else ((), bound)
     out = primitive.bind(*functions, *values, **bound)
     return out if primitive.multiple_results else [out]
@@ -108,14 +108,14 @@ def _bind(equation: Any, values: Iterable[Any]) -> Sequence[Any]:
 def with_stores(function: Callable[..., Any], *like: Any) -> Callable[..., Any]:
     """`function` with long chains of operations behind fences.
 
-    XLA repeats cheap operations wherever their value is used, and so it repeats the
-    start of a chain, such as the stages of a step, in each of its later programs. What
-    would be repeated is counted, and a value of too many operations is stored.
+    XLA repeats cheap operations wherever their value is used. So it repeats the start
+    of a chain, such as the stages of a step, in each of the later programs. Here the
+    repeated operations are counted, and a value that takes too many is stored.
 
     **Arguments:**
 
-    - `function`: of pytrees of arrays, such as `by_components` returns.
-    - `like`: the shapes of its arguments. It is traced here, and not in each
+    - `function`: a function of pytrees of arrays, such as one from `by_components`.
+    - `like`: the shapes of its arguments. It is traced here once, not in each
         derivative.
 
     **Returns:** a function with the same values, which compiles in less time.
@@ -144,8 +144,8 @@ def with_stores(function: Callable[..., Any], *like: Any) -> Callable[..., Any]:
 def _on_components(
     primitive: Any, params: Any, shape: Any, values: list[Any]
 ) -> Sequence[Any] | None:
-    """The outputs of a primitive that makes components, or acts on them; `None` if it
-    needs the whole arrays. `shape` is that of its first output."""
+    """The outputs of a primitive that makes components or acts on them; `None` if it
+    needs whole arrays. `shape` is the shape of its first output."""
     name, (first, *others) = primitive.name, values or [None]
     split = [isinstance(value, _Components) for value in values]
     size = shape[0] if shape and len(shape) == 1 else None
@@ -162,7 +162,7 @@ def _on_components(
     if name == "stack" and shape == (len(values),) and len(values) <= COMPONENTS_UP_TO:
         return [_Components(values)]
     if name in _ELEMENTWISE and size is not None and any(split):
-        # Elementwise primitives have no axes in `params`, so an entry takes the same.
+        # Elementwise primitives have no axes in `params`, which thus fit an entry too.
         columns = [_entries(value, size) for value in values]
         if any(column is None for column in columns):
             return None
@@ -178,7 +178,7 @@ def _on_components(
         ends = params["start_indices"] + params["limit_indices"]
         taken = first.entries[slice(*ends, *(params["strides"] or ()))]
         return [_Components(taken)] if taken else None
-    # `x[-1]` and the like: the start is a number, which JAX clamps to the vector.
+    # For `x[-1]` and the like, the start is a number. JAX clamps it to the vector.
     if name == "dynamic_slice" and not isinstance(others[0], Tracer):
         (count,) = params["slice_sizes"]
         start = min(max(int(others[0]), 0), len(first.entries) - count)
@@ -187,7 +187,7 @@ def _on_components(
 
 
 def _entries(value: Any, size: int) -> Sequence[Any] | None:
-    """`size` entries of a vector, or as many times a scalar or the only entry."""
+    """`size` entries of a vector; a scalar or a single entry is repeated."""
     if isinstance(value, _Components):
         return value.entries * (size // len(value.entries))
     if jnp.shape(value) == ():
@@ -200,7 +200,8 @@ def _whole(value: Any) -> Any:
 
 
 def split_state(x: Array, most: int = COMPONENTS_UP_TO) -> tuple[Array, ...]:
-    """A state of up to `most` components as these, which is how loops carry it."""
+    """The components of a state, as loops carry it; a state with more than `most`
+    entries is left whole."""
     return tuple(x) if x.shape[0] <= most else (x,)
 
 
@@ -214,13 +215,15 @@ def stack_steps(
 ) -> Array:
     """Vectors over time, shape `(T, size)`, from the components of each step.
 
-    `last` is put behind them: of a few components when they are one array, of more
-    one by one, which is what a batch on CPU transposes fastest. (And a loop that keeps
-    the state before each step, not the one after it, keeps XLA from computing the
-    step twice, once to carry it and once to keep it.)
+    `last` is appended. A few components are stacked first and many are extended one by
+    one, which a batch on CPU transposes fastest.
+
+    A loop should keep the state before each step and append the last one here. If it
+    kept the state after each step, XLA would compute the step twice: once to carry the
+    state and once to keep it.
     """
     if size <= _STACKED_FIRST_UP_TO:
-        # A reshape of one component is free, where a stack would copy it.
+        # For one component a reshape, because a stack would copy it.
         steps = parts[0][:, None] if size == 1 else jnp.stack(parts, axis=1)
         if last:
             steps = jnp.concatenate([steps, jnp.stack(last)[None].astype(steps.dtype)])

@@ -1,4 +1,4 @@
-"""Derivatives in the mode that solvers support, and NaN tangents of failed solves."""
+"""Derivatives in a mode that solvers support, and NaN tangents of failed solves."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -16,14 +16,15 @@ from jaxtyping import Array
 
 
 _LOOPED_UP_TO = 64
-"""More directions are taken at once, by products of matrices."""
+"""More directions than this are taken at once, by matrix products."""
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
-    """Try several ways to differentiate; use the first that the solvers inside support.
+    """Try several ways to differentiate, and use the first that the solvers inside
+    support.
 
     Some solvers have no reverse mode, others no forward mode. If all ways fail, the
-    error of the first is raised, and so is any error of the program itself.
+    error of the first is raised. That includes errors of the program itself.
     """
 
     def evaluate(*args):
@@ -39,18 +40,19 @@ def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
-    """The Jacobian of `f` in forward mode, or in reverse where a solver inside has only
-    that."""
+    """The Jacobian of `f` in forward mode, or in reverse mode if a solver inside of it
+    supports only that."""
     return first_possible(jax.jacfwd(f), jax.jacrev(f))
 
 
 def value_and_jacobians(
     f: Callable[..., Array], *args: Array, in_loop: bool = False
 ) -> tuple[Array, Any]:
-    """`f` of vectors, and its Jacobian with respect to each, from one copy of `f`.
+    """The value of `f` at vectors and its Jacobians with respect to each, from one copy
+    of `f`.
 
-    With `in_loop`, for what runs seldom, few directions are taken one after the other:
-    XLA on CPU compiles a loop over small arrays as a whole, which takes half the time.
+    Use `in_loop` for code that runs seldom. Few directions are then taken one after the
+    other: XLA on CPU compiles a loop over small arrays as a whole, in half the time.
     """
     joined, split = ravel_pytree(args)
 
@@ -60,13 +62,13 @@ def value_and_jacobians(
 
     def looped(joined):
         def along(direction):
-            # Behind a barrier both change in each round. Otherwise XLA would move what
-            # depends on the point alone out of the loop, one operation after the other.
+            # Without the barrier, XLA would move everything that depends only on the
+            # point out of the loop, one operation after the other.
             point, direction = lax.optimization_barrier((joined, direction))
             return jax.jvp(lambda z: f(*split(z)), (point,), (direction,))
 
-        # A solver without forward mode would be refused by XLA alone, too late for
-        # another way. It stands in the program as this primitive.
+        # A solver without forward mode appears in the program as this primitive. XLA
+        # would refuse it only later, when no other way can be tried.
         directions = jnp.eye(joined.size, dtype=joined.dtype)
         traced = jax.make_jaxpr(along)(directions[0])
         if "custom_lin" in _primitives(traced):
@@ -82,7 +84,7 @@ def value_and_jacobians(
 
 
 def _primitives(jaxpr: Any) -> Iterator[str]:
-    """The names of the operations of a program, those of nested ones included."""
+    """The names of the operations of a program, including those of nested programs."""
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         for leaf in jax.tree.leaves(list(equation.params.values())):
@@ -91,13 +93,13 @@ def _primitives(jaxpr: Any) -> Iterator[str]:
 
 
 def operations(f: Callable[..., Any], *args: Any) -> int:
-    """How many operations the program of `f` has, those of nested ones included."""
+    """The number of operations of the program of `f`, including nested programs."""
     return sum(1 for _ in _primitives(jax.make_jaxpr(f)(*args)))
 
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
     """Whether the array that `f` returns depends on none of its arguments."""
-    # Dead code elimination that keeps the output says which inputs it needs.
+    # Dead code elimination says which inputs the output needs.
     traced = jax.make_jaxpr(f)(*args)
     _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
     return not any(used)
@@ -107,11 +109,11 @@ _nan_tangent = Primitive("nan_tangent")
 
 
 def nan_tangent(tangent: Array, ok: Array) -> Array:
-    """The tangent where `ok` holds; elsewhere NaN, unless the tangent is zero.
+    """The tangent where `ok` holds; NaN elsewhere, unless the tangent is zero.
 
-    The same in reverse: what does not depend on a failed solve (a masked lane of a
-    batch) keeps its gradient, and the gradient of what does is NaN. A product with NaN
-    would not do, because that of NaN and zero is NaN.
+    The same holds in reverse mode. A value that does not depend on a failed solve, such
+    as a masked member of a batch, keeps its gradient. Other gradients are NaN. To
+    multiply by NaN would not do, because NaN times zero is NaN.
     """
     return _nan_tangent.bind(tangent, jnp.broadcast_to(ok, tangent.shape))
 
@@ -121,14 +123,14 @@ def _value(tangent, ok):
 
 
 def _batch(values, dims):
-    # Elementwise, so a batch is the same on arrays with the batch in front.
+    # Elementwise, so a batch only moves its axis to the front.
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
     at_front = functools.partial(batching.bdim_at_front, size=size)
     return _nan_tangent.bind(*map(at_front, values, dims)), 0
 
 
 def _transpose(cotangent, _, ok):
-    # The map is diagonal, and so its own transpose.
+    # A diagonal map is its own transpose.
     is_zero = type(cotangent) is ad.Zero
     return cotangent if is_zero else _nan_tangent.bind(cotangent, ok), None
 
@@ -147,9 +149,9 @@ def deferred(
 ) -> Array:
     """`function(given, tangents)`, an array like `like`, linear in the tangents.
 
-    It is traced where its value or its transpose is needed, and not where it is called:
-    a tangent that nothing depends on costs no compilation. It must not close over
-    arrays.
+    It is traced where its value or its transpose is needed, not where it is called. So
+    a tangent on which nothing depends takes no time to compile. The function must not
+    close over arrays.
     """
     arrays, static = eqx.partition(given, eqx.is_array)
     leaves, structure = jax.tree.flatten((arrays, tangents))
@@ -164,7 +166,8 @@ def deferred(
 
 
 _deferred = Primitive("deferred")
-"""The function, of which the last `linear` arguments are the tangents, and its type."""
+"""A function, with the type `out` of its value. Its last `linear` arguments are the
+tangents."""
 
 
 def _deferred_value(*values, function, **_):

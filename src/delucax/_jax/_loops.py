@@ -12,12 +12,13 @@ from jaxtyping import Array
 
 
 def in_parts(body: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The body of a long loop, with a whole number in its carry.
+    """The body of a long loop, changed so that XLA compiles it in parts. Its carry must
+    hold an integer.
 
-    XLA makes one function of machine code of a loop over small arrays on CPU, with all
-    that is inside. For a solver that takes two or three times as long to compile, on
-    one core, and runs up to 15% faster. XLA leaves a loop in parts if its body calls a
-    library, so this one does, to no effect.
+    On CPU, XLA compiles a loop over small arrays into one function of machine code. For
+    a solver that takes two or three times as long to compile, on one core, and runs up
+    to 15% faster. XLA leaves a loop in parts if its body calls a library. Here a call
+    without effect is added.
     """
 
     def called(carry):
@@ -34,7 +35,7 @@ def in_parts(body: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _zero_by_call(count: Array) -> Array:
-    """Zero, in a way that XLA does not see through: the root of one, less one."""
+    """Zero, in a way that XLA does not simplify: the square root of one, minus one."""
     one = (1 + 0 * count.astype(jnp.float32)).reshape(1, 1)
     root = lax.linalg.cholesky(one, symmetrize_input=False)[0, 0]
     return (root - 1).astype(count.dtype)
@@ -43,12 +44,12 @@ def _zero_by_call(count: Array) -> Array:
 def bounded_while(
     needed: Callable[[Any], Array], turn: Callable[[Any], Any], state: Any, most: int
 ) -> Any:
-    """`state` after `turn` as often as it is `needed`, `most` times at most.
+    """Apply `turn` to `state` while `needed(state)` holds, at most `most` times.
 
-    It has a derivative in both modes, which stores the state at each turn and computes
-    the rest again. Turns that are not needed are skipped: by one test where none is, in
-    blocks where few are. In a batch a turn is needed if one member needs it, so `turn`
-    must leave the others as they are.
+    It has derivatives in both modes, which store the state at each turn and compute the
+    rest again. Turns that are not needed are skipped: all by one test, or in blocks. In
+    a batch, a turn runs if one member needs it, so `turn` must leave the other members
+    as they are.
     """
     turn = jax.checkpoint(turn)
 
