@@ -91,7 +91,7 @@ def split():
             {"terms.0": d.Constant(1.0, size=3)}, "must have the same size"),
         (lambda: (plant(), {"p": plant()}), {"1.p.dt": -1.0}, "dt must be positive"),
         (lambda: dlx.controllers.LQR(dlx.LinearDynamics(A, B), np.eye(2), np.eye(1)),
-            {"K": np.ones((3, 3))}, r"LQR: shapes must fit each other, got K .*\(3, 3\)"),
+            {"K": np.ones((3, 3))}, r"LQR: shapes must fit each other, .*\(3, 3\)"),
         (lambda: dlx.make("single_compartment"),
             {"dynamics.dynamics.system.resistance": [1.0, 2.0]}, "does not accept"),
     ],

@@ -143,7 +143,10 @@ def test_a_goal_is_one_number():
             lambda: dlx.disturbances.Gaussian(1.0, size=1.5),
             "Gaussian: size must be a whole number",
         ),
-        (lambda: dlx.register(3, "a:b"), "register: name must be a non-empty string, got 3"),
+        (
+            lambda: dlx.register(3, "a:b"),
+            "register: name must be a non-empty string, got 3",
+        ),
         (
             lambda: dlx.randomise(
                 dlx.make("pendulum"), jax.random.key(0), {"dynamics.dt": ("a", "b")}

@@ -313,5 +313,7 @@ def test_wrong_estimators_are_named():
         match=r"loss must return \(cost, \{'log_prob': ...\}\), got the met"
     ):
         LikelihoodRatio(4)(lambda m, k: (m, {"x": m}), jnp.asarray(1.0), jr.key(0))
-    with user_error(match="scored_cost: the controller must be a .*StochasticPolicy.* got Zero"):
+    with user_error(
+        match="scored_cost: the controller must be a .*Stochastic.* got Zero"
+    ):
         scored_cost(environment())(dlx.controllers.Zero(1), jr.key(0))

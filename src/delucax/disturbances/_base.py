@@ -177,9 +177,7 @@ class Sum(AbstractDisturbance):
             check_instance(term, AbstractDisturbance, "every term", "Sum")
         sizes = [term.size for term in self.terms]
         if len(set(sizes)) != 1:
-            raise ValueError(
-                f"Sum: terms must have the same size, got sizes {sizes}."
-            )
+            raise ValueError(f"Sum: terms must have the same size, got sizes {sizes}.")
 
     @property
     def size(self) -> int:

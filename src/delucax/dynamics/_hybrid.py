@@ -204,8 +204,7 @@ class Intervals(eqx.Module):
     until: int | None = eqx.field(static=True, default=None)
 
     def __call__(self, x: Array, dt: Array, substeps: int, record: bool) -> Outcome:
-        """The interval of length `dt` from `x`. If it stops early, the state is held.
-        """
+        """The interval of length `dt` from `x`. The state is held if it stops early."""
         events = Events.none(self.max_events, x) if record else None
         known = _knows(self.plant.args[0], x)
         result = choose(known, RESULTS.successful, RESULTS.unknown_mode)
@@ -284,8 +283,7 @@ class Intervals(eqx.Module):
         return jax.tree.map(lambda a, b: jnp.where(run.expected, a, b), after, run)
 
     def _noted(self, ahead, count, stopped, result, events) -> _Run:
-        """The progress with a new next step, and the status of what is wrong with it.
-        """
+        """The progress with a new next step, and the status of what went wrong."""
         going = ~stopped
         over = going & any_of(ahead.expected) & (count >= self.max_events)
         beyond = going & any_of(ahead.beyond)

@@ -117,9 +117,7 @@ def register(name: str, entry_point: str) -> None:
         ```
     """
     if not isinstance(name, str) or not name:
-        raise ValueError(
-            f"register: name must be a non-empty string, got {name!r}."
-        )
+        raise ValueError(f"register: name must be a non-empty string, got {name!r}.")
     module, _, function = str(entry_point).partition(":")
     if not module or not function.isidentifier():
         raise ValueError(

@@ -115,8 +115,7 @@ def largest_of_each(*matrices: Array) -> tuple[Array, ...]:
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
-    """The norm of an equation's residual, divided by the sum of the norms of its terms.
-    """
+    """The norm of the residual of an equation, divided by that of its terms."""
     return relative_and_total_size(error, xp.stack(terms))[0]
 
 
