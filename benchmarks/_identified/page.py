@@ -65,17 +65,33 @@ def page(results: Path) -> None:
 
 def written(results: Path) -> str:
     """The text of the page."""
-    stored = json.loads(results.read_text()) if results.exists() else {}
-    parts = [_HEAD]
+    stored = json.loads(results.read_text())
+    parts = [_HEAD, _summary(stored)]
     for name, (title, about) in _TITLES.items():
-        if name in stored:
-            parts.append(f"## {title}\n\n{about}\n\n{_table(name, stored[name])}")
-    if "coverage" in stored:
-        parts.append(_coverage(stored["coverage"]["rows"]))
+        parts.append(f"## {title}\n\n{about}\n\n{_table(name, stored[name])}")
+    parts.append(_coverage(stored["coverage"]["rows"]))
     parts.append(
         "## Sources\n\n" + "\n".join(f"- {k}: {v}" for k, v in SOURCES.items())
     )
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _summary(stored: dict[str, Any]) -> str:
+    """The medians of the grey boxes."""
+    median = {
+        (name, part): row[part]["median"]
+        for name in _TITLES
+        for row in stored[name]["rows"]
+        if row["method"] == "grey box"
+        for part in list(row)[2:]
+    }
+    return (
+        "In the median of ten seeds, physics with a network has an error of "
+        f"{median['tanks', 'test']:.3f} V on the cascaded tanks, "
+        f"{median['silverbox', 'multisine']:.3f} mV on the multisine of the Silverbox "
+        f"and {median['silverbox', 'arrow']:.3f} mV on its arrow, and "
+        f"{median['bouc_wen', 'multisine']:.1f} um on the multisine of Bouc-Wen."
+    )
 
 
 def _table(name: str, result: dict[str, Any]) -> str:
@@ -94,7 +110,8 @@ def _table(name: str, result: dict[str, Any]) -> str:
         entries = [f"{errors[test]:g}" if test in errors else "-" for test in tests]
         lines.append(f"| {method} | " + " | ".join(entries) + f" | {source} |")
     seconds = result["longest fit, s"]
-    lines.append(f"\nThe longest fit took {seconds:.0f} s with compilation.")
+    title = _TITLES[name][0]
+    lines.append(f"\nThe longest fit ({title}) took {seconds:.0f} s with compilation.")
     return "\n".join(lines)
 
 
