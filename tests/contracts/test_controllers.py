@@ -214,7 +214,8 @@ def test_wrong_observation(case, key):
         controller = case.make(1.0)
         return controller(0.0, jnp.zeros(5), controller.init(key=key))
 
-    with user_error(match="observation of size 2, got size 5.*features=env.encode"):
+    match = "observation must have size 2, got size 5.*features=env.encode"
+    with user_error(match=match):
         eqx.filter_eval_shape(act)
 
 

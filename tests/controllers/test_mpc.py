@@ -262,7 +262,7 @@ def test_bad_arguments_are_named():
         MPC(*given, 5, constraints=lambda t, x, u: x)
     with user_error(match="planner must be an AbstractPlanner"):
         MPC(*given, 5, planner=3)
-    with user_error(match="bounds must be numbers or vectors of 1"):
+    with user_error(match="bounds must be numbers or have shape"):
         MPC(*given, 5, bounds=(-jnp.ones(2), jnp.ones(2)))
     with user_error(match="low <= high"):
         MPC(*given, 5, bounds=(1.0, -1.0))

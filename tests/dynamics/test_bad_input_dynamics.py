@@ -59,7 +59,7 @@ def test_bad_input(arguments, match):
 @pytest.mark.parametrize(
     "returned, match",
     [
-        (lambda x, u: [x[1], u[0]], "got a list .*jnp.stack"),
+        (lambda x, u: [x[1], u[0]], "got a list.*jnp.stack"),
         (lambda x, u: None, "got a NoneType"),
     ],
 )

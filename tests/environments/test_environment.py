@@ -126,8 +126,14 @@ def test_default_noise_of_a_diffusion():
     [
         ({"dynamics": dlx.systems.Pendulum()}, "dynamics must be an AbstractDynamics"),
         ({"cost": lambda t, x, u: 0.0}, "cost must be an AbstractCost"),
-        ({"disturbance": dlx.disturbances.Zero(3)}, "disturbance has size 3 where 2"),
-        ({"sensor_noise": dlx.disturbances.Zero(1)}, "sensor_noise has size 1 where 2"),
+        (
+            {"disturbance": dlx.disturbances.Zero(3)},
+            "disturbance must have size 2",
+        ),
+        (
+            {"sensor_noise": dlx.disturbances.Zero(1)},
+            "sensor_noise must have size 2",
+        ),
         ({"disturbance": 0.1}, "disturbance must be an AbstractDisturbance"),
         ({"initial_state": jnp.zeros(3)}, r"initial_state must have shape \(2,\)"),
         ({"control_bounds": (1.0, -1.0)}, "low <= high"),

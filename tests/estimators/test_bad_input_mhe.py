@@ -47,7 +47,10 @@ WALK = c.RandomWalk(0.1)
         (dict(parameters=["system.length"]), "parameters must be a dictionary"),
         (dict(parameters={"system.length": 0.1}), "parameters must be a dictionary"),
         (dict(parameters={"system.lenght": WALK}), "parameters: .* 'lenght'.*length"),
-        (dict(parameters={"solver": WALK}), "parameters names 'solver', .* start from"),
+        (
+            dict(parameters={"solver": WALK}),
+            "parameters names 'solver', .* start",
+        ),
         (
             dict(parameters={"system.length": c.RandomWalk([0.1, 0.1])}),
             r"variance of parameters\['system.length'\]",
@@ -62,7 +65,7 @@ def test_a_wrong_argument(options, match):
 
 def test_a_parameter_that_is_not_a_number():
     broken = eqx.tree_at(lambda d: d.system.length, PENDULUM, jnp.array(jnp.nan))
-    with user_error(match="system.length.*start from.* must be finite"):
+    with user_error(match="system.length.*start value.* must be finite"):
         mhe(broken, parameters={"system.length": WALK})
 
 

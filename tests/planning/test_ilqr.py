@@ -351,7 +351,7 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
         (dict(controls=jnp.full((5, 1), jnp.inf)), "controls must be finite"),
         (dict(bounds=(1.0, -1.0)), "bounds must have low <= high"),
         (dict(bounds=3.0), "bounds must be a pair"),
-        (dict(bounds=([0.0, 0.0], 1.0)), "bounds must be numbers or vectors of 1"),
+        (dict(bounds=([0.0, 0.0], 1.0)), "bounds must be numbers or have shape"),
         (dict(w=jnp.zeros((4, 2))), "w must have shape"),
         (dict(states=jnp.zeros((5, 2))), "states must have shape"),
         (dict(states=jnp.full((6, 2), jnp.nan)), "states must be finite"),

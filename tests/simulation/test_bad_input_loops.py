@@ -62,10 +62,10 @@ def simulate(controller=FEEDBACK, **arguments):
 @pytest.mark.parametrize(
     "kind, match",
     [
-        ("alone", r"must return \(u, state\).*got an array of shape \(1,\)"),
+        ("alone", r"__call__ must return \(u, state\).*got an array of shape \(1,\)"),
         ("dtype", r"state must keep .*i32\[\], got f\d\d\[\]"),
         ("shape", r"state\['seen'\] must keep .*\[2\], got f\d\d\[3\]"),
-        ("number", "state must keep .*, 0, got .*JAX array from the start"),
+        ("number", "state must keep .*, 0, got .*JAX arrays for all that changes"),
         ("structure", r"state must keep the structure.*\(f\d\d\[1\],\), got \{\}"),
     ],
 )

@@ -68,8 +68,8 @@ def check_state(controller: AbstractController, first: PyTree, after: PyTree) ->
         raise ValueError(
             f"{type(controller).__name__}: state{jax.tree_util.keystr(path)} must keep "
             "the structure, shape and dtype that init gives it, "
-            f"{eqx.tree_pformat(before)}, got {eqx.tree_pformat(now)}. Make everything "
-            "that changes a JAX array in init."
+            f"{eqx.tree_pformat(before)}, got {eqx.tree_pformat(now)}. In init, use "
+            "JAX arrays for all that changes."
         )
 
 
