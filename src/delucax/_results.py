@@ -58,8 +58,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     not_converged = "The iteration did not converge within its step limit."
     unexciting = (
         "The data do not identify all parameters: there are too few, or they excite "
-        "the system too little. With throw=False you get the fit, which names the "
-        "parameters that are not identified."
+        "the system too little. With throw=False you get the fit, which shows the "
+        "direction that is not identifiable."
     )
     no_descent = (
         "No step lowered the cost, although the gradient is not zero. The problem may "
