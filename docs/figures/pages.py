@@ -21,8 +21,7 @@ from PIL import Image
 
 DOCS = Path(__file__).parents[1]
 PICTURES = {
-    "index.md": ["van_der_pol.png"],
-    "first_system.md": ["first_system.png"],
+    "first_system.md": ["first_system.png", "van_der_pol.png"],
     "events.md": ["bounces.png", "wheel.png"],
     "gradients.md": [],
     "linear_analysis.md": ["bode.png", "nyquist.png", "root_locus.png"],
