@@ -88,7 +88,9 @@ _SILENT = [
 
 def pages(root: Path) -> list[str]:
     """The pages that are held to the ledger."""
-    found = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    docs = root / "docs"
+    found = [root / "README.md", *sorted(docs.glob("*.md"))]
+    found += sorted(docs.glob("coming_from/*.md"))
     found += sorted((root / "notebooks").glob("*.ipynb"))
     return [str(path.relative_to(root)) for path in found]
 

@@ -218,6 +218,21 @@ def counted_programs():
         jax.monitoring.unregister_event_duration_listener(listen)
 
 
+def pages_of(root):
+    """README and the pages of the documentation, without the reference and the
+    notebooks."""
+    docs = root / "docs"
+    pages = [page.relative_to(docs) for page in docs.rglob("*.md")]
+    own = [page for page in pages if page.parts[0] not in ("api", "notebooks")]
+    return sorted([root / "README.md", *(docs / page for page in own)])
+
+
+def name_of(root, page):
+    """The name of a page, with that of its folder in `docs`."""
+    docs = root / "docs"
+    return str(page.relative_to(docs if docs in page.parents else root))
+
+
 class CountCalls:
     """Counts how often it is traced, when it is called inside a compiled function."""
 

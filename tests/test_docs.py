@@ -6,17 +6,20 @@ that it raises the error that the `text` block after it shows, and `<!-- notest:
 -->`, or `notest` after the language, that it is left out.
 """
 
+import importlib.util
 import itertools
 import re
 from pathlib import Path
 
 import pytest
 from examples import check_output, output_of
-from helpers import as_a_user, has_compiler
+from helpers import as_a_user, has_compiler, name_of, pages_of
+
+import delucax as dlx
 
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("README.md")])
+PAGES = pages_of(ROOT)
 BLOCK = re.compile(
     r"^(?:<!-- (?P<mark>notest|raises)[^\n]*-->\n)?"
     r"```(?P<language>python|text)(?P<rest>[^\n]*)\n(?P<code>.*?)^```$",
@@ -46,11 +49,14 @@ RUNNABLE = [page for page in PAGES if list(_blocks(page))]
 
 
 def test_pages_are_found():
-    names = {page.name for page in RUNNABLE}
-    assert {"index.md", "first_system.md", "gradients.md", "errors.md"} <= names
+    names = {name_of(ROOT, page) for page in RUNNABLE}
+    assert {"index.md", "first_system.md", "gradients.md"} <= names
+    assert {"troubleshooting.md", "coming_from/diffrax.md"} <= names
 
 
-@pytest.mark.parametrize("page", [pytest.param(p, id=p.name) for p in RUNNABLE])
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, id=name_of(ROOT, p)) for p in RUNNABLE]
+)
 def test_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
@@ -70,3 +76,17 @@ def test_page_runs(page, tmp_path, monkeypatch):
             exec(compile(code, str(page), "exec"), namespace)
         message = f"{raised.type.__name__}: {raised.value}"
         assert message.split() == shown.split()
+
+
+def test_every_status_is_explained():
+    text = (ROOT / "docs" / "troubleshooting.md").read_text()
+    missing = [name for name in dlx.RESULTS._name_to_item if f"`{name}`" not in text]
+    assert not missing
+
+
+def test_layers_are_drawn_as_they_are():
+    path = ROOT / "docs" / "figures" / "layers.py"
+    spec = importlib.util.spec_from_file_location("layers", path)
+    layers = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(layers)
+    assert layers.PICTURE.read_text() == layers.picture(layers.settings())

@@ -6,13 +6,13 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers import once
+from helpers import name_of, once, pages_of
 
 
 pytestmark = once
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"])
+PAGES = pages_of(ROOT)
 NAME = re.compile(r"\b(?:dlx|delucax)((?:\.[A-Za-z_]\w*)+)")
 CODE = re.compile(r"^( *)```.*?^\1``` *$", re.DOTALL | re.MULTILINE)
 
@@ -50,7 +50,7 @@ def test_what_is_looked_for():
     assert _exists(f"{sb3}.SB3VecEnv") and not _exists(f"{sb3}.Nothing")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+@pytest.mark.parametrize("page", PAGES, ids=[name_of(ROOT, page) for page in PAGES])
 def test_names_exist(page):
     missing = sorted(
         f"delucax{name}" for name in _names(page.read_text()) if not _exists(name)
