@@ -117,8 +117,9 @@ types: $(VENV)/.dev ## static types
 	$(bin)/pyright
 
 .PHONY: docs
-docs: $(VENV)/.docs ## build the site into site/; a warning is an error
+docs: $(VENV)/.docs ## build the site into site/ and check it; a warning is an error
 	$(bin)/properdocs build --strict --config-file mkdocs.yml
+	$(bin)/python scripts/check_site.py
 
 .PHONY: serve
 serve: $(VENV)/.docs ## show the site on this machine while editing it

@@ -6,12 +6,17 @@ neither JavaScript for its mathematics nor a network, and the sources stay plain
 and `$$...$$`. An equation that cannot be converted is a warning, hence an error in a
 strict build.
 
-The page of claims is written from the ledger.
+The page of claims is written from the ledger, and the tables of names in the reference
+from the docstrings. The version of the package stands in the header.
 """
 
 import html
+import importlib.metadata
 import importlib.util
+import inspect
 import logging
+import pkgutil
+import posixpath
 import re
 import sys
 import tomllib
@@ -30,6 +35,14 @@ _EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 
 # A class without an `__init__` of its own shows that of `object`.
 _NO_INIT = re.compile(r"<p>Initialize self\.\s+See help\(type\(self\)\)[^<]*</p>")
+
+# Headings, figures of a notebook that nothing describes, and links to other sources.
+_FIGURE = re.compile(
+    r"<h\d[^>]*>(.*?)</h\d>|"
+    r'<img(?: alt="No description[^"]*")?(?=[\s>])(?![^>]*\salt=)',
+    re.DOTALL,
+)
+_LINK = re.compile(r'href="([^":#]+\.(?:md|ipynb))(#[^"]*)?"')
 
 # mkdocs-jupyter offers MathJax from the network to every page; nothing is left for it.
 _MATHJAX = re.compile(r"<script data-mkdocs-jupyter-mathjax=.*?</script>", re.DOTALL)
@@ -76,10 +89,59 @@ def _symbol(match: re.Match[str]) -> str:
     return f"<mo>{match.group(1)}</mo>" if kind[0] in "PS" else match.group()
 
 
-def on_page_markdown(markdown: str, /, *, page: Any, **_: Any) -> str:
-    """Put the ledger of claims into its page."""
+def on_config(config: Any, /, **_: Any) -> Any:
+    """What the templates show, which is known only to the package."""
+    config.extra["release"] = importlib.metadata.version("delucax")
+    return config
+
+
+def on_nav(nav: Any, /, **_: Any) -> Any:
+    """Make `api/qp.md` the index of the section whose other pages are in `api/qp/`."""
+    sections = list(nav.items)
+    while sections:
+        children = sections.pop().children or []
+        sections += children
+        pages = [child for child in children if child.is_page]
+        for page in pages[1:]:
+            if pages[0].url != "./" and page.url.startswith(pages[0].url):
+                pages[0].file.name = "index"  # its address is known by now
+    return nav
+
+
+def on_page_markdown(markdown: str, /, *, page: Any, **more: Any) -> str:
+    """Put the ledger of claims into its page, and tables of names into the reference;
+    and name what a search for a page should find it by.
+    """
+    source = page.file.src_uri
+    words = more["config"].extra.get("keywords", {}).get(source)
+    if words:
+        page.meta.setdefault("tags", words)
+    package, *inner = source.removeprefix("api/").removesuffix(".md").split("/")
+    if source.startswith("api/") and package != "index":
+        heading = markdown.lstrip("# ").split("\n", 1)[0]
+        page.meta.setdefault("title", heading if inner else f"delucax.{package}")
+
+    def names(match: re.Match[str]) -> str:
+        other = more["files"].get_file_from_path(f"api/{match.group(1)}")
+        return table_of_names(other.content_string if other else markdown, package)
+
+    markdown = re.sub(r"<!-- names(?:: (\S+))? -->", names, markdown)
     mark = "<!-- ledger -->"
     return markdown.replace(mark, ledger()) if mark in markdown else markdown
+
+
+def table_of_names(markdown: str, package: str) -> str:
+    """The names that a page of the reference documents, with their first sentences."""
+    lines = ["| name | |", "|---|---|"]
+    for name in re.findall(r"^::: (\S+)", markdown, re.MULTILINE):
+        value = pkgutil.resolve_name(name)
+        is_documented = inspect.isclass(value) or callable(value)
+        doc = (inspect.getdoc(value) or "") if is_documented else ""
+        said = " ".join(doc.split("\n\n")[0].split())
+        said = re.split(r"(?<=[^.]{3}[.:]) ", said)[0].rstrip(".,:;")
+        short = name.removeprefix("delucax.").removeprefix(f"{package}.")
+        lines.append(f"| [`{short}`][{name}] | {said.replace('|', chr(92) + '|')} |")
+    return "\n".join(lines)
 
 
 def ledger() -> str:
@@ -110,8 +172,10 @@ def _each(names: Iterable[str | None]) -> str:
     return ", ".join(f"`{name}`" for name in dict.fromkeys(names) if name)
 
 
-def on_page_content(html_text: str, /, *, page: Any, **_: Any) -> str:
+def on_page_content(html_text: str, /, *, page: Any, files: Any, **_: Any) -> str:
     """Replace every marked equation of a page, and drop what says nothing."""
+    if page.file.src_uri.endswith(".ipynb"):
+        html_text = described(linked(html_text, page.file, files))
 
     def render(match: re.Match[str]) -> str:
         source = html.unescape(match.group(2)).strip()
@@ -124,6 +188,35 @@ def on_page_content(html_text: str, /, *, page: Any, **_: Any) -> str:
             return match.group()
 
     return _EQUATION.sub(render, _NO_INIT.sub("", html_text))
+
+
+def linked(html_text: str, file: Any, files: Any) -> str:
+    """A notebook whose links to pages and notebooks lead to what they have become."""
+
+    def lead(match: re.Match[str]) -> str:
+        path = posixpath.join(posixpath.dirname(file.src_uri), match.group(1))
+        target = files.get_file_from_path(posixpath.normpath(path))
+        if target is None:
+            _log.warning("%s: no page for %s", file.src_uri, match.group(1))
+            return match.group()
+        return f'href="{target.url_relative_to(file)}{match.group(2) or ""}"'
+
+    return _LINK.sub(lead, html_text)
+
+
+def described(html_text: str) -> str:
+    """A notebook whose figures say which section they belong to."""
+    section = ""
+
+    def describe(match: re.Match[str]) -> str:
+        nonlocal section
+        if match.group(1) is None:
+            return f'<img alt="A figure of the section {section}"'
+        heading = re.sub(r"<.*?>|¶|&para;", "", match.group(1))
+        section = html.escape(html.unescape(" ".join(heading.split())))
+        return match.group()
+
+    return _FIGURE.sub(describe, html_text)
 
 
 def on_post_page(output: str, /, **_: Any) -> str:

@@ -8,7 +8,7 @@ from benchmarks._identified.published import RESULTS as PUBLISHED, SOURCES
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "identification_exam.md"
-_HEAD = """# Identification, graded by public data
+_HEAD = """# Identification on public data
 
 This page shows three public benchmarks of nonlinear identification, with published
 results beside ours, and a check of our intervals on simulated plants. To make it again,

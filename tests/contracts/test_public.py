@@ -134,7 +134,7 @@ def test_example_runs(name, value, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", [name for name, _ in MEMBERS])
 def test_name_is_on_the_site(name):
-    pages = "\n".join(page.read_text() for page in sorted(DOCS.glob("*.md")))
+    pages = "\n".join(page.read_text() for page in sorted(DOCS.rglob("*.md")))
     assert re.search(
         rf"^ *(:::|##+) +`?{re.escape(name)}`?\s*$", pages, re.MULTILINE
     ), f"{name} is on no page of docs/api"

@@ -50,7 +50,7 @@ class PublishedLung(AbstractDynamics):
 
     Rebuilt from the published weights; the authors' program was not run. Under the
     conditions of their notebook it has the errors that are printed there, see
-    [the comparison](../ventilator.md#the-published-simulator).
+    [the comparison](../../ventilator.md#the-published-simulator).
 
     The state is (the controls, the pressures, both scaled and newest first, and the
     count of steps), and the observation is the pressure [cmH2O].
