@@ -1,4 +1,4 @@
-"""The tables and the figure of `docs/ventilator.md`, from the committed results."""
+"""The tables and the figure of `docs/ventilator_results.md`, from what is stored."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from delucax.studies.ventilator._report import PID_ROWS
 
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGE = DOCS / "ventilator.md"
+PAGE = DOCS / "ventilator_results.md"
 
 
 def write_page(results: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ ELSEWHERE = {
     ("wall-clock", "in one chain"): (
         "[the wall-clock table](benchmarks.md#the-wall-clock-table-of-the-deluca-paper)"
     ),
-    ("ventilator", ""): "[with 20 seeds](ventilator.md#limits)",
+    ("ventilator", ""): "[with 20 seeds](ventilator_results.md#limits)",
 }
 BEGIN, END = "<!-- table: claims -->\n", "<!-- end: claims -->"
 

@@ -38,19 +38,30 @@ OUT = Path(__file__).parent / "results" / "riccati_exam.json"
 PAGE = ROOT / "docs" / "riccati_exam.md"
 HEAD = """# Riccati equations, system by system
 
-The 20 continuous and 15 discrete systems of the collections CAREX and DAREX (P. Benner,
-A. J. Laub and V. Mehrmann, 1995) with the data of SciPy's own tests, and four systems
-that users of SciPy reported; then families of them over their parameters. `python -m
-benchmarks.riccati_exam` makes this page.
+Does a solver find the right solution of your Riccati equation? This page compares SciPy
+and delucax on published test systems. `python -m benchmarks.riccati_exam` makes it.
 
-The residual is that of the equation, over the sum of the norms of its terms, of what
-each solver finds in double precision. It is evaluated in 60 digits for all; the
-column "reported" is the residual that delucax itself returns, and should never be the
-smaller of the two. A residual is no certificate: the bound is the spectral abscissa of
-the closed loop (below 0 if it is stable) in continuous time and its spectral radius
-(below 1) in discrete time. In single precision the data are rounded first, and what
-counts as solved is 1e-5 instead of 1e-12; a solver whose precision does not suffice
-says so. The loop of CAREX 11 is on the boundary.
+There are 39 systems: the 20 continuous and 15 discrete ones of the collections CAREX
+and DAREX (P. Benner, A. J. Laub and V. Mehrmann, 1995), with the data of SciPy's own
+tests, and four that users of SciPy reported. The second table has families of them over
+their parameters.
+
+How to read the first table:
+
+- **SciPy**, **slycot**, **delucax**: the relative residual of what each solver finds in
+  double precision. It is the residual of the equation, divided by the sum of the norms
+  of its terms. It is evaluated in 60 digits for all solvers.
+- **reported**: the residual that delucax itself returns. It should never be smaller
+  than the residual before it.
+- **bound**: the spectral abscissa of the closed loop in continuous time (below 0 if the
+  loop is stable), and its spectral radius in discrete time (below 1). This matters
+  because a small residual does not prove that a solution stabilises.
+- **result**: what delucax says about its solution.
+- **float32**, **its result**: the same in single precision. The data are rounded first,
+  and an equation counts as solved at 1e-5 instead of 1e-12. If the precision does not
+  suffice, the solver says so.
+
+The loop of CAREX 11 is on the boundary of stability.
 
 """
 
@@ -158,9 +169,11 @@ def page(rows: list[dict[str, Any]], families: list[dict[str, Any]]) -> str:
         lines.append("\nslycot was not installed where this page was made.")
     lines.append("\n## Families\n")
     lines.append(
-        "The worst relative residual of each, and how many of its members each solver "
-        "brings below 1e-12; for delucax with a certificate. In float32: how many are "
-        "certified, and the worst residual of these.\n"
+        "A family varies the parameters of a system. The columns SciPy and delucax "
+        "count the members that the solver brings below 1e-12; for delucax the "
+        "solution must also be certified as stabilising. The next two have the worst "
+        "residuals. In float32: how many members are certified, and the worst residual "
+        "of these.\n"
     )
     head = "| family | members | SciPy | delucax | worst SciPy | worst delucax |"
     lines += [head + " float32 | its worst |", "|---" * 8 + "|"]

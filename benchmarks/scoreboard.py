@@ -61,8 +61,9 @@ def example(board: Board, plain: str = "van_der_pol", offset: str = "neural") ->
     best, cost, _, excess, best_2, cost_2, zero_2, excess_2 = said
     return (
         f"On `{plain}` the best known costs {best} and LQR {cost}: {excess}. On "
-        f"`{offset}` the best known costs {best_2} and zero control {zero_2}, so that "
-        f"MPC, at {cost_2}, is not nearly perfect: {excess_2}.\n"
+        f"`{offset}` the best known costs {best_2} and zero control {zero_2}. MPC "
+        f"costs {cost_2} there, which looks nearly perfect, but it misses part of what "
+        f"the best known saves: {excess_2}.\n"
     )
 
 
@@ -81,21 +82,22 @@ def best_table(board: Board) -> str:
 def tables(board: Board) -> str:
     """How often each method is near the best known, scores, costs and speed."""
     made = ["## How often a method is good\n", how_often(board)]
-    made += ["## Score\n\nPercent above the best known, 0 being the best.\n"]
+    made += ["## Score\n\nPercent above the best known. 0 is the best.\n"]
     made += [_by_task(board, board.methods, board.excess, score)]
     single = [m for m in TRAINED for t in board.names if board.trainings(t, m) == 1]
-    once = " Without brackets there was but one." if single else ""
+    once = " Without brackets there was only one." if single else ""
     made.append(
-        "## Cost\n\nOf an episode, the interquartile mean over 8 starts. Of several "
-        f"trainings the middle one, and in brackets the least and the most.{once}\n"
+        "## Cost\n\nThe cost of an episode, as the interquartile mean over 8 starts. "
+        "Of several trainings this is the middle one, with the least and the most in "
+        f"brackets.{once}\n"
     )
     for name, family in _families(board):
         show = lambda spread: _spread(spread) if spread else ""
         made.append(f"### {name}: cost\n")
         made.append(_by_task(board, family, board.cost, show, best=True))
     made.append(
-        "## Time\n\nMicroseconds a step, the controller included, of each of a batch "
-        "of 8. Two processes ran side by side, on the two threads of one core.\n"
+        "## Time\n\nMicroseconds per step of each of a batch of 8, including the "
+        "controller. Two processes ran side by side, on the two threads of one core.\n"
     )
     for name, family in _families(board):
         took = lambda task, method: board.speeds.get((task, method))

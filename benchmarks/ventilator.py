@@ -4,8 +4,8 @@ Runs `python -m delucax lung` with more seeds into a folder; times the parts on 
 lung; fits learned lungs as published; and trains the same controller by the gradient,
 by evolution strategies and by proximal policy optimisation, with as many steps of the
 simulator and with more. A run that was cut off goes on in its folder. Prints tables,
-and writes `benchmarks/results/ventilator.json` and the tables of `docs/ventilator.md`;
-`--page` does the latter from what is stored.
+and writes `benchmarks/results/ventilator.json` and the tables of
+`docs/ventilator_results.md`; `--page` does the latter from what is stored.
 
 The limits were written before the first run. Where there are seeds, the upper end of
 the 95% interval of the mean decides.

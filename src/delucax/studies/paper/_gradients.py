@@ -186,20 +186,20 @@ def estimator_variance(small: bool = False) -> Finding:
             bool(max(ratios["analytic"]) < 1e-9),
         ),
         Claim(
-            "That of evolution strategies grows in proportion to the parameters "
-            "(slope 0.8 to 1.2 on log-log axes)",
+            "The variance of evolution strategies grows in proportion to the number of "
+            "parameters (slope 0.8 to 1.2 on log-log axes)",
             f"slope {steep:.2f}",
             0.8 <= steep <= 1.2,
         ),
         Claim(
-            "That of REINFORCE does not depend on the number of parameters (slope -0.2 "
-            "to 0.2), but adds to the problem's own",
+            "The variance of REINFORCE does not depend on the number of parameters "
+            "(slope -0.2 to 0.2), but adds to that of the problem",
             f"slope {flat:.2f}, {last:.3g} times the squared gradient",
             abs(flat) <= 0.2 and last > 0,
         ),
         Claim(
-            "Over a long horizon, with starts at random, the analytic gradient loses: "
-            "its variance grows above that of REINFORCE at as many rollouts",
+            "Over a long horizon with random starts the analytic gradient loses: its "
+            "variance grows above that of REINFORCE, at equal rollouts",
             f"{exploding:.1e} times from {over[0]['horizon']} to {over[-1]['horizon']} "
             f"steps; above from {lost[0]} steps on"
             if lost

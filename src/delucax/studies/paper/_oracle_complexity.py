@@ -71,7 +71,7 @@ def oracle_complexity(small: bool = False) -> Finding:
         Claim(
             "Central differences call the dynamics 2 (6 + 2) = 16 times for each "
             "linearisation, automatic differentiation once",
-            f"{central} against {automatic}, counted as it happens",
+            f"{central} against {automatic}, counted at run time",
             (automatic, central) == (1, 16),
         ),
         Claim(

@@ -28,7 +28,7 @@ def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
             bool(worst <= 0.4),
         ),
         Claim(
-            "Its error is at most half of that of physics that is not the lung's",
+            "Its error is at most half of the error of a model with the wrong physics",
             f"{relative:.2f} times at most",
             bool(relative <= 0.5),
         ),
