@@ -133,7 +133,7 @@ def test_a_plan_is_a_controller(best):
     expected = plan.controls[5] - plan.gains[5] @ (0.1 * jnp.ones(2))
     assert_close(u, expected, rtol=1e-5)
     assert jnp.isnan(plan(2.0, x0, None)[0]) and jnp.isnan(plan(-0.1, x0, None)[0])
-    with user_error(match="observation of size 2"):
+    with user_error(match="observation must have size 2"):
         plan(0.0, jnp.zeros(3), None)
 
 
