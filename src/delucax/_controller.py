@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ._check import check_instance
 from ._message import shortened
-from ._module import check_parameters, parts_of
+from ._module import check_parameters, parts_of, shown
 from ._typing import PRNGKey, RealScalar
 
 
@@ -82,6 +82,8 @@ class AbstractController(eqx.Module):
         (1,)
         ```
     """
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

@@ -1,5 +1,6 @@
 """Status codes, in one enumeration with those of Diffrax, Optimistix and Lineax."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -131,8 +132,42 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 if TYPE_CHECKING:
     Result: TypeAlias = Any
 else:
-    Result = type(RESULTS.successful)
-"""An item of `RESULTS`; the type of every `result` field."""
+    Result = type(diffrax.RESULTS.successful)
+"""An item of `RESULTS`, or of Diffrax's; the type of every `result` field."""
+
+
+class _Item(Result):
+    """An item of `RESULTS` that prints its name and its message."""
+
+    def __repr__(self):
+        if isinstance(self._value, Tracer):
+            return "<RESULTS: traced>"
+        names = list(RESULTS._name_to_item)
+        codes, counts = np.unique(np.asarray(self._value), return_counts=True)
+        if np.ndim(self._value):  # of a batch
+            each = (f"{n} {names[code]}" for code, n in zip(codes, counts, strict=True))
+            return f"<RESULTS: {', '.join(each)}>"
+        message = RESULTS[self]
+        return f"<RESULTS.{names[codes[0]]}{': ' if message else ''}{message}>"
+
+
+def _print_names() -> None:
+    """Make `RESULTS`, and its functions that make items, hold items of that class."""
+
+    def ours(make: Callable[..., Any]) -> Any:
+        def made(*args):
+            item = make(*args)
+            return item if isinstance(item, _Item) else _Item(item._value, RESULTS)
+
+        return staticmethod(functools.wraps(make)(made))
+
+    items: Any = RESULTS._name_to_item
+    items |= {name: _Item(item._value, RESULTS) for name, item in items.items()}
+    for make in (RESULTS.promote, RESULTS.where):
+        setattr(RESULTS, make.__name__, ours(make))
+
+
+_print_names()
 
 
 INCIDENTS = {

@@ -8,6 +8,8 @@ import re
 import textwrap
 from pathlib import Path
 
+import diffrax
+import equinox as eqx
 import pytest
 from examples import check_output, output_of
 from helpers import has_compiler
@@ -68,6 +70,14 @@ def test_docstring_names_every_argument(name, value):
         return
     missing = _unnamed(value, doc)
     assert not missing, f"{name}: the docstring does not name {missing}"
+
+
+def test_modules_print_their_values():
+    """`__repr__ = shown` belongs in the first class of a family."""
+    for name, value in CALLABLES:
+        is_module = inspect.isclass(value) and issubclass(value, eqx.Module)
+        if is_module and not issubclass(value, diffrax.AbstractSolver):
+            assert value.__repr__ is not eqx.Module.__repr__, name
 
 
 @pytest.mark.parametrize("name, value", CALLABLES, ids=IDS)

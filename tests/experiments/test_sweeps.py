@@ -83,7 +83,7 @@ def test_workers_give_the_same_and_their_death_harms_no_other(file, capfd):
     out = capfd.readouterr()
     assert "FAILED count[2]: ArithmeticError: two <is> bad" in out.err
     assert "worker" in out.err and "8/8" in out.err
-    assert "8 cases in both.jsonl" in out.out
+    assert "The results of 8 cases are in both.jsonl" in out.out
 
 
 def test_fixtures_of_workers_are_let_go_with_the_run(tmp_path):
@@ -161,7 +161,8 @@ def test_the_command_line(file, capsys):
     out = capsys.readouterr().out
     assert "count[9]  (slow)" in out and "5 cases" in out
     for args, message in (
-        (["run", "none.py"], "there is no file"),
+        (["run", "none.py"], "run: there is no file"),
+        (["list", "none.py"], "list: there is no file"),
         (["run", "json"], "there is no experiment in json"),
         (["run", "no.such.module"], "cannot be imported"),
         (["run", file, "-k", "a b"], "select must be words"),

@@ -68,7 +68,7 @@ def test_the_report_holds_claims_tables_and_images(tmp_path, made_up):
     assert '<img src="data:image/gif;base64,R0lGODlh" alt="breath">' in page
     assert "RuntimeError: no &lt;plant&gt;" in page
     assert "no <plant>" in (tmp_path / "broken.txt").read_text()
-    assert "  Breaths: 1 s" in lines and "1 of 3 claims hold" in lines[-1]
+    assert "  Breaths: 1 s" in lines and "1 of 3 claims hold" in lines[-2]
 
 
 def test_small_and_full_lungs_are_apart(tmp_path, made_up):

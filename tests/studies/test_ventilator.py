@@ -65,7 +65,7 @@ def test_goes_on_where_it_was_cut_off(tmp_path):
         stages.training("second", "Two", cut_off, "data")
     again = Stages(tmp_path, {"seeds": 1}, said.append, progress=False)
     assert_close(again.stage("first", "One", first), [0.0, 1.0, 2.0])
-    assert made == ["first"] and said[-1].startswith("One: found")
+    assert made == ["first"] and said[-1].startswith("One: done before")
     # What is left of its training is there to go on from, and gone at its end.
     left = []
 
@@ -124,7 +124,8 @@ def test_breaths_that_are_left_out_are_said(tmp_path, monkeypatch):
     for _ in range(2):  # also where the breaths are found
         with pytest.raises(KeyboardInterrupt):
             studies.lung_study(tmp_path / "out", data=data, say=said.append)
-        assert "2 of the 16 breaths are left out: each of the 2 lungs has 7" in said[-1]
+        assert "2 of the 16 breaths are left out, so that each of" in said[-1]
+        assert "the 2 lungs has 7 breaths" in said[-1]
 
 
 def test_what_passed_the_limit_is_not_saved(tmp_path):
@@ -194,7 +195,7 @@ def test_what_has_no_finite_error_is_not_chosen():
     assert best_candidates(candidates, errors, True)["number"].tolist() == [4, 5]
     assert divergence_note(np.zeros(5), errors[:, 2]) == ""
     assert "2 of 6 errors are not finite" in divergence_note(np.zeros(5), errors)
-    assert "in 1 of 5 steps" in divergence_note(np.eye(5)[0], errors[:, 2])
+    assert "In 1 of 5 training steps" in divergence_note(np.eye(5)[0], errors[:, 2])
 
 
 def write_lungs(path, lungs, breaths):

@@ -26,6 +26,7 @@ from ._paths import (
     with_values as with_values,
 )
 from ._serialise import load as load, save as save
+from ._shown import shown as shown
 from ._stack import (
     count_of as count_of,
     stack as stack,

@@ -354,7 +354,8 @@ class _Reader:
             fitted = np.where(numbers == int(number), _number(item), fitted)
         fitted = fitted.astype(numbers.dtype)
         fitted = jnp.asarray(fitted) if isinstance(value, jax.Array) else fitted
-        return Result(fitted, enumeration)  # pyright: ignore[reportCallIssue]
+        first = next(iter(enumeration._name_to_item.values()))
+        return jax.tree.map(lambda _: fitted, first)
 
     def build_module(self, content, node):
         cls = self.class_of(content, eqx.Module, "module class")

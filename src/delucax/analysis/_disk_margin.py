@@ -4,6 +4,7 @@ import equinox as eqx
 
 from .._check import check_at_most, check_count
 from .._jax import compiled_unless_on_host, host_unless_traced, xp
+from .._module import shown
 from .._results import raise_on_failure, Result
 from .._typing import RealScalar, Scalar
 from ._gains import peak_gain
@@ -41,6 +42,8 @@ class DiskMargin(eqx.Module):
     gain_high: Scalar
     phase: Scalar
     result: Result
+
+    __repr__ = shown
 
 
 @host_unless_traced

@@ -12,7 +12,7 @@ from .._jax import (
     while_loop,
     xp,
 )
-from .._module import as_float_array
+from .._module import as_float_array, shown
 from .._results import choose, raise_if, raise_on_failure, Result, RESULTS
 from .._typing import Array, BoolScalar, Scalar
 from ..math._linear_solve import eigenvalues, lu_solve
@@ -165,6 +165,8 @@ class PeakGain(eqx.Module):
     gain: Scalar
     frequency: Scalar
     result: Result
+
+    __repr__ = shown
 
 
 @host_unless_traced

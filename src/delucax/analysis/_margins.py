@@ -10,6 +10,7 @@ from .._jax import (
     vmap,
     xp,
 )
+from .._module import shown
 from .._results import first_of, raise_on_failure, Result
 from .._typing import BoolScalar, Scalar
 from ._crossings import crossings, follow, gains
@@ -69,6 +70,8 @@ class Margins(eqx.Module):
     disk_t: DiskMargin
     is_stable: BoolScalar
     result: Result
+
+    __repr__ = shown
 
 
 @host_unless_traced

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Complex, Float
 
 from .._check import check_positive, is_concrete
 from .._jax import compiled_unless_on_host, host_unless_traced, stop_gradient, vmap, xp
+from .._module import shown
 from .._typing import Array, BoolScalar, RealScalar, Scalar
 from ..math._linear_solve import eigenvalues
 from ._state_space import LinearModel, state_space, StateSpace
@@ -46,6 +47,8 @@ class ModalTest(eqx.Module):
     distances: Float[Array, " n"]
     unstable: Bool[Array, " n"]
     tolerance: Scalar
+
+    __repr__ = shown
 
     @property
     @host_unless_traced

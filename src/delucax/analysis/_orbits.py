@@ -18,7 +18,7 @@ from .._check import (
     is_concrete,
 )
 from .._jax import bounded_while, jacobian
-from .._module import as_float_array
+from .._module import as_float_array, shown
 from .._results import choose, promote, raise_on_failure, Result, RESULTS
 from .._typing import Numbers, RealScalar
 from ..dynamics import Discretized
@@ -53,6 +53,8 @@ class Return(eqx.Module):
     time: Array
     result: Result
 
+    __repr__ = shown
+
 
 class PeriodicOrbit(eqx.Module):
     """An orbit that returns to itself, as [`delucax.analysis.periodic_orbit`][] finds.
@@ -83,6 +85,8 @@ class PeriodicOrbit(eqx.Module):
     jacobian: Array
     multipliers: Array
     result: Result
+
+    __repr__ = shown
 
 
 def poincare_map(

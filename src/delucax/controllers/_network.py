@@ -22,7 +22,7 @@ from .._check import (
     is_concrete,
 )
 from .._controller import AbstractController, wrong_observation
-from .._module import as_float_array, function_field, mlp, parameter, weight
+from .._module import as_float_array, function_field, mlp, parameter, shown, weight
 from .._typing import PRNGKey, Real, RealScalar
 from ..environments import Environment
 from ._stochastic import Gaussian
@@ -319,6 +319,8 @@ class Standardise(eqx.Module):
     mean: Array = parameter()
     std: Real = parameter(1.0)
     features: Callable[[Array], Array] | None = function_field(None)
+
+    __repr__ = shown
 
     def __post_init__(self):
         mean, std = as_float_array(self.mean), as_float_array(self.std)

@@ -17,6 +17,7 @@ from .._module import (
     function_field,
     parameter,
     parts_of,
+    shown,
 )
 from .._typing import Control, Real, RealScalar, State
 from ..systems import AbstractPlant
@@ -52,6 +53,8 @@ class AbstractCost(eqx.Module):
         Array(1., dtype=float32)
         ```
     """
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

@@ -12,7 +12,7 @@ import jax.random as jr
 from jaxtyping import Array, ArrayLike, Float
 
 from .._check import as_entries, check_count, check_instance, check_key, check_range
-from .._module import check_parameters, parameter, parts_of
+from .._module import check_parameters, parameter, parts_of, shown
 from .._typing import PRNGKey, Real, RealScalar, Vector
 from ..math._steps import reached, step_between
 
@@ -57,6 +57,8 @@ class AbstractDisturbance(eqx.Module):
         size: ClassVar[Any]
     else:
         size: eqx.AbstractVar[int]
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
+from .._module import shown
+
 
 class Events(eqx.Module):
     """The events of one control interval, in the order in which they fired.
@@ -49,6 +51,8 @@ class Events(eqx.Module):
     after: Array
     fault_time: Array
     fault_kind: Array
+
+    __repr__ = shown
 
     @classmethod
     def none(cls, max_events: int, x: Array) -> "Events":

@@ -28,6 +28,7 @@ from .._module import (
     check_parameters,
     function_field,
     parameter,
+    shown,
 )
 from .._results import Result
 from .._typing import (
@@ -152,6 +153,8 @@ class Environment(eqx.Module):
     observation_bounds: BoundsOrNone = bounds_field(
         "Environment", "observation_bounds", default=None
     )
+
+    __repr__ = shown
 
     def __post_init__(self):
         check_instance(self.dynamics, AbstractDynamics, "dynamics", "Environment")

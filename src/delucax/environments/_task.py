@@ -23,7 +23,7 @@ from .._check import (
     keywords_of,
 )
 from .._jax import host_unless_traced, xp
-from .._module import parameter
+from .._module import parameter, shown
 from .._typing import Array, BoolScalar, PRNGKey, Real, State, Time
 from ..costs import Arrival
 from ..dynamics import AbstractDynamics, Discretized
@@ -60,6 +60,8 @@ class UniformState(eqx.Module):
 
     low: Real = parameter()
     high: Real = parameter()
+
+    __repr__ = shown
 
     def __check_init__(self):
         size = np.size(self.low)

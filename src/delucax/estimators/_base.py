@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._module import check_parameters
+from .._module import check_parameters, shown
 from .._results import choose, Result, RESULTS
 from .._typing import BoolScalar, Control, Observation, PRNGKey, RealScalar
 
@@ -84,6 +84,8 @@ class AbstractEstimator(eqx.Module):
         observer.update(0.0, jnp.array([0.1, 0.0]), observer.init()).mean
         ```
     """
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from .._check import bounds_field, check_finite, check_range, number_at
 from .._message import shortened
-from .._module import by_path, get_path, parameter, with_values
+from .._module import by_path, get_path, parameter, shown, with_values
 from .._results import Result
 from .._typing import Real, RealScalar
 from ..dynamics import AbstractDynamics, AbstractWrapper
@@ -55,6 +55,8 @@ class RandomWalk(eqx.Module):
     variance: Real = parameter()
     step: Real = parameter(0.0)
     bounds: tuple[Array, Array] | None = bounds_field("RandomWalk", default=None)
+
+    __repr__ = shown
 
     def __check_init__(self):
         where = "RandomWalk"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._check import as_rows, check_at_most, check_finite, check_instance, check_number
-from .._module import as_float_array
+from .._module import as_float_array, shown
 from .._results import first_of, raise_on_failure, Result, RESULTS
 from ..dynamics import AbstractDynamics
 from ._base import AbstractEstimator, Belief
@@ -24,6 +24,8 @@ class Estimated(eqx.Module):
     states: PyTree
     results: Result
     result: Result
+
+    __repr__ = shown
 
     def _facts(self) -> str:
         failed = np.asarray(self.results != RESULTS.successful)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import as_rows, check_finite, check_instance, check_number
-from .._module import as_float_array
+from .._module import as_float_array, shown
 from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision
 from ._base import Belief
@@ -24,6 +24,8 @@ class Filtered(eqx.Module):
     updated: Belief
     log_likelihoods: Array
     result: Result
+
+    __repr__ = shown
 
     @property
     def log_likelihood(self) -> Array:
@@ -42,6 +44,8 @@ class Smoothed(eqx.Module):
     covariance: Array
     filtered: Filtered
     result: Result
+
+    __repr__ = shown
 
 
 def run_filter(

@@ -19,7 +19,7 @@ from ._run import run
 
 def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> None:
     """Show the cases of a file."""
-    experiments = load(file, suites)
+    experiments = load(file, suites, "list")
     cases = [case for one in experiments for case in one.cases(select, marks, True)]
     for case in cases:
         labels = ", ".join(mark.name for mark in case.marks)
@@ -35,20 +35,21 @@ def run_file(
     options: dict[str, Any],
 ) -> int:
     """Run the experiments of a file and print their results."""
-    experiments = load(file, suites)
+    experiments = load(file, suites, "run")
     place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
     results = run(*experiments, store=place, **options)
     done = {row["case"] for row in results.rows if row["status"] != "skipped"}
     if not done:
         raise ValueError(
-            f"run: no case of '{file}' is selected (-k, -m, or marked skip or slow)."
+            f"run: no case of '{file}' is selected. Check -k and -m. Cases marked slow "
+            "need --slow, and cases marked skip never run."
         )
     _show(results)
     failed = {row["case"]: row for row in results.failed}
     for case, row in failed.items():
-        first = str(row["error"] or "passed though it was expected to fail")
+        first = str(row["error"] or "it passed, but was expected to fail")
         print(f"FAILED {case}: {first.splitlines()[0]}", file=sys.stderr)
-    print(f"{len(done)} cases in {place}")
+    print(f"The results of {len(done)} cases are in {place}")
     _write_page(html, lambda: page_of(results, Path(file).stem))
     return bool(failed)
 
@@ -58,12 +59,15 @@ def report_file(
 ) -> None:
     """Show one results file."""
     if len(paths) != 1:
-        raise ValueError("report: two results files are compared with --diff.")
+        raise ValueError(
+            f"report: expected one results file, got {len(paths)}. To compare two "
+            "files, add --diff."
+        )
     results = _read(paths[0], select)
     _show(results)
     for path in exports:
         results.export(path)
-        print(f"written {path}")
+        print(f"Wrote {path}")
     _write_page(html, lambda: page_of(results, Path(paths[0]).stem))
 
 
@@ -74,7 +78,7 @@ def report_diff(
     if len(paths) != 2:
         raise ValueError(f"report: --diff needs two results files, got {len(paths)}.")
     if exports:
-        raise ValueError("report: --export goes with one results file, not --diff.")
+        raise ValueError("report: --export and --diff cannot be combined.")
     difference = diff(*(_read(path, select) for path in paths))
     if difference.changed:
         print(as_text("markdown", DIFFERENCES, difference.changed))
@@ -97,34 +101,34 @@ def _show(results: Results) -> None:
 def _write_page(path: str | None, make: Callable[[], Page]) -> None:
     if path is not None:
         make().write(path)
-        print(f"report in {path}")
+        print(f"Wrote {path}")
 
 
-def load(file: str, suites: Mapping[str, str]) -> list[Experiment]:
+def load(file: str, suites: Mapping[str, str], command: str) -> list[Experiment]:
     """The experiments of a file, of a module by its dotted name, or of a suite: one of
-    the modules that have a shorter name."""
+    the modules that have a shorter name. Errors name the command."""
     if file in suites:
         module = importlib.import_module(suites[file])
     elif file.endswith(".py"):
-        module = _module_at(Path(file))
+        module = _module_at(Path(file), command)
     else:
         sys.path.insert(0, str(Path.cwd()))
         try:
             module = importlib.import_module(file)
         except ImportError as error:
             raise ValueError(
-                f"run: FILE must be a Python file, a module or one of "
-                f"{', '.join(suites)}; {file!r} cannot be imported: {error}."
+                f"{command}: FILE must be a Python file, a module or a suite "
+                f"({', '.join(suites)}). {file!r} cannot be imported: {error}."
             ) from error
     own = [v for v in vars(module).values() if isinstance(v, Experiment)]
     if not own:
-        raise ValueError(f"run: there is no experiment in {file}.")
+        raise ValueError(f"{command}: there is no experiment in {file}.")
     return list({id(made): made for made in own}.values())
 
 
-def _module_at(path: Path) -> ModuleType:
+def _module_at(path: Path, command: str) -> ModuleType:
     if not path.is_file():
-        raise ValueError(f"run: there is no file '{path}'.")
+        raise ValueError(f"{command}: there is no file '{path}'.")
     path = path.resolve()
     name = path.stem if path.stem not in sys.modules else f"_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_count, check_finite, check_key, check_range
-from .._module import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive, shown
 from .._typing import PRNGKey
 from ._waveform import LENGTH
 
@@ -57,6 +57,8 @@ class Breaths(eqx.Module):
     resistance: Array | None = parameter(None)
     compliance: Array | None = parameter(None)
     truth: Array | None = parameter(None)
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

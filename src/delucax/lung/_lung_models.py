@@ -10,7 +10,7 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_instance, check_key, check_step
-from .._module import mlp, parameter, positive, weight
+from .._module import mlp, parameter, positive, shown, weight
 from .._typing import (
     Control,
     Disturbance,
@@ -53,6 +53,8 @@ class LungModel(eqx.Module):
 
     dynamics: Delayed
     peep: Array = parameter()
+
+    __repr__ = shown
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._check import as_vector, check_count, check_keywords, check_positive, check_range
-from .._module import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive, shown
 from .._results import Result
 from .._typing import Control, Observation, RealScalar, Scalar, State, Time
 from ..costs import AbstractCost
@@ -68,6 +68,8 @@ class Valves(eqx.Module):
     expiratory_resistance: Array = parameter(5.0, constraint=positive)
     peep: Array = parameter(5.0)
     leak: Array = parameter(0.0)
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

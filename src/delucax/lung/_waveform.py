@@ -16,7 +16,14 @@ from .._check import (
     is_concrete,
 )
 from .._message import shortened
-from .._module import as_float_array, check_parameters, parameter, parts_of, positive
+from .._module import (
+    as_float_array,
+    check_parameters,
+    parameter,
+    parts_of,
+    positive,
+    shown,
+)
 
 
 _T = TypeVar("_T")
@@ -75,6 +82,8 @@ class BreathWaveform(eqx.Module):
     keypoints: Float[Array, " points"] = parameter((0.0, 1 / 3, 1 / 2, 1.0))
     levels: Float[Array, " points"] = parameter((1.0, 1.0, 0.0, 0.0))
     inspiration: Array = parameter(1 / 3)
+
+    __repr__ = shown
 
     def __check_init__(self):
         where = "BreathWaveform"

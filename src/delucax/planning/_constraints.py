@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._check import as_float_array, is_concrete
-from .._module import as_module, check_function, function_field, parameter
+from .._module import as_module, check_function, function_field, parameter, shown
 from ..qp import Soft
 
 
@@ -47,6 +47,8 @@ class SoftConstraint(eqx.Module):
     function: Callable[..., Any] = function_field()
     linear: Array = parameter(0.0)
     quadratic: Array = parameter(0.0)
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_function(self.function, "function", "SoftConstraint")
@@ -145,6 +147,8 @@ class Constraints(eqx.Module):
     final_equality: Any = eqx.field(default=None, converter=_as_functions)
     states: Any = eqx.field(default=None, converter=_as_limits)
     controls: Any = eqx.field(default=None, converter=_as_limits)
+
+    __repr__ = shown
 
     def __check_init__(self):
         where = "Constraints"
@@ -279,7 +283,7 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
             if row.weights is None and row.size:
                 over = np.abs(c) if row.is_equality else np.maximum(c, 0)
                 violations.append((np.nan_to_num(over, nan=np.inf), row.name, final))
-    for name, value, shown in (
+    for name, value, planned in (
         ("states", constraints.states, states[1:]),
         ("controls", constraints.controls, controls),
     ):
@@ -291,7 +295,7 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
             else np.asarray(end)
             for end in value
         )
-        over = np.maximum(np.maximum(low - shown, shown - high), 0)
+        over = np.maximum(np.maximum(low - planned, planned - high), 0)
         violations.append((over, f"bound of {name}", False))
     if not violations:
         return ""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._module import shown
 from ._constraints import Constraints, rows_of
 
 
@@ -57,6 +58,8 @@ class Multipliers(eqx.Module):
     controls: tuple[Array, Array] | None = None
     costates: Array | None = None
     penalty: Array | None = None
+
+    __repr__ = shown
 
 
 def by_name(

@@ -24,7 +24,7 @@ from .._check import (
     finite_vector,
 )
 from .._message import shortened
-from .._module import as_module
+from .._module import as_module, shown
 from .._results import choose, raise_on_failure, RESULTS
 from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
@@ -118,6 +118,8 @@ class AbstractPlanner(eqx.Module):
     """Whether it draws random numbers, and so needs a key."""
     takes_unknowns: ClassVar[bool] = False
     """Whether it plans with [`delucax.planning.Unknowns`][]."""
+
+    __repr__ = shown
 
     @property
     def starts_from_states(self) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._jax import by_components, join_state, split_state, stack_steps
+from .._module import shown
 from .._results import choose, first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
@@ -112,6 +113,8 @@ class Problem(eqx.Module):
     multipliers: Augmentation | None = None
     unknowns: Any = None
     free: FreeStart | None = None
+
+    __repr__ = shown
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
         """The deviation of `x` from `x_ref`, by `difference`.

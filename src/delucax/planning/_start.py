@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._check import check_count, check_finite, check_instance
 from .._jax import host_unless_traced, jacobian, xp
 from .._message import shortened
-from .._module import as_float_array, parameter
+from .._module import as_float_array, parameter, shown
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
@@ -71,6 +71,8 @@ class Start(eqx.Module):
     states: Float[Array, "*batch T+1 n"] | None = parameter(None)
     gains: Float[Array, "*batch T m n"] | None = parameter(None)
     multipliers: Multipliers | None = None
+
+    __repr__ = shown
 
     @property
     def horizon(self) -> int:

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from .._check import as_float_array, is_concrete, number_at
 from .._message import did_you_mean, shortened
-from .._module import with_values
+from .._module import shown, with_values
 from ..dynamics import AbstractDiscretization, AbstractDynamics
 from ._plan import Plan
 from ._problem import Problem
@@ -80,6 +80,8 @@ class Unknowns(eqx.Module):
         default_factory=dict, converter=_as_bounds
     )
     duration: Bounds | None = eqx.field(default=None, converter=_as_bounds)
+
+    __repr__ = shown
 
     def __check_init__(self):
         where = "Unknowns"

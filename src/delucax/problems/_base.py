@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_instance, check_positive
-from .._module import parameter, replace
+from .._module import parameter, replace, shown
 from .._typing import Real
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics, Discretized, open_loop
@@ -88,6 +88,8 @@ class OptimalControl(eqx.Module):
     constraints: Constraints | None = None
     unknowns: Unknowns | None = None
     is_maximised: bool = eqx.field(static=True, default=False)
+
+    __repr__ = shown
 
     @property
     def horizon(self) -> int:

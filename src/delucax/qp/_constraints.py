@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._check import as_float_array, check_count, check_real, is_concrete
+from .._module import shown
 from .._typing import Array
 
 
@@ -42,6 +43,8 @@ class Soft(eqx.Module):
     high: Array
     linear: Array
     quadratic: Array
+
+    __repr__ = shown
 
     def __init__(self, low: Any, high: Any, linear: Any = 0.0, quadratic: Any = 0.0):
         self.low, self.high = (
@@ -86,6 +89,8 @@ class Rows(eqx.Module):
     upper: Array
     linear: Array | None
     quadratic: Array | None
+
+    __repr__ = shown
 
     def __init__(
         self,

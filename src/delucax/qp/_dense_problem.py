@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from .._check import check_instance
+from .._module import shown
 from .._typing import Array
 from ._constraints import (
     as_finite_array,
@@ -50,6 +51,8 @@ class DenseMultipliers(eqx.Module):
     equalities: Array
     bounds: tuple[Array, Array] | None
     rows: tuple[Array, Array] | None
+
+    __repr__ = shown
 
 
 class Dense(eqx.Module):

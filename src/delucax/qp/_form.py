@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
+from .._module import shown
 from .._typing import Array, Scalar
 
 
@@ -60,6 +61,8 @@ class AbstractForm(eqx.Module):
     soft: eqx.AbstractVar[tuple[Array, Array] | None]
     """The weights `v` and `W` of both sides of each row; infinite where a side is hard.
     """
+
+    __repr__ = shown
 
     @abstractmethod
     def hessian(self, x: Array) -> Array:

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 
+from .._module import shown
 from .._results import Result
 from .._typing import Array, Scalar
 from ._dense_problem import DenseMultipliers
@@ -57,3 +58,5 @@ class Solution(eqx.Module):
     gap: Scalar
     iterations: Array
     result: Result
+
+    __repr__ = shown

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from .._check import check_instance
+from .._module import shown
 from .._typing import Array
 from ._constraints import (
     as_finite_array,
@@ -69,6 +70,8 @@ class StagedMultipliers(eqx.Module):
     controls: Pair
     rows: Pair
     final_rows: Pair
+
+    __repr__ = shown
 
 
 class Staged(eqx.Module):

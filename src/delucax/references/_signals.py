@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import as_matrix, check_step, check_vector
-from .._module import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive, shown
 from .._typing import Real, RealScalar, Vector
 from ..math import sin
 from ..math._steps import step_at
@@ -36,6 +36,8 @@ class Constant(eqx.Module):
     """
 
     value: Array = parameter()
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_vector(self.value, "value", "Constant")
@@ -76,6 +78,8 @@ class Sequence(eqx.Module):
 
     values: Array = parameter()
     dt: Real = parameter(constraint=positive)
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_step(self.dt, "Sequence")
@@ -121,6 +125,8 @@ class FigureEight(eqx.Module):
     width: Real = parameter(1.0)
     height: Real = parameter(1.0)
     centre: Array = parameter((0.0, 0.0))
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

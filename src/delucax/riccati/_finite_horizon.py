@@ -6,6 +6,7 @@ import equinox as eqx
 
 from .._check import as_vector
 from .._jax import compiled_unless_on_host, host_unless_traced, on_host, vmap, xp
+from .._module import shown
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Array, Numbers
 from ..math._linear_solve import full_precision, solve
@@ -68,6 +69,8 @@ class FiniteHorizonSolution(eqx.Module):
     s: Array | None = None
     k: Array | None = None
     times: Array | None = None
+
+    __repr__ = shown
 
 
 @host_unless_traced

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from .._check import check_step
 from .._jax import custom_jvp, stop_gradient, vmap, while_loop, xp
+from .._module import shown
 from .._results import raise_on_failure, Result
 from .._typing import Array, Scalar, Square
 from ..math._linear_solve import full_precision, solve
@@ -86,6 +87,8 @@ class GameSolution(eqx.Module):
     iterations: Array | None = None
     spectral_radius: Array | None = None
     spectral_abscissa: Array | None = None
+
+    __repr__ = shown
 
 
 def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:

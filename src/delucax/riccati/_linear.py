@@ -16,6 +16,7 @@ from .._jax import (
     while_loop,
     xp,
 )
+from .._module import shown
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import Array, Numbers
 from ..math._linear_solve import full_precision, no_tangent, solve
@@ -61,6 +62,8 @@ class MatrixSolution(eqx.Module):
     residual: Array
     iterations: Array
     result: Result
+
+    __repr__ = shown
 
     def _facts(self) -> str:
         """The diagnostics of an error."""

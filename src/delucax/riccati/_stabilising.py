@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 
 from .._jax import compiled_unless_on_host, custom_jvp, matmul, stop_gradient, xp
+from .._module import shown
 from .._results import raise_on_failure, Result
 from .._typing import Array, BoolScalar, Square
 from ..math._linear_solve import (
@@ -100,6 +101,8 @@ class RiccatiSolution(eqx.Module):
     result: Result
     spectral_radius: Array | None = None
     spectral_abscissa: Array | None = None
+
+    __repr__ = shown
 
     def _facts(self) -> str:
         """The diagnostics of an error."""

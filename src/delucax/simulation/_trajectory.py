@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 
 from .._extras import extra
 from .._jax import host_unless_traced, xp
+from .._module import shown
 from .._results import choose, INCIDENTS, Result, RESULTS
 from .._typing import Array
 from ..dynamics import Events
@@ -85,7 +86,7 @@ class Trajectory(eqx.Module):
     controls: Array | None
     costs: Array | None
     final_state: Array
-    final_cost: Array
+    final_cost: Array = eqx.field(repr=False)
     total_cost: Array
     length: Array
     ended: Array
@@ -93,22 +94,24 @@ class Trajectory(eqx.Module):
     dt: Array
     # Arrays that follow from others are computed when they are read. To write them out
     # would take a batch longer than the simulation.
-    recorded_times: Array | None
-    recorded_observations: Array | None
-    recorded_disturbances: Array | None
-    recorded_terminated: Array | None
-    steps: int = eqx.field(static=True)
-    keep: tuple[str, ...] = eqx.field(static=True)
-    disturbance_size: int = eqx.field(static=True)
-    state_names: tuple[str, ...] = eqx.field(static=True)
-    control_names: tuple[str, ...] = eqx.field(static=True)
-    state_units: tuple[str, ...] = eqx.field(static=True)
-    control_units: tuple[str, ...] = eqx.field(static=True)
-    time_unit: str = eqx.field(static=True, default="s")
+    recorded_times: Array | None = eqx.field(repr=False)
+    recorded_observations: Array | None = eqx.field(repr=False)
+    recorded_disturbances: Array | None = eqx.field(repr=False)
+    recorded_terminated: Array | None = eqx.field(repr=False)
+    steps: int = eqx.field(static=True, repr=False)
+    keep: tuple[str, ...] = eqx.field(static=True, repr=False)
+    disturbance_size: int = eqx.field(static=True, repr=False)
+    state_names: tuple[str, ...] = eqx.field(static=True, repr=False)
+    control_names: tuple[str, ...] = eqx.field(static=True, repr=False)
+    state_units: tuple[str, ...] = eqx.field(static=True, repr=False)
+    control_units: tuple[str, ...] = eqx.field(static=True, repr=False)
+    time_unit: str = eqx.field(static=True, repr=False, default="s")
     incidents: dict[str, Array] | None = None
-    controller_state: PyTree = None
-    recorded_events: Events | None = None
-    event_names: tuple[str, ...] = eqx.field(static=True, default=())
+    controller_state: PyTree = eqx.field(repr=False, default=None)
+    recorded_events: Events | None = eqx.field(repr=False, default=None)
+    event_names: tuple[str, ...] = eqx.field(static=True, repr=False, default=())
+
+    __repr__ = shown
 
     @property
     def events(self) -> Events:

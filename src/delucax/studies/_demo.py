@@ -1,4 +1,4 @@
-"""The demo: from the pendulum's ODE to a trained controller, and the paper in small."""
+"""The demo: from the pendulum's ODE to a controller, then the paper in small."""
 
 import tempfile
 import time
@@ -16,14 +16,13 @@ from .. import plotting
 from .._check import check_count
 from .._extras import extra
 from .._module import replace, save
-from ..controllers import Linear, LQR
+from ..controllers import Linear, LQR, Zero
 from ..dynamics import linearize
 from ..environments import Environment, pendulum
 from ..simulation import rollout, Trajectory
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 from .paper import reproduce, STUDIES
 from .paper._finding import mean_and_half_width
-from .paper._gradients import train_linear
 from .paper._wall_clock import gymnasium_run, take_turns
 
 
@@ -38,20 +37,20 @@ def demo(
     steps: int = STEPS,
     say: Callable[[str], Any] = print,
 ) -> Any:
-    """Design, train, compare and show controllers for Gym's pendulum; then the studies
-    of the Deluca paper, small, and whether its claims hold.
+    """Design, train and compare controllers for Gym's pendulum, then reproduce the
+    Deluca paper with fewer seeds and steps.
 
-    Takes the pendulum's ODE; designs an LQR about the upright; trains the linear policy
-    of the Deluca paper (Section 4) and an MLP by differentiating the rollout; runs them
-    and zero control from the same 100 starts, without and with a shock in the middle;
-    and writes a table, the controller, a figure and an animation. Then it is
-    [`delucax.studies.reproduce`][] with `small`, of all but the ventilator, in the
-    folder `paper` beside them.
+    The first part designs an LQR about the upright, and trains MLPs by differentiating
+    the rollout. It runs zero control, the LQR and the first MLP from the same 100
+    starts, without and with a shock in the middle. It writes a table, the MLP, a figure
+    and an animation. The second part calls [`delucax.studies.reproduce`][] with
+    `small=True` for all studies except the ventilator, and writes to the folder
+    `paper` inside `out`.
 
     **Arguments:**
 
     - `out`: the folder to write to, `"demo"` by default.
-    - `seeds`: how many MLPs to train, 2 by default; the first is the one shown.
+    - `seeds`: how many MLPs to train, 2 by default; the first one is compared.
     - `steps`: optimiser steps for each, 800 by default.
     - `say`: what to do with a line of text; `print` by default.
 
@@ -75,22 +74,15 @@ def demo(
     check_count(seeds, "seeds", "demo")
     out = _writable(Path(out))
     env = pendulum()
-    gains_of = lambda K: f"  K = {np.array2string(np.asarray(K), precision=3)}"
 
-    say("LQR about the upright, from the linearised ODE")
+    say("LQR, designed from the ODE linearised about the upright:")
     weights = np.diag([1.0, 0.1]), np.eye(1) * 0.001
     difference = env.dynamics.difference
     lqr = LQR(linearize(env.dynamics), *weights, difference=difference)
-    say(gains_of(lqr.K))
+    say(f"  u = -K x with K = {np.array2string(np.asarray(lqr.K[0]), precision=3)}")
+    controllers: dict[str, Any] = {"zero": Zero(1), "LQR": lqr}
 
-    say("\nLinear policy u = -K x by gradient descent on the rollout (torque +-10)")
-    linear = train_linear(1000).model
-    say(gains_of(linear.K))
-    # Zero control as a linear policy, which shares the program of the other one.
-    zero = replace(linear, {"K": 0 * linear.K})
-    controllers = {"zero": zero, "LQR": lqr, "linear policy": linear}
-
-    say(f"\nMLP by gradient descent through the ODE, {seeds} seeds")
+    say(f"\nMLP, trained by gradient descent through the ODE (seeds: {seeds}):")
     keys = jax.random.split(jax.random.key(2**20), STARTS)
     starts = np.asarray(jax.jit(jax.vmap(env.reset))(keys))
     shock = np.zeros((EVALUATION_STEPS, env.disturbance_size))
@@ -102,10 +94,10 @@ def demo(
         fitted = train_swing_up(env, key=jax.random.key(seed), steps=steps)
         seconds.append(time.perf_counter() - begin)
         held = np.sum(_evaluate(env, fitted.model, starts, worlds["none"])[1])
-        first = "" if seed else ", compilation included"
+        first = "" if seed else " with compilation"
         say(
-            f"  seed {seed}: {seconds[-1]:.1f} s{first}; swings up and holds from "
-            f"{held} of {STARTS} starts"
+            f"  seed {seed}: trained in {seconds[-1]:.1f} s{first}. It swings up and "
+            f"stays upright from {held} of {STARTS} starts."
         )
         controllers.setdefault("MLP", fitted.model)
 
@@ -119,44 +111,44 @@ def demo(
             row |= {"median": np.median(cost), "worst": cost.max()}
             rows.append(row | {"upright at the end": np.sum(held)})
     table = pd.DataFrame(rows)
-    say(f"\nCost over 20 s from the same {STARTS} starts, torque +-2:\n")
+    say(
+        f"\nCost of 20 s from the same {STARTS} starts (lower is better), with a "
+        "torque of at most 2 N m.\nThe last column counts the starts from which the "
+        "pendulum is upright for the last 5 s.\n"
+    )
     say(table.to_string(index=False, float_format=lambda x: f"{x:.1f}"))
     say(
-        "\nLQR and the linear policy (which was trained with torque +-10) are too weak "
-        "at +-2 to\nlift the pendulum from most starts; a shock may by chance bring it "
-        "within LQR's reach."
+        "\nThe motor is too weak to lift the pendulum directly. LQR does not swing it "
+        "back and forth,\nso it fails from most starts. The shock adds 3 rad/s within "
+        "half a second, which happens\nto throw the pendulum upright for LQR from some "
+        "starts."
     )
 
-    say(f"\nWriting {out}/")
+    say(f"\nFiles in {out}/:")
     table.to_csv(out / "table.csv", index=False)
+    say("  table.csv         the table above")
     save(out / "mlp.dlx", controllers["MLP"])
+    say("  mlp.dlx           the first MLP, which delucax.load reads")
     # The start that hangs lowest makes the best picture of a swing-up.
     lowest = int(np.argmin(np.cos(starts[:, 0])))
     picture = {name: shown[name, "at 10 s"][lowest] for name in controllers}
-    figure: Any = plotting.plot(picture)
-    for axes in figure.axes:
-        axes.axvspan(10.0, 10.5, color="0.5", alpha=0.25, lw=0)
-    low, high = np.array(figure.axes[0].get_ylim()) / (2 * np.pi)
-    for upright in 2 * np.pi * np.arange(np.ceil(low), np.floor(high) + 1):
-        figure.axes[0].axhline(upright, color="0.5", lw=0.8, ls=":", zorder=0)
-    figure.text(0.01, 0.005, "Grey: the shock. Dotted: upright.", fontsize=8)
-    figure.savefig(out / "trajectories.png", dpi=120)
-    say("  table.csv, mlp.dlx, trajectories.png")
+    _draw(picture).savefig(out / "trajectories.png", dpi=120)
+    say("  trajectories.png  angle, velocity, torque and cost with a shock at 10 s")
     swing = shown["MLP", "none"][lowest][:160]
     plotting.animate(env, swing, path=out / "swing_up.gif", max_frames=80)
-    say("  swing_up.gif")
+    say("  swing_up.gif      the swing-up by the MLP")
 
     trained = BATCH * HORIZON * steps
     usual = float(np.median(seconds[1:] or seconds))
-    without = f" ({usual:.1f} s without, the median seed)" if seeds > 1 else ""
+    without = f" ({usual:.1f} s without compilation)" if seeds > 1 else ""
     say(
-        f"\nTrained on {trained / 1e6:.1f} million steps, gradients included, in "
-        f"{seconds[0]:.1f} s with compilation{without}: "
-        f"{trained / usual / 1e6:.2f} million steps a second."
+        f"\nThe training simulated {trained / 1e6:.1f} million steps in "
+        f"{seconds[0]:.1f} s{without}: {trained / usual / 1e6:.2f} million steps a "
+        "second, gradients included."
     )
     say(_beside_gymnasium(trained / usual))
     say(_derivative())
-    say("\nThe Deluca paper, study by study, with few seeds and steps\n")
+    say("\nNow the Deluca paper, study by study, with fewer seeds and steps:\n")
     names = [name for name in STUDIES if name != "ventilator"]
     claims = reproduce(names, out / "paper", small=True, say=say)
     holds = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
@@ -165,8 +157,8 @@ def demo(
     for claim in claims:
         if not claim["holds"]:
             say(f"Does not hold: {claim['claim']} ({claim['measured']}).")
-    say("\nThe ventilator, in a minute: python -m delucax lung --small")
-    say("All of it, with more seeds and steps: python -m delucax reproduce all")
+    say("\nThe ventilator study, in about a minute: python -m delucax lung --small")
+    say("The paper with all seeds and steps: python -m delucax reproduce all")
     return table
 
 
@@ -179,6 +171,21 @@ def _writable(out: Path) -> Path:
         message = f"demo: out must be a folder to write to, got {out}: {error}"
         raise OSError(message) from error
     return out
+
+
+def _draw(runs: dict[str, Trajectory]) -> Any:
+    """The runs by controller, with the shock in grey and ticks at each half turn."""
+    figure: Any = plotting.plot(runs)
+    for axes in figure.axes:
+        axes.axvspan(10.0, 10.5, color="0.5", alpha=0.25, lw=0)
+    angle = figure.axes[0]
+    low, high = np.array(angle.get_ylim()) / np.pi
+    turns = np.arange(np.ceil(low), np.floor(high) + 1).astype(int)
+    where = {0: "0 (upright)", 1: "π (down)"}
+    name = lambda k: where.get(k, f"{k}π ({'down' if k % 2 else 'upright'})")
+    angle.set_yticks(np.pi * turns, [name(int(k)) for k in turns])
+    figure.text(0.01, 0.005, "Grey: the shock, which adds 3 rad/s.", fontsize=8)
+    return figure
 
 
 def _evaluate(
@@ -205,8 +212,9 @@ def _beside_gymnasium(steps_per_second: float) -> str:
         return "Gymnasium is not installed, so its speed was not measured."
     rate = count / float(seconds[0, 0])
     return (
-        f"Gymnasium simulates {rate / 1e6:.3f} million steps a second on this machine: "
-        f"training ran {steps_per_second / rate:.0f} times as fast."
+        f"Gymnasium simulates {rate / 1e6:.3f} million steps a second on this machine, "
+        f"without gradients. The training ran {steps_per_second / rate:.0f} times as "
+        "fast."
     )
 
 
@@ -228,6 +236,7 @@ def _derivative() -> str:
         exact = float(both(length)[1])
         numeric = float((both(length + step)[0] - both(length - step)[0]) / (2 * step))
     return (
-        "d(cost)/d(length) through the ODE (Tsit5, float64): "
-        f"{exact:.9f}; central difference: {numeric:.9f}."
+        "The derivative of the cost by the pendulum's length is "
+        f"{exact:.9f} through the ODE;\na central difference gives {numeric:.9f} "
+        "(Tsit5, float64)."
     )

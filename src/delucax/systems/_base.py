@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check_models import output_of
-from .._module import check_parameters
+from .._module import check_parameters, shown
 from .._typing import Control, Disturbance, Observation, State, Time
 from ..math import wrap
 
@@ -53,6 +53,8 @@ class AbstractPlant(eqx.Module):
     state_units: ClassVar[Any] = ()
     control_units: ClassVar[Any] = ()
     time_unit: ClassVar[Any] = "s"
+
+    __repr__ = shown
 
     @property
     def state_size(self) -> int:

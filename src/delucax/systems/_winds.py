@@ -6,12 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._module import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive, shown
 from .._typing import Real, State, Time, Vector
 
 
 class _AbstractWind(eqx.Module):
     """A force in the plane, a function of time and the state."""
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_parameters(self)

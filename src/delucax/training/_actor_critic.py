@@ -18,7 +18,7 @@ from .._check import (
     check_range,
 )
 from .._controller import AbstractController, check_controller
-from .._module import parameter, parts_of
+from .._module import parameter, parts_of, shown
 from .._typing import PRNGKey, RealScalar
 from ..controllers import Categorical, MLP, mlp_policy, Standardise
 from ..environments import Environment
@@ -62,6 +62,8 @@ class ActorCritic(eqx.Module):
     critic: AbstractController
     shift: Array = parameter(0.0)
     scale: Array = parameter(1.0)
+
+    __repr__ = shown
 
     def __check_init__(self):
         for name in ("policy", "critic"):

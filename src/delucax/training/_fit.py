@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Array, PyTree
 
 from .._check import check_at_most, check_count, check_function, check_key, is_concrete
+from .._module import shown
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._gradient_estimators import analytic
@@ -65,6 +66,8 @@ class Fitted(eqx.Module):
     model: PyTree
     history: History
     result: Result
+
+    __repr__ = shown
 
 
 def fit(

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_key, check_positive
-from .._module import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive, shown
 from .._typing import PRNGKey, Real
 from ._trainable import weights_of
 
@@ -126,6 +126,8 @@ class ClippedSamples(eqx.Module):
     samples: int = eqx.field(static=True, default=32)
     factor: float = eqx.field(static=True, default=5.0)
 
+    __repr__ = shown
+
     def __post_init__(self):
         self.samples = check_count(self.samples, "samples", "ClippedSamples")
         check_positive(self.factor, "factor", "ClippedSamples")
@@ -211,6 +213,8 @@ class EvolutionStrategies(eqx.Module):
     sigma: Real = parameter(constraint=positive)
     samples: int = eqx.field(static=True)
     antithetic: bool = eqx.field(static=True, default=True)
+
+    __repr__ = shown
 
     def __check_init__(self):
         where = "EvolutionStrategies"
@@ -315,6 +319,8 @@ class LikelihoodRatio(eqx.Module):
 
     samples: int = eqx.field(static=True)
     baseline: bool = eqx.field(static=True, default=True)
+
+    __repr__ = shown
 
     def __check_init__(self):
         where = "LikelihoodRatio"

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from .._check import as_path
 from .._extras import extra
-from .._module import load, save
+from .._module import load, save, shown
 from ._trainable import is_float
 
 
@@ -60,6 +60,8 @@ class History(eqx.Module):
     gradient_norm: np.ndarray
     seconds: np.ndarray
     metrics: dict[str, np.ndarray]
+
+    __repr__ = shown
 
     def __len__(self) -> int:
         return len(self.step)

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int, PyTree
 
+from .._module import shown
 from .._typing import PRNGKey
 from ._gradient_estimators import cost_and_metrics
 from ._optimiser import Optimiser
@@ -80,6 +81,8 @@ class AbstractSurrogate(eqx.Module):
         fitted = dlx.training.fit(Steadied(), controller, optax.adam(0.1), 10, key=key)
         ```
     """
+
+    __repr__ = shown
 
     @abc.abstractmethod
     def init(self, model: PyTree, key: PRNGKey) -> PyTree:

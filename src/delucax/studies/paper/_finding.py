@@ -64,8 +64,11 @@ def draw_panels(count: int, size: tuple[float, float], **options: Any) -> Any:
     the options of Matplotlib's `subplots`."""
     from matplotlib.figure import Figure
 
+    from ..._figures import PALETTE
+
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(1, count, **options)
     for ax in np.ravel(axes):
         ax.grid(alpha=0.25, lw=0.5)
+        ax.set_prop_cycle(color=[*PALETTE, "0.2"])
     return axes

@@ -71,12 +71,14 @@ def policy_gradient(small: bool = False) -> Finding:
             least is None or (first is not None and least > first),
         ),
     ]
+    from ..._figures import color_of
+
     ax = draw_panels(1, (7.5, 3.4))
     ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
     for (scale, count), runs in curves.items():
         x = 2 * count * np.arange(1, steps + 1)
         label = f"ES, sigma {scale}, {count} pairs"
-        color, alpha = f"C{scales.index(scale)}", 1 - 0.2 * pairs.index(count)
+        color, alpha = color_of(scales.index(scale)), 1 - 0.2 * pairs.index(count)
         median = np.median(runs, axis=0)
         ax.plot(x, median, lw=1, color=color, alpha=alpha, label=label)
     ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")

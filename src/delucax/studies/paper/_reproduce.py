@@ -85,7 +85,7 @@ def reproduce(
         finding = _run(name, out, small, say)
         for claim in finding.claims:
             say(f"  {'holds' if claim.holds else 'DOES NOT HOLD'}: {claim.statement}")
-            say(f"    {claim.measured}")
+            say(f"    measured: {claim.measured}")
             row = {"study": name, "claim": claim.statement}
             rows.append(row | {"measured": claim.measured, "holds": claim.holds})
         images = []
@@ -103,7 +103,8 @@ def reproduce(
         page.provenance(Path())
         page.write(out / "report.html")
         say(f"  {time.perf_counter() - study_start:.0f} s")
-    say(f"{_held(rows)}; {out / 'report.html'}, in {time.perf_counter() - start:.0f} s")
+    say(f"{_held(rows)} ({time.perf_counter() - start:.0f} s).")
+    say(f"The report is {out / 'report.html'}.")
     return rows
 
 

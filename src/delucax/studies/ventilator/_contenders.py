@@ -242,8 +242,8 @@ def divergence_note(diverged: Any, errors: Any) -> str:
     if not lost and not steps:
         return ""
     return (
-        f"{lost} of {errors.size} errors are not finite, and count as infinite; in "
-        f"{steps} of {len(diverged)} steps a PID had no finite gradient."
+        f"{lost} of {errors.size} errors are not finite and count as infinite. In "
+        f"{steps} of {len(diverged)} training steps a gradient was not finite."
     )
 
 
@@ -301,7 +301,9 @@ def contenders(
     """All controllers, in the order of the report."""
     size, waveform, count = trainer.size, trainer.waveform, trainer.count
     training, steps = stages.training, size.controller_steps
-    pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer))
+    pids = stages.stage(
+        "pids", "Searching PID gains", lambda: searched_pids(envs, trainer)
+    )
 
     def residuals(**kept):
         # So that the network adds nothing before it is trained.
@@ -313,26 +315,29 @@ def contenders(
     # No control is a PID without gains, as which it compiles nothing of its own.
     none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
     rows = [Contender("zero", 0, none, True), *pid_contenders(pids)]
-    seeds = f"{size.seeds} seeds at once"
+    seeds = f"({size.seeds} at once)" if size.seeds > 1 else ""
     networks = trainer.networks((size.seeds, count), 7, steps, width=32)
-    own = training("own", f"A network for each lung, {seeds}", networks)
+    own = training("own", f"Training a network for each lung {seeds}".strip(), networks)
     sizes = dict(zip(("width", "controls"), size.shared_network, strict=True))
     networks = trainer.networks((size.seeds,), 11, size.shared_steps, **sizes)
     networks = functools.partial(networks, shared=True, limit=_TRAINING_LIMIT)
-    shared = training("shared", f"A network for all lungs, {seeds}", networks)
+    shared = training("shared", f"Training one for all lungs {seeds}".strip(), networks)
     if size.tuned:
-        words = "PIDs with feed-forward tuned on the lungs"
+        words = "Tuning PIDs with feed-forward on the lungs"
         tuned = training("tuned_pids", words, tuned_pids, envs, trainer)
         rows += pid_contenders(tuned)
     if size.extras:
-        more = training("trained_pids", "PIDs trained on", trained_pids, trainer, pids)
+        more = training(
+            "trained_pids", "Training the PIDs further", trained_pids, trainer, pids
+        )
         networks = trainer.networks((1, count), 7, steps, kind="cnn", width=12)
         convolved = training(
-            "own_cnn", "A convolutional network for each lung", networks
+            "own_cnn", "Training a convolutional network for each lung", networks
         )
-        residual = training("residual", "A PID and a network for each lung", residuals)
+        words = "Training a network on top of the PID of each lung"
+        residual = training("residual", words, residuals)
         learn = lambda: online_learners(train, pids, waveform, size.sensor_delay)
-        online = stages.stage("online", "GPC around the best PIDs", learn)
+        online = stages.stage("online", "Setting up GPC around the PIDs", learn)
         given: Any = trainer.simulators, envs.cost.waveform  # pyright: ignore
         planners = eqx.filter_vmap(lung.ShootingMPC)(*given)
         rows += [

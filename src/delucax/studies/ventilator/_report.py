@@ -142,7 +142,8 @@ def summarise(
     not saved."""
     simulators = _by_kind(table, "mae")
     learned = simulators["learned"]
-    wrong = [simulators[kind] for kind in WRONG if kind in simulators]
+    names = [kind for kind in WRONG if kind in simulators]
+    wrong = [simulators[kind] for kind in names]
     ratios = {name: e / min(w[name] for w in wrong) for name, e in learned.items()}
     gains, bounds = {}, {}
     for name in learned:
@@ -158,21 +159,25 @@ def summarise(
     reached = [row["highest"] for row in rows if row["controller"] in LEARNED]
     highest = float(np.max(reached))
     error, gain = np.array([*learned.values()]), np.array([*gains.values()])
+    between = shared["between"]
+    on_others = "" if np.isnan(between) else f"; on lungs between those, {between:.2f}"
     words = [
-        f"Learned lungs: open-loop error {error.mean():.3f} cmH2O on average, "
-        f"{error.max():.3f} at most; relative to the better of single compartment and "
-        f"balloon at most {max(ratios.values()):.2f}.",
-        "A network for each lung: its error over that of the best PID is "
-        f"{gain.mean():.2f} on average, {gain.max():.2f} at most, at peak pressures "
-        "that are not trained on.",
-        f"A network for all lungs, over the best PID for all: {shared['unseen']:.2f} "
-        f"on the lungs of the training, {shared['between']:.2f} on lungs between.",
-        f"The highest pressure with what was learned: {highest:.1f} cmH2O; the limit "
-        f"is {ABORT:g}.",
-        f"Controllers were judged in {judge}.",
+        "The learned lungs predict the pressure from the controls alone with a mean "
+        f"error of {error.mean():.3f} cmH2O ({error.max():.3f} on the worst lung). "
+        f"This is at most {max(ratios.values()):.2f} times the error of physical "
+        f"models with the wrong structure ({', '.join(names)}).",
+        f"With a network for each lung, the error is {gain.mean():.2f} times that of "
+        f"the best PID ({gain.max():.2f} on the worst lung), at peak pressures that "
+        "the network was not trained on.",
+        "With one network for all lungs, the error is "
+        f"{shared['unseen']:.2f} times that of the best PID for all lungs{on_others}.",
+        "The highest pressure under a learned controller was "
+        f"{highest:.1f} cmH2O; the limit is {ABORT:g}.",
+        f"The controllers were tested in {judge}.",
     ]
     if unsafe:
-        words.append(f"Not saved, for they passed the limit: {', '.join(unsafe)}.")
+        lost = ", ".join(unsafe)
+        words.append(f"Not saved, because the pressure passed the limit: {lost}.")
     return dict(
         simulators=simulators,
         simulators_closed_loop=_by_kind(table, "closed_loop_mae"),

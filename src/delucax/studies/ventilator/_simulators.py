@@ -91,8 +91,8 @@ def left_out(recorded: lung.Breaths, breaths: lung.Breaths) -> str:
     if not count:
         return ""
     return (
-        f"{count} of the {len(recorded)} breaths are left out: each of the {lungs} "
-        f"lungs has {each}, as many as there are of the one with the fewest."
+        f"{count} of the {len(recorded)} breaths are left out, so that each of the "
+        f"{lungs} lungs has {each} breaths, as many as the lung with the fewest."
     )
 
 

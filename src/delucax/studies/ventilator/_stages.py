@@ -142,7 +142,7 @@ class Stages:
         if path.exists():
             stored = load(path)
             self.seconds[name] = float(stored["seconds"])
-            self.say(f"{words}: found ({self.seconds[name]:.0f} s then)")
+            self.say(f"{words}: done before, in {self.seconds[name]:.0f} s")
             return stored["value"]
         began = time.perf_counter()
         self.say(f"{words} ...")

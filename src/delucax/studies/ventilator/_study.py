@@ -101,21 +101,25 @@ def lung_study(
 
     if recorded is None:
         lungs = size.lungs
-        breaths = stages.stage("breaths", "Breaths", lambda: _simulators.explored(size))
+        make = lambda: _simulators.explored(size)
+        breaths = stages.stage("breaths", "Simulating breaths", make)
     else:
         make = lambda: _simulators.grouped(recorded)
-        lungs, breaths = stages.stage("breaths", "Breaths", make)
+        words = "Sorting the recorded breaths by lung"
+        lungs, breaths = stages.stage("breaths", words, make)
         if words := _simulators.left_out(recorded, breaths):
             say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
     names = [_lung_name(*each) for each in lungs]
     train, test = _simulators.divided(breaths, jr.fold_in(key, 1))
-    words, given = f"all {len(lungs)} at once", (train, size, key)
-    learned = "simulators", f"Learned lungs, {words}", _simulators.learned
+    words, given = f"(all {len(lungs)} at once)", (train, size, key)
+    words_learned = f"Training a learned lung for each lung {words}"
+    learned = "simulators", words_learned, _simulators.learned
     models: dict[str, Any] = {"learned": stages.training(*learned, *given)}
     for kind in size.physics:
-        stage = kind.replace(" ", "_"), f"Fitted {kind}, {words}", _simulators.fitted
+        told = f"Fitting a {kind} model to each lung {words}"
+        stage = kind.replace(" ", "_"), told, _simulators.fitted
         models[kind] = stages.training(*stage, kind, *given)
     error_of = eqx.filter_jit(eqx.filter_vmap(lung.Breaths.open_loop_error))
     table: list[dict[str, Any]] = [
@@ -138,12 +142,12 @@ def lung_study(
         options: Any = dict(waveform=waveform, noise=NOISE, horizon=BREATH)
         boxes = unstack(models["grey box"])
         envs = stack([lung.learned_lung(box, **options) for box in boxes])
-        judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
+        judge = "grey-box lungs fitted to the same breaths (the lungs are unknown)"
     trainer = _contenders.Trainer(models["learned"], waveform, size, key, say)
     contenders = _contenders.contenders(stages, envs, train, trainer)
     if size.extras and recorded is None:
         pids = next(c.controllers for c in contenders if c.label == "PID")
-        words = "Simulators and lungs under the same PIDs"
+        words = "Comparing simulators and lungs under the same PIDs"
         make = lambda: _simulators.closed_loop_errors(envs, models, pids)
         closed = stages.stage("closed_loop", words, make)
         for row in table:
@@ -155,7 +159,8 @@ def lung_study(
     if size.bound_steps:
         pips = jnp.asarray(TRAIN_PIPS + TEST_PIPS)
         of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
-        words, make = "The least error, with the lung at hand", eqx.filter_vmap(of)
+        words = "Computing the least error that is possible with a known lung"
+        make = eqx.filter_vmap(of)
         bound = stages.stage("bound", words, lambda: make(envs))
         rows += _report.rows_of(names, ("least error", 0), np.asarray(bound))
     stages.write_table("report.csv", rows)
@@ -168,7 +173,7 @@ def lung_study(
     best = {"best PID": _report.best_of(rows, _report.PID_ROWS, "unseen")[1]}
     shown = {n: runs[best.get(n, n)] for n in ("best PID", "MLP", "MLP for all")}
     if importlib.util.find_spec("matplotlib") is None:
-        say("No figures: they need matplotlib (pip install 'delucax[plot]').")
+        say("No figures, because Matplotlib is missing: pip install 'delucax[plot]'.")
     else:
         from . import _figures
 
@@ -177,7 +182,7 @@ def lung_study(
         figure = _figures.simulator_figure(test, models, names, table)
         figure.savefig(stages.out / "simulators.png", dpi=130)
         _figures.draw_breath(stages.out / "breath.gif", envs, shown["MLP"])
-    say(f"Written to {stages.out}/ in {time.perf_counter() - began:.0f} s.")
+    say(f"Wrote the results to {stages.out}/ ({time.perf_counter() - began:.0f} s).")
     return rows
 
 

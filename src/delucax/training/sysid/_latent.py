@@ -16,7 +16,7 @@ from ..._check import (
     check_positive,
 )
 from ..._check_models import check_matrices
-from ..._module import indexed_names, mlp, parameter, positive, weight
+from ..._module import indexed_names, mlp, parameter, positive, shown, weight
 from ..._results import Result, RESULTS
 from ..._typing import Observation, PRNGKey, RealScalar, State, Time
 from ...dynamics import AbstractDynamics
@@ -168,6 +168,8 @@ class Encoder(eqx.Module):
     y_size: Float[Array, "..."] = parameter(constraint=positive)
     past: int = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
+
+    __repr__ = shown
 
     def __init__(
         self,

@@ -18,7 +18,7 @@ from ..._check import (
     check_positive,
 )
 from ..._check_models import state_network
-from ..._module import parameter, positive, weight
+from ..._module import parameter, positive, shown, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
@@ -209,6 +209,8 @@ class PredictionError(eqx.Module):
     """
 
     scale: Float[Array, "..."] = parameter(1.0, constraint=positive)
+
+    __repr__ = shown
 
     def __check_init__(self):
         check_positive(self.scale, "scale", "PredictionError")

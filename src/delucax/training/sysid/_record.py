@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..._check import check_choice, check_instance, check_step, is_concrete
 from ..._message import shortened
-from ..._module import as_float_array
+from ..._module import as_float_array, shown
 
 
 Hold = Literal["zero", "linear", "cubic"]
@@ -64,6 +64,8 @@ class Record(eqx.Module):
     steps: Float[Array, " steps"]
     hold: Hold = eqx.field(static=True)
     is_uniform: bool = eqx.field(static=True)
+
+    __repr__ = shown
 
     def __init__(
         self,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._check import check_at_most, check_bool, check_count
+from ..._module import shown
 from ..._results import choose, first_failure, Result, RESULTS
 from ...dynamics import LinearDynamics
 from ._hankel import Realised, realised, Units
@@ -62,6 +63,8 @@ class Subspace(eqx.Module):
     start_gain: Float[Array, "n p"]
     error: Float[Array, " p"]
     result: Result
+
+    __repr__ = shown
 
     def start(self, record: Records) -> Float[Array, "*records n"]:
         """The first state of other records, from all of their samples: that from which
