@@ -97,6 +97,8 @@ class Dense(eqx.Module):
     G: Array | None
     rows: Limits | None
 
+    __repr__ = shown
+
     def __init__(
         self,
         P: Any,

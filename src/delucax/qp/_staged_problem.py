@@ -158,6 +158,8 @@ class Staged(eqx.Module):
     final_rows: Limits | None
     horizon: int = eqx.field(static=True)
 
+    __repr__ = shown
+
     def __init__(
         self,
         A: Any,
