@@ -141,7 +141,7 @@ def test_no_real_system_has_these_samples(A, shown):
 
 def test_the_trapezoidal_rule_gives_no_minus_one():
     dynamics = dlx.LinearDynamics(jnp.diag(jnp.array([-1.0, 0.5])), jnp.ones((2, 1)))
-    with user_error(RuntimeError, match="eigenvalue -1, which .*; got -1"):
+    with user_error(RuntimeError, match="eigenvalue -1, which .*, got -1"):
         dlx.d2c(dynamics, "tustin")
 
 
