@@ -51,7 +51,7 @@ RUNNABLE = [page for page in PAGES if list(_blocks(page))]
 def test_pages_are_found():
     names = {name_of(ROOT, page) for page in RUNNABLE}
     assert {"index.md", "first_system.md", "gradients.md"} <= names
-    assert {"troubleshooting.md", "coming_from/diffrax.md"} <= names
+    assert {"errors.md", "troubleshooting.md", "coming_from/diffrax.md"} <= names
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_page_runs(page, tmp_path, monkeypatch):
 
 
 def test_every_status_is_explained():
-    text = (ROOT / "docs" / "troubleshooting.md").read_text()
+    text = (ROOT / "docs" / "errors.md").read_text()
     missing = [name for name in dlx.RESULTS._name_to_item if f"`{name}`" not in text]
     assert not missing
 
