@@ -33,6 +33,12 @@ def stored(store: Path) -> list[Row]:
     return [json.loads(line) for line in store.open()] if store.exists() else []
 
 
+def forget(store: Path, **which: Any) -> None:
+    """Take the rows with these values out of the store."""
+    kept = [row for row in stored(store) if not _of(which, [row])]
+    store.write_text("".join(json.dumps(row) + "\n" for row in kept))
+
+
 def run(
     module: str,
     store: Path,

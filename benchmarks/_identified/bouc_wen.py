@@ -32,7 +32,6 @@ LIMITS = {"multisine": 1.5 * BEST}
 RATE, OVERSAMPLED, PERIOD = 750.0, 20, 8192
 BAND, FORCE, NOISE = (5.0, 150.0), 50.0, 8.0
 SWEEP, SWEPT, SWEEP_FORCE = (20.0, 50.0), 180.0, 40.0
-START = 50
 FITTED = PERIOD
 PARAMETERS = ("damping", "hysteresis", "mass", "stiffness")
 

@@ -4,6 +4,9 @@ Three grey-box plants, each with parameters at a guess that is 20% off and a hid
 state: a pendulum whose angle is measured, two tanks of which the lower one is, and a
 stirred reactor whose temperature is. 1,000 records each, with other controls, other
 noise and another start. A fit counts if it converged; those that did not are counted.
+
+The limits are for the windows and controls that suit each plant. For information, also
+with the default window, and for tanks of which the upper one seldom overflows.
 """
 
 from typing import Any
@@ -26,6 +29,8 @@ LIMITS = 92.5, 97.5
 """Percent."""
 FAILURES = 1.0
 """Percent, at most."""
+DEFAULT = 20
+"""The window of `sysid.physical` by default."""
 _OFF = 1.2
 
 
@@ -55,7 +60,19 @@ class Reactor(dlx.AbstractSystem):
 
 
 def plants() -> dict[str, dict[str, Any]]:
-    """The truth, what is estimated, where records begin, and their controls."""
+    """The truth, what is estimated, where records begin, their controls, and the window
+    of the fit, with the rows that are for information."""
+    judged = _plants()
+    few = dict(controls=(0.5, 5.0))
+    default = {
+        f"{name}, default window": plant | dict(window=DEFAULT, judged=False)
+        for name, plant in judged.items()
+    }
+    seldom = {"tanks, seldom full": judged["tanks"] | few | dict(judged=False)}
+    return judged | default | seldom
+
+
+def _plants() -> dict[str, dict[str, Any]]:
     midpoint = lambda system, dt, substeps: dlx.Discretized(
         system, dt, diffrax.Midpoint(), substeps
     )
@@ -73,8 +90,8 @@ def plants() -> dict[str, dict[str, Any]]:
             dynamics=midpoint(Tanks(), 4.0, 1),
             parameters=["lower", "pump", "through"],
             start=([3.0, 3.0], [6.0, 6.0]),
-            # So much that the upper tank overflows in each record. Where it does not,
-            # the data hardly tell how full it is.
+            # So much that the upper tank overflows in each record. If it does not, the
+            # data hardly tell how full it is.
             controls=(0.5, 7.0),
             held=10,
             noise=0.05,
@@ -94,14 +111,15 @@ def plants() -> dict[str, dict[str, Any]]:
 
 def coverage(records: int = RECORDS) -> list[dict[str, Any]]:
     """A row for each plant."""
-    rows = []
+    rows, order = [], list(_plants())
     for name, plant in plants().items():
         paths = [f"system.{path}" for path in plant["parameters"]]
         truth = jnp.stack(
             [getattr(plant["dynamics"].system, p) for p in plant["parameters"]]
         )
         run = _one(plant, paths, truth)
-        keys = jr.split(jr.key(len(rows)), records)
+        # The rows for information are of the records of their plants.
+        keys = jr.split(jr.key(order.index(name.split(",")[0])), records)
         solved, inside = map(np.stack, zip(*map(run, keys), strict=True))
         share = np.mean(inside[solved], axis=0)
         rows.append(
@@ -111,6 +129,8 @@ def coverage(records: int = RECORDS) -> list[dict[str, Any]]:
                 "each, %": [round(float(100 * s), 1) for s in share],
                 "failures, %": float(100 * np.mean(~solved)),
                 "records": records,
+                "window": plant["window"],
+                "judged": plant.get("judged", True),
             }
         )
         print("  ", rows[-1], flush=True)

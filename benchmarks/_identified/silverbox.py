@@ -23,7 +23,6 @@ from delucax.training import sysid
 UNIT, LIMITS = "mV", {"multisine": 0.27, "arrow": 0.35}
 FILE = "silverbox/SNLS80mV.csv.gz"
 RATE = 610.35
-START = 50
 PARAMETERS = ("cubic", "damping", "frequency", "gain", "offset", "square")
 ARROW, MULTISINE, SHARE, INSIDE = slice(100, 40575), slice(40650, 127400), 0.75, 32000
 FITTED = 16000

@@ -18,8 +18,6 @@ from delucax.training import sysid
 UNIT, LIMITS = "V", {"test": 0.27}
 FILE = "cascaded_tanks/dataBenchmark.csv"
 DT = 4.0
-START = 50
-"""The samples from which the state is estimated, as `nonlinear_benchmarks` has it."""
 PARAMETERS = ("depth", "leak", "lower", "offset", "pump", "spill", "through", "upper")
 # The height at which the tanks overflow, in volts of the sensor, which is saturated
 # there.
