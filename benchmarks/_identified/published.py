@@ -68,8 +68,8 @@ SOURCES = {
     RELAN: "An unstructured flexible nonlinear model for the cascaded water-tanks "
     "benchmark, IFAC-PapersOnLine 50-1.",
     BRUNOT: "Continuous-time nonlinear systems identification with output error method "
-    "based on derivative-free optimisation, IFAC-PapersOnLine 50-1. Printed in "
-    "percent.",
+    "based on derivative-free optimisation, IFAC-PapersOnLine 50-1. It prints "
+    "percentages, which are converted here.",
     KERNELS: "Kernel-based methods for Volterra series identification, Automatica 129.",
     VOLTERRA: "Efficient multidimensional regularization for Volterra series "
     "estimation, Mechanical Systems and Signal Processing 104.",
