@@ -102,7 +102,7 @@ def test_wrong_arguments():
         HInfinity(dlx.LinearDynamics(A, B, x_next=[1.0, 0.0]), Q, R)
     with user_error(match="HInfinity: dynamics must observe"):
         HInfinity(dlx.LinearDynamics(A, B, C=[[1.0, 0.0]]), Q, R)
-    with user_error(match="final is given, which needs a horizon"):
+    with user_error(match="final must not be given without a horizon"):
         HInfinity(dynamics, Q, R, final=Q)
     with user_error(match="horizon must be a whole number"):
         HInfinity(dynamics, Q, R, horizon=0)

@@ -268,7 +268,7 @@ def test_bad_arguments_are_named():
         MPC(*given, 5, bounds=(1.0, -1.0))
     with user_error(match=r"start must have shape \(5, 1\)"):
         MPC(*given, 5, start=jnp.zeros((4, 1)))
-    with user_error(match="start must have 5 steps, as the horizon, got 4"):
+    with user_error(match="start must have 5 steps, the horizon, got 4"):
         MPC(*given, 5, start=dlx.planning.Start(jnp.zeros((4, 1))))
     with user_error(match=r"start.controls must have shape \(5, 1\)"):
         MPC(*given, 5, start=dlx.planning.Start(jnp.zeros((5, 2))))

@@ -1,4 +1,4 @@
-"""Feedback laws."""
+"""Controllers: feedback laws, designed, trained or learned online."""
 
 from .._controller import Tally as Tally
 from ._basic import (

@@ -21,9 +21,9 @@ from ..math import matvec
 
 
 class Zero(AbstractController):
-    """`u = 0`, the baseline.
+    """A controller whose control is always zero, $u = 0$. Use it as a baseline.
 
-    **Arguments:** `control_size`: the number of controls.
+    **Arguments:** `control_size`: the number of controls $m$.
 
     **Raises:** `ValueError` if it is below 0.
 
@@ -49,9 +49,9 @@ class Zero(AbstractController):
 
 
 class Constant(AbstractController):
-    """`u = value`.
+    """A constant control, $u = v$.
 
-    **Arguments:** `value`: a vector, one entry per control.
+    **Arguments:** `value`: $v$, shape `(m,)`; trainable.
 
     **Raises:** `ValueError` if `value` is not a finite vector.
 
@@ -78,15 +78,17 @@ class Constant(AbstractController):
 
 
 class Random(AbstractController):
-    """Independent normal controls, `u ~ N(mean, std^2)`, for exploration.
+    r"""Random controls for exploration, drawn independently at each step.
+
+    $$u \sim N(\mu, \operatorname{diag}(\sigma^2))$$
 
     **Arguments:**
 
-    - `std`: standard deviation, a vector with one entry per control.
-    - `mean`: a number or vector, 0 by default.
+    - `std`: the standard deviation $\sigma$, shape `(m,)`.
+    - `mean`: $\mu$, a number or of shape `(m,)`; 0 by default.
 
-    **Raises:** `ValueError` if `std` is not a vector; or, when it is run, if there is
-    no key.
+    **Raises:** `ValueError` if `std` is not a vector of finite numbers of at least 0,
+    or `mean` does not fit; at run time, if there is no random key.
 
     !!! example
 
@@ -119,7 +121,7 @@ class Random(AbstractController):
 
 
 class Linear(AbstractController):
-    """Linear feedback, `u = -K y`.
+    """Linear feedback, $u = -K y$.
 
     **Arguments:** `K`: the gain, shape `(m, p)`; trainable.
 
@@ -151,11 +153,11 @@ class Linear(AbstractController):
 
 
 class OpenLoop(AbstractController):
-    """Open-loop control by a given sequence.
+    """Open-loop control by a given sequence, $u_k = v_k$.
 
-    `u_k = values[k]`; the last is held after the end.
+    After the last entry, the controller repeats it.
 
-    **Arguments:** `values`: shape `(steps, m)`; trainable.
+    **Arguments:** `values`: $v$, shape `(steps, m)`; trainable.
 
     **Raises:** `ValueError` if `values` is not a matrix of finite numbers with at least
     one row.

@@ -18,17 +18,18 @@ from ._network import features_of
 
 
 class Scheduled(AbstractController):
-    """A controller for each time step, `u_k = controllers[k](t_k, y_k)`.
+    r"""A controller for each time step, $u_k = \pi_k(t_k, y_k)$.
 
-    The last one is used after the end; before the start the control is NaN, which a
-    rollout reports. All share one state, which must have the same structure and meaning
-    for each of them.
+    At time `t`, the controller at `round(t / dt)` acts. After the end of the sequence,
+    the last controller acts. Before the start the control is NaN, which a rollout
+    reports. All controllers share one state, so it must have the same structure and
+    meaning for each of them.
 
     **Arguments:**
 
-    - `controllers`: controllers of one kind, with a leading axis of time in each of
-        their arrays, as `eqx.filter_vmap` makes them.
-    - `dt`: the step between two of them.
+    - `controllers`: controllers of one kind in one module, whose arrays have a leading
+        time axis. `eqx.filter_vmap` makes such a module.
+    - `dt`: the time between one controller and the next.
 
     **Raises:** `ValueError` if `controllers` is not a controller, its arrays do not
     share a leading axis, or `dt` is not positive.
@@ -74,7 +75,7 @@ class Scheduled(AbstractController):
         arrays, rest = eqx.partition(self.controllers, eqx.is_array)
         count = len(jax.tree.leaves(arrays)[0])
         k = step_at(t, self.dt, count, "Scheduled")
-        # Held after the end; row -1, of times before the start, is NaN.
+        # Only the end is clipped: row -1, before the start, is NaN on purpose.
         return eqx.combine(row_at(arrays, jnp.minimum(k, count - 1)), rest)
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
@@ -92,25 +93,26 @@ class _Past(NamedTuple):
 
 
 class History(AbstractController):
-    """A controller whose input is a window of past observations and controls,
+    r"""A controller that acts on a window of past observations and controls.
 
-    `u_t = base(t, (z_t, z_{t-1}, ..., z_{t-n}, u_{t-1}, ..., u_{t-n}))`
+    $$u_t = \pi(t, (z_t, z_{t-1}, \dots, z_{t-n}, u_{t-1}, \dots, u_{t-n})),
+    \qquad z_t = \phi(y_t)$$
 
-    with `z = features(y)` and u the controls that were applied. Before the beginning
-    the controls are zero and the observations the first one.
+    The past controls are those that were applied, after clipping. At the start of an
+    episode, the past controls are zero and the past observations equal the first one.
 
     **Arguments:**
 
-    - `base`: the controller of the window, which has `size (n + 1) + controls n`
-        entries.
-    - `size`: the size of the features.
+    - `base`: $\pi$, the controller that acts on the window. Its observation is a vector
+        with `size * (n + 1) + controls * n` entries.
+    - `size`: the size of the features $z$.
     - `controls`: the number of controls.
-    - `length`: n, the steps of the past, 1 by default.
-    - `features`: of an observation, a function such as `env.encode`; the observation
-        itself by default.
+    - `length`: $n$, the number of past steps; 1 by default.
+    - `features`: $\phi$, a function of an observation, such as `env.encode`; the
+        observation itself by default.
 
-    **Raises:** `ValueError` if `base` is not a controller or a size is below 1; when it
-    is run, if the features have another size.
+    **Raises:** `ValueError` if `base` is not a controller or a size is below 1; at run
+    time, if the features have another size.
 
     !!! example
 

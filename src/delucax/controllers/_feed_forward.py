@@ -1,4 +1,4 @@
-"""References and disturbances known in advance, and the feed-forward for them."""
+"""Known references and disturbances, and the feed-forward control for them."""
 
 import functools
 from collections.abc import Callable
@@ -24,12 +24,12 @@ Signal = Callable[[Any], Array]
 
 
 class KnownSignals(eqx.Module):
-    """A state and control to follow, and a disturbance, each known at every time.
+    """The state and control to follow and the disturbance, known at every time.
 
-    About them the linear dynamics are `e_next = A e + B v + d`, with
-    `e = difference(x, r)`, `v = u - u_r`, and `d[k]` the residual of the reference: the
-    difference of where the dynamics go from `r[k]` under `u_r[k]` and `w[k]` from
-    `r[k+1]`.
+    Relative to these signals the linear dynamics are $e_{k+1} = A e_k + B v_k + d_k$,
+    with the state error $e = $ `difference(x, r)` and the control error $v = u - u_r$.
+    The residual $d_k$ is the difference between the state that follows $r_k$ under
+    $u_r$ and the disturbance, and the next reference $r_{k+1}$.
     """
 
     dynamics: LinearDynamics
@@ -39,20 +39,20 @@ class KnownSignals(eqx.Module):
     difference: Difference | None = function_field()
 
     def state(self, t: RealScalar) -> Float[Array, " n"]:
-        """`r(t)`."""
+        """The reference `r(t)` of the state."""
         return self.dynamics.x_ref if self.reference is None else self.reference(t)
 
     def control(self, t: RealScalar) -> Float[Array, " m"]:
-        """`u_r(t)`."""
+        """The reference `u_r(t)` of the control."""
         if self.control_reference is None:
             return self.dynamics.u_ref
         return self.control_reference(t)
 
     def next_state(self, t: RealScalar) -> Float[Array, " n"]:
-        """Where the dynamics go from `r(t)` under `u_r(t)` and the disturbance."""
+        """The state that follows `r(t)` under `u_r(t)` and the disturbance."""
         point = self.dynamics
         here = deviation(self.state(t), point.x_ref, self.difference)
-        # The affine map of the operating point, even where the reference is far away.
+        # The dynamics stay linearised at the operating point, however far r is.
         after = point.x_next + matvec(point.A, here)
         after = after + matvec(point.B, self.control(t) - point.u_ref)
         if self.disturbance is None:
@@ -61,7 +61,7 @@ class KnownSignals(eqx.Module):
         return after + (w if point.E is None else matvec(point.E, w))
 
     def offset(self, t: RealScalar) -> Float[Array, " n"]:
-        """`d` at time `t`."""
+        """The residual `d` at time `t`."""
         ahead = self.state(t + self.dynamics.dt)
         return deviation(self.next_state(t), ahead, self.difference)
 
@@ -69,8 +69,7 @@ class KnownSignals(eqx.Module):
 def as_signals(
     dynamics: LinearDynamics, given: tuple[Any, Any, Any], where: str
 ) -> tuple[Signal | None, Signal | None, Signal | None]:
-    """The reference, control reference and disturbance that were given, checked at
-    time 0."""
+    """The two references and the disturbance as signals, with checked sizes."""
     sizes = dynamics.state_size, dynamics.control_size, dynamics.disturbance_size
     names = "reference", "control_reference", "disturbance"
     r, u_r, w = map(functools.partial(as_signal, where), given, sizes, names)
@@ -78,7 +77,7 @@ def as_signals(
 
 
 def as_signal(where: str, value: Any, size: int, name: str) -> Any:
-    """A vector as a constant signal; a function `t -> vector` with its size checked."""
+    """A vector as a constant signal, or a function of time with its size checked."""
     if value is None:
         return None
     if not callable(value):
@@ -93,11 +92,12 @@ def as_signal(where: str, value: Any, size: int, name: str) -> Any:
 
 
 class Preview(eqx.Module):
-    """The feed-forward of an infinite-horizon regulator,
+    r"""The feed-forward control of an infinite-horizon regulator.
 
-    `v[k] = -M sum_j (A - B K)'^j P d[k+j]`, `M = (R + B'PB)^-1 B'`,
+    $$v_k = -M \sum_{j \ge 0} ((A - B K)^\top)^j P\, d_{k+j},
+    \qquad M = (R + B^\top P B)^{-1} B^\top$$
 
-    with `d` looked up `steps` ahead and taken to stay as it is from there.
+    It evaluates `d` for `steps` steps ahead and takes it as constant after them.
     """
 
     signals: KnownSignals
@@ -107,17 +107,16 @@ class Preview(eqx.Module):
     steps: int = eqx.field(static=True)
 
     def __call__(self, t: RealScalar) -> Float[Array, " m"]:
-        """`v` at time `t`."""
-        # The sum is the linear term of the cost to go, of which v = -M p is the best
-        # control: p[k] = P d[k] + (A - B K)' p[k+1].
+        """The feed-forward control `v` at time `t`."""
+        # The sum is the linear term p of the cost to go, and v = -M p the best control:
+        # p[k] = P d[k] + (A - B K)' p[k+1].
         loop = self.closed_loop.T
         times = t + self.signals.dynamics.dt * jnp.arange(self.steps + 1)
         pushes = jax.vmap(lambda t: self.P @ self.signals.offset(t))(times)
-        # A constant push for ever sums to (I - loop)^-1 times it.
+        # If the last push stays for ever, the rest of the sum is (I - loop)^-1 push.
         eye = jnp.eye(loop.shape[0], dtype=loop.dtype)
         operator = lx.MatrixLinearOperator(eye - loop)
         ahead = lx.linear_solve(operator, pushes[-1], lx.LU()).value
         back = lambda total, push: (push + loop @ total, None)  # noqa: E731
-        # Horner's rule on the powers of the loop, from the last push back to the first.
         ahead, _ = jax.lax.scan(back, ahead, pushes[:-1], reverse=True)
         return -matvec(self.M, ahead)

@@ -19,38 +19,45 @@ from ._operating_point import (
 
 
 class HInfinity(AbstractController):
-    """The H-infinity controller about an operating point,
+    r"""The H-infinity controller about an operating point, for the worst disturbance.
 
-    `u = u_ref - K difference(x, x_ref)`,
+    $$u = u_\mathrm{ref} - K\, \mathrm{difference}(x, x_\mathrm{ref})$$
 
-    which keeps the sum of `dx'Q dx + du'R du` below `gamma^2` times the sum of `w'w`,
-    for every disturbance `w` of the linear dynamics from rest, `dx` and `du` being the
-    deviations from the operating point. Over all time, or over a horizon; then the gain
-    varies in time, and `dx' final dx` at the end counts too.
+    For every disturbance $w$ of the linear dynamics, starting at the operating point,
+    it guarantees
 
-    By default `gamma` is the least that is attainable. A larger one improves the
-    average at the expense of the worst case.
+    $$\sum_k \left( \delta x_k^\top Q\, \delta x_k + \delta u_k^\top R\, \delta u_k
+    \right) \le \gamma^2 \sum_k w_k^\top w_k$$
+
+    where $\delta x$ and $\delta u$ are the deviations from the operating point. The
+    sums run over all time, or over a finite horizon. With a horizon the gain varies in
+    time, and the left side includes the final cost.
+
+    By default $\gamma$ is the smallest level that a controller can attain. A larger one
+    improves the average at the expense of the worst case.
 
     **Arguments:**
 
     - `dynamics`: linear dynamics that rest at their operating point and observe their
-        state; of [`delucax.linearize`][], for example. Their `E` is how the disturbance
-        enters. Time-varying ones have a horizon, and an operating point that each step
-        takes to the next.
-    - `Q`: state weight, shape `(n, n)`, symmetric; over a horizon also `(T, n, n)`.
-    - `R`: control weight, shape `(m, m)`, symmetric; over a horizon also `(T, m, m)`.
-    - `gamma`: the level, a positive number; by default the least that is attainable.
-    - `horizon`: the number of steps `T`; by default that of time-varying `dynamics`,
-        otherwise all time.
-    - `final`: final weight, shape `(n, n)`, symmetric, over a horizon only; zero by
+        state, for example from [`delucax.linearize`][]. The disturbance enters through
+        their `E`. Time-varying dynamics have a finite horizon, and must go from each
+        operating point to the next.
+    - `Q`: state weight, shape `(n, n)`, symmetric; with a horizon also `(T, n, n)`.
+    - `R`: control weight, shape `(m, m)`, symmetric; with a horizon also `(T, m, m)`.
+    - `gamma`: the level $\gamma$, a positive number; the smallest attainable one by
         default.
-    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
+    - `horizon`: the number of steps `T`. By default the length of time-varying
+        `dynamics`, and otherwise infinite.
+    - `final`: final weight, shape `(n, n)`, symmetric, only with a horizon; zero by
+        default.
+    - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
+        subtraction by default.
 
     **Attributes:** `K`, the gain, trainable, shape `(m, n)`, or `(T, m, n)`; `P`, the
     solution of the game, shape `(n, n)`, or `(T+1, n, n)`; `L`, the gain of the worst
     disturbance `w = L dx`, shape `(k, n)`, or `(T, k, n)`; `gamma`, the level; `x_ref`
-    and `u_ref`, the operating point. Before step 0 of a horizon and from step `T` on
-    the control is NaN, which a rollout reports.
+    and `u_ref`, the operating point. With a horizon the control is NaN before step 0
+    and from step `T` on, which a rollout reports.
 
     **Raises:** `ValueError` if `dynamics` is not linear, does not rest at its operating
     point or does not observe its state, or if an argument does not fit; an error at run
@@ -97,12 +104,12 @@ class HInfinity(AbstractController):
         varies = dynamics.is_time_varying
         is_finite = varies or horizon is not None
         if final is not None and not is_finite:
-            raise ValueError(f"{where}: final is given, which needs a horizon.")
+            raise ValueError(f"{where}: final must not be given without a horizon.")
         self.x_ref = operating_state(dynamics, difference, where)
         self.u_ref, self.difference = dynamics.u_ref, difference
         matrices = dynamics.A, dynamics.B, dynamics.E, Q, R
-        # As the state is observed, one Riccati equation does; from outputs it would
-        # take a second, of the filter (Doyle, Glover, Khargonekar and Francis, 1989).
+        # One Riccati equation is enough, because the state is observed. Output feedback
+        # would need a second one (Doyle, Glover, Khargonekar and Francis, 1989).
         if is_finite:
             steps = dynamics.A.shape[0] if varies else None
             T = steps if horizon is None else check_count(horizon, "horizon", where)
@@ -110,8 +117,7 @@ class HInfinity(AbstractController):
         else:
             solution = hinf_dare(*matrices, gamma=gamma)
         self.K, self.P, self.L = solution.K, solution.X, solution.L
-        # The sign is that of the Riccati package: u = -K dx minimises, w = +L dx
-        # maximises, and the closed loop of both is A - B K + E L.
+        # The signs of the Riccati package: u = -K dx minimises, w = +L dx maximises.
         self.gamma, self.dt = solution.gamma, dynamics.dt if is_finite else None
 
     def __check_init__(self):
@@ -125,7 +131,7 @@ class HInfinity(AbstractController):
         if self.dt is not None:
             step = step_at(t, self.dt, len(K), "HInfinity")
             K = row_at(K, step)
-            # Gains may vary about one operating point, or about one at each step.
+            # The gains vary in time, but the operating point need not.
             if x_ref.ndim == 2:
                 x_ref, u_ref = row_at((x_ref, u_ref), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))

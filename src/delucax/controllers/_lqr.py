@@ -1,4 +1,4 @@
-"""The linear-quadratic regulators over an infinite horizon."""
+"""Linear-quadratic regulators over an infinite horizon."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,44 +27,56 @@ from ._operating_point import (
 
 
 class LQR(AbstractController):
-    """The infinite-horizon linear-quadratic regulator about an operating point,
+    r"""The infinite-horizon linear-quadratic regulator about an operating point.
 
-    `u = u_ref - K difference(x, x_ref)`,
+    $$u = u_\mathrm{ref} - K\, \delta x, \qquad
+    \delta x = \mathrm{difference}(x, x_\mathrm{ref})$$
 
-    which minimises the sum over all time of `dx'Q dx + 2 dx'S du + du'R du` on the
-    linear dynamics, `dx` and `du` being the deviations from the operating point. The
-    minimum is `dx' P dx`; with unit white noise it is `trace(P)` per step.
+    On the linear dynamics it minimises the sum over all time of
 
-    With a `reference` r(t), a `control_reference` u_r(t) or a known `disturbance` w(t),
-    the deviations are those from r and u_r, and a feed-forward is added, the best one
-    if these signals are known `preview` steps ahead and stay as they are from there:
+    $$\delta x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u +
+    \delta u^\top R\, \delta u$$
 
-    `u = u_r - K difference(x, r) - (R + B'PB)^-1 B' sum_j (A - B K)'^j P d[k+j]`,
+    where $\delta x$ and $\delta u$ are the deviations from the operating point. The
+    minimum from a deviation $\delta x$ is $\delta x^\top P\, \delta x$. Under white
+    noise of unit covariance on the state, the average cost per step is
+    $\operatorname{tr} P$.
 
-    `d[k]` being the distance from `r[k+1]` to where the dynamics go from `r[k]` under
-    `u_r[k]` and `w[k]`. As control away from u_r is charged, r is reached exactly only
-    if u_r is what holds it; [`delucax.controllers.LQI`][] finds that by itself.
+    With a `reference` $r(t)$, a `control_reference` $u_r(t)$ or a known `disturbance`
+    $w(t)$, the cost charges deviations from $r$ and $u_r$, and the regulator adds a
+    feed-forward control:
+
+    $$u_k = u_{r,k} - K\, \mathrm{difference}(x_k, r_k) -
+    (R + B^\top P B)^{-1} B^\top \sum_{j \ge 0} ((A - B K)^\top)^j P\, d_{k+j}$$
+
+    Here $d_k$ is the difference between the state that follows $r_k$ under $u_{r,k}$
+    and $w_k$, and $r_{k+1}$. The feed-forward is optimal if the signals are known
+    `preview` steps ahead and are constant after that. The state reaches a constant $r$
+    exactly only if $u_r$ holds it there, because the cost charges any other control.
+    [`delucax.controllers.LQI`][] reaches it without knowing $u_r$.
 
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
-        and whose state is observed, of [`delucax.linearize`][] for example; or any
-        dynamics, with a `point`. The residual of the equilibrium must be below 1e-4 of
-        the terms `|A - I| |x_ref| + |B| |u_ref|`.
+        and whose state is observed, for example from [`delucax.linearize`][]; or any
+        dynamics, if you give a `point`. The residual of the equilibrium must be below
+        1e-4 of the terms $|A - I|\,|x_\mathrm{ref}| + |B|\,|u_\mathrm{ref}|$.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `reference`: the state to follow, a vector or a function of time; the operating
-        point by default.
-    - `control_reference`: the control from which deviations are charged, a vector or a
-        function of time; that of the operating point by default.
-    - `disturbance`: a disturbance known in advance, a vector or a function of time.
-    - `preview`: for how many steps ahead the signals are looked up, 0 by default.
-    - `difference`: `(x, x_ref) -> deviation`, such as the `difference` of the system
-        that was linearised, which wraps angles; subtraction by default, and with a
-        `point` that of `dynamics`.
-    - `point`: the [`delucax.dynamics.OperatingPoint`][] of [`delucax.trim`][] at which
-        `dynamics` are linearised, at time 0; by default they are linear already.
+    - `reference`: $r$, the state to follow, a vector of shape `(n,)` or a function of
+        time; the operating point by default.
+    - `control_reference`: $u_r$, the control that costs nothing, a vector of shape
+        `(m,)` or a function of time; the control of the operating point by default.
+    - `disturbance`: $w$, a disturbance known in advance, a vector of shape `(k,)` or a
+        function of time; none by default.
+    - `preview`: the number of steps ahead at which the signals are known, 0 by default.
+    - `difference`: a function `(x, x_ref) -> deviation`, such as the `difference` of
+        the system that you linearised, which wraps angles. Subtraction by default; with
+        a `point`, the `difference` of nonlinear `dynamics`.
+    - `point`: the [`delucax.dynamics.OperatingPoint`][] about which to linearise
+        `dynamics` at time 0, from [`delucax.trim`][]. Without it, `dynamics` must be
+        linear.
 
     **Attributes:** `K`, the gain, trainable, shape `(m, n)`; `P`, the solution of the
     Riccati equation, shape `(n, n)`; `x_ref` and `u_ref`, the operating point.
@@ -116,8 +128,8 @@ class LQR(AbstractController):
         where = "LQR"
         if point is not None:
             hint = (
-                ", where point is given (sample a system with `delucax.Discretized`, "
-                "or use `delucax.controllers.lqrd`)"
+                " if point is given (sample a system with `delucax.Discretized`, or "
+                "use `delucax.controllers.lqrd`)"
             )
             check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
         linear, difference = linear_at(dynamics, point, difference, where)
@@ -130,10 +142,10 @@ class LQR(AbstractController):
         preview = check_count(preview, "preview", where, least=0)
         if preview and not is_known:
             raise ValueError(
-                f"{where}: preview must be 0 without a reference or disturbance that "
-                f"is looked up ahead, got {preview}."
+                f"{where}: preview must be 0 without a reference, control_reference or "
+                f"disturbance, got {preview}."
             )
-        # K = (R + B'PB)^-1 (B'PA + S'), for u = -K x: the minus is in the law.
+        # K = (R + B'PB)^-1 (B'PA + S'), for u = -K x: the minus is not in K.
         solution = dare(linear.A, linear.B, Q, R, S)
         self.K, self.P, self.feed_forward = solution.K, solution.X, None
         if is_known:
@@ -149,9 +161,8 @@ class LQR(AbstractController):
         shapes = self.feed_forward.M.shape, self.feed_forward.signals.dynamics.B.shape
         if shapes != ((m, n), (n, m)):
             raise ValueError(
-                f"LQR: feed_forward must be that of {n} states and {m} controls, as K "
-                f"is, got M of shape {shapes[0]} and dynamics with B of shape "
-                f"{shapes[1]}."
+                f"LQR: feed_forward must fit K, for {n} states and {m} controls, got M "
+                f"of shape {shapes[0]} and dynamics with B of shape {shapes[1]}."
             )
         known = self.feed_forward.signals
         given = known.reference, known.control_reference, known.disturbance
@@ -163,7 +174,7 @@ class LQR(AbstractController):
         if self.feed_forward is not None:
             signals = self.feed_forward.signals
             x_ref = signals.state(t)
-            # The feed-forward has its minus inside.
+            # Plus: the feed-forward includes its minus.
             u_ref = signals.control(t) + self.feed_forward(t)
         u = u_ref - matvec(self.K, deviation(y, x_ref, self.difference))
         return u.astype(y.dtype), state
@@ -175,17 +186,21 @@ class _Memory(NamedTuple):
 
 
 class LQI(AbstractController):
-    """The linear-quadratic regulator with integral action,
+    r"""The linear-quadratic regulator with integral action.
 
-    `u = u_ref - K difference(x, x_ref) - Ki z`,
-    `z[k+1] = z[k] + dt (r(t_k) - C x[k])`,
+    $$u_k = u_\mathrm{ref} - K\, \mathrm{difference}(x_k, x_\mathrm{ref}) - K_i z_k,
+    \qquad z_{k+1} = z_k + \Delta t\, (r(t_k) - C x_k)$$
 
-    which brings the outputs `C x` to a constant reference under any constant
-    disturbance. The gains minimise the sum of `v'Q v + 2 v'S du + du'R du`, `v` being
-    the deviation of the state and the integral `z`, one under the other.
+    It brings the outputs $C x$ to a constant reference $r$ under any constant
+    disturbance. The gains minimise the sum over all time of
 
-    Where the control is limited, back-calculation sets the integral to the value that
-    would have given the applied control, so that it cannot wind up.
+    $$v^\top Q v + 2\, v^\top S\, \delta u + \delta u^\top R\, \delta u$$
+
+    where $v$ stacks the deviation of the state and the integral $z$.
+
+    If the applied control differs from the one that the regulator asked for, for
+    example because it was clipped, then back-calculation sets the integral to the value
+    that would have given the applied control. So the integral does not wind up.
 
     **Arguments:**
 
@@ -194,20 +209,21 @@ class LQI(AbstractController):
     - `Q`: weight of state and integral, shape `(n+p, n+p)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n+p, m)`; zero by default.
-    - `output`: `C`, which outputs to regulate, shape `(p, n)`; as many as there are
-        controls at most.
-    - `reference`: r, a vector of size `p` or a function of time that returns one; the
-        outputs at the operating point by default.
-    - `difference`: `(x, x_ref) -> deviation`; subtraction by default. The outputs are
-        those of the operating point plus `C` times the deviation.
+    - `output`: $C$, the map from the state to the regulated outputs, shape `(p, n)`.
+        There are at most as many outputs as controls.
+    - `reference`: $r$, a vector of shape `(p,)` or a function of time that returns one;
+        the outputs at the operating point by default.
+    - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
+        subtraction by default. The outputs are `C x_ref` plus $C$ times the deviation.
 
     **Attributes:** `K` and `Ki`, the gains, trainable, shapes `(m, n)` and `(m, p)`;
     `P`, the solution of the Riccati equation, shape `(n+p, n+p)`; `x_ref` and `u_ref`,
     the operating point.
 
-    **Raises:** `ValueError` as for [`delucax.controllers.LQR`][], or if `output` or
-    `reference` does not fit; an error at run time if there is no stabilising gain, as
-    where the outputs cannot be moved one without the other.
+    **Raises:** `ValueError` for the same reasons as [`delucax.controllers.LQR`][], or
+    if `output` or `reference` does not fit; an error at run time if there is no
+    stabilising gain, for example because the controls cannot move the outputs
+    independently.
 
     Source: Young and Willems, 1972.
 
@@ -281,24 +297,23 @@ class LQI(AbstractController):
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.x_ref.shape[0])
         dx = deviation(y, self.x_ref, self.difference)
-        # r - C x with x = x_ref + dx; the part of x_ref cancels where no reference is
-        # given.
+        # r - C x with x = x_ref + dx. Without a reference, r = C x_ref, which cancels.
         error = -matvec(self.output, dx)
         if self.reference is not None:
             error = error + self.reference(t) - matvec(self.output, self.x_ref)
         u = self.u_ref - matvec(self.K, dx) - matvec(self.Ki, state.integral)
-        # After u, which is of z[k]: that is the z of the design.
+        # After u: the gains are designed for u[k] as a function of z[k].
         integral = state.integral + self.dt * error
         dtype = state.integral.dtype
         after = _Memory(integral.astype(dtype), u.astype(dtype))
         return u.astype(y.dtype), after
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
-        # The least change `dz` of the integral with `Ki dz = asked - applied`, so that
-        # the law would have given the applied control: back-calculation in one step.
+        # Back-calculation in one step: the smallest change dz of the integral with
+        # Ki dz = asked - applied.
         excess = state.asked - u.astype(state.asked.dtype)
         gain = lx.MatrixLinearOperator(self.Ki)
-        # Where there are fewer outputs than controls, Ki is tall: least squares.
+        # Ki is tall if there are fewer outputs than controls: least squares.
         solver = lx.AutoLinearSolver(well_posed=None)
         change = lx.linear_solve(gain, excess, solver, throw=False).value
         limited = jnp.any(excess != 0)
@@ -308,8 +323,7 @@ class LQI(AbstractController):
 
 @host_unless_traced
 def _effect(R, B, P) -> Array:
-    """`(R + B'PB)^-1 B'`: the weight of each control by what it does to the cost to
-    go."""
+    """The map `(R + B'PB)^-1 B'` from a gradient of the cost to go to a control."""
     return solve(R.astype(P.dtype) + B.T @ P @ B, B.T)
 
 
@@ -317,11 +331,11 @@ def _effect(R, B, P) -> Array:
 def _with_integral(A, B, C, dt, Q, R, S) -> tuple[Array, Array, Array]:
     """The gains of state and integral, and the solution of the Riccati equation."""
     (n, m), p = B.shape, len(C)
-    # `z_next = z - dt C e`, below the plant: the reference drops out of the design.
+    # The design needs no reference: it drops out of z_next = z - dt C dx.
     integrals = [-dt * C, xp.eye(p, dtype=C.dtype)]
     A = xp.block([[A, xp.zeros((n, p), C.dtype)], integrals])
     B = xp.concatenate([B, xp.zeros((p, m), C.dtype)])
-    # z integrates r - C x. Where a textbook integrates C x - r (Åström and Murray,
-    # 2008), its Ki has the other sign.
+    # z integrates r - C x. Textbooks that integrate C x - r (Åström and Murray, 2008)
+    # have the other sign of Ki.
     solution = dare(A, B, Q, R, S)
     return solution.K[:, :n], solution.K[:, n:], solution.X

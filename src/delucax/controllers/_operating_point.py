@@ -1,4 +1,4 @@
-"""Checks of the linear dynamics that a regulator is designed for."""
+"""Checks of the linear dynamics for which a regulator is designed."""
 
 from typing import Any
 
@@ -19,13 +19,13 @@ from ..systems import LinearSystem
 
 
 _EQUILIBRIUM_TOLERANCE = 1e-4
-"""The relative residual of an equilibrium, which users may give to few digits."""
+"""The largest relative residual of an equilibrium: users may give few digits."""
 
 
 def linear_at(
     dynamics: Any, point: Any, difference: Difference | None, where: str
 ) -> tuple[Any, Difference | None]:
-    """`dynamics` linearised at a point that is given, and how their states differ."""
+    """`dynamics` linearised at `point`, if any, and the difference of their states."""
     if point is None:
         return dynamics, difference
     hint = " (`delucax.trim` computes one)"
@@ -36,8 +36,7 @@ def linear_at(
             f"{where}: point must have x of shape {sizes[0]} and u of shape "
             f"{sizes[1]}, got {point.x.shape} and {point.u.shape}."
         )
-    # Linear dynamics have no angles of their own: for them subtraction stays the
-    # default.
+    # Linear dynamics have no angles, so their default stays subtraction.
     if difference is None and not isinstance(dynamics, LinearDynamics | LinearSystem):
         difference = dynamics.difference
     return linearize(dynamics, x=point), difference
@@ -46,8 +45,7 @@ def linear_at(
 def check_linear_state_feedback(
     dynamics: Any, where: str, *, time_invariant: bool = False
 ) -> None:
-    """Raise unless the dynamics are linear and observe their state, and if need be are
-    the same at all times."""
+    """Raise unless the dynamics are linear and observe their state."""
     hint = (
         " (`delucax.linearize` makes one of any dynamics, `delucax.c2d` of a linear "
         "system)"
@@ -58,21 +56,24 @@ def check_linear_state_feedback(
     C, n = dynamics.C, dynamics.state_size
     if C is None:
         return
-    # A traced C cannot be inspected: its shape alone decides.
+    # The values of a traced C are unknown: only its shape is checked.
     if C.shape != (n, n) or is_concrete(C) and not np.array_equal(C, np.eye(n)):
         raise ValueError(
-            f"{where}: dynamics must observe their state (C the identity), for {where} "
-            f"acts on the state itself, got a C of shape {C.shape}. Where only C x is "
-            "measured use `delucax.controllers.LQG`, or `OutputFeedback` with a Kalman "
-            "filter; where the state is measured leave C out."
+            f"{where}: dynamics must observe their state (C the identity), because "
+            f"{where} acts on the state itself, got a C of shape {C.shape}. If only "
+            "C x is measured, use `delucax.controllers.LQG`, or `OutputFeedback` with "
+            "a Kalman filter. If the state is measured, leave C out."
         )
 
 
 def operating_state(
     dynamics: LinearDynamics, difference: Difference | None, where: str
 ) -> Float[Array, "*T n"]:
-    """The state of the operating point, if the dynamics rest there, or those over time,
-    if the dynamics go from each to the next."""
+    """The state of the operating point, once the dynamics are known to rest there.
+
+    Time-varying dynamics may have a state for each time. They must go from each to the
+    next.
+    """
     x_ref, x_next = dynamics.x_ref, dynamics.x_next
     A, B, u_ref = dynamics.A, dynamics.B, dynamics.u_ref
     x, hint = x_ref, ""
@@ -84,7 +85,7 @@ def operating_state(
         A, B, x, u_ref = (a[:-1] for a in (A, B, x_ref, u_ref))
     else:
         rule = f"{where}: dynamics must rest at their operating point (x_next = x_ref)"
-        hint = "`delucax.trim(system, x=..., u=...)` computes one that does; "
+        hint = " `delucax.trim(system, x=..., u=...)` computes a point of rest."
         after = x_ref
     if difference is None:
         moved = _relative_drift(x_next, after, A, B, x, u_ref)
@@ -92,20 +93,20 @@ def operating_state(
         drift = _drift(difference, x_next, after)
         moved = _relative_drift(drift, jnp.zeros_like(drift), A, B, x, u_ref)
     if not is_concrete(moved):
-        # Negated, so that a NaN counts as motion.
+        # `not <=` instead of `>`, so that a NaN raises.
         moves = ~(moved <= _EQUILIBRIUM_TOLERANCE)
         return eqx.error_if(x_ref, moves, f"{rule}.")
     if not float(moved) <= _EQUILIBRIUM_TOLERANCE:
         raise ValueError(
-            f"{rule}, to {_EQUILIBRIUM_TOLERANCE:g} of the terms that move them; the "
-            f"residual is {float(moved):.1e}. {hint}got x_ref {x_ref}, x_next {x_next}."
+            f"{rule}, got x_ref {x_ref} and x_next {x_next}. The relative residual is "
+            f"{float(moved):.1e}, and may be {_EQUILIBRIUM_TOLERANCE:g} at most.{hint}"
         )
     return x_ref
 
 
 @eqx.filter_jit
 def _drift(difference: Difference, x_next: Array, after: Array) -> Array:
-    """The difference of one pair of states, or of those over time."""
+    """The difference of a pair of states, or of a pair at each time."""
     off = difference if x_next.ndim == 1 else jax.vmap(difference)
     return off(x_next, after)
 
@@ -113,18 +114,18 @@ def _drift(difference: Difference, x_next: Array, after: Array) -> Array:
 @host_unless_traced
 @compiled_unless_on_host
 def _relative_drift(x_next, after, A, B, x, u):
-    """The residual of an equilibrium, relative to its terms."""
-    # The derivative of x_next - x: what moves the state is J (x, u).
+    """The residual of an equilibrium, relative to the terms that it is a sum of."""
+    # The derivative of x_next - x by (x, u).
     J = xp.concatenate([A - xp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
     return relative_drift(x_next - after, J, x, u, is_map=True)
 
 
 def deviation(x: Array, x_ref: Array, difference: Difference | None) -> Array:
-    """`x - x_ref`, as the system measures it."""
+    """`x - x_ref`, or the difference that was given in place of subtraction."""
     return x - x_ref if difference is None else difference(x, x_ref)
 
 
 def check_state(controller: AbstractController, y: Array, size: int) -> None:
-    """Raise unless the observation is a state."""
+    """Raise unless the observation has the size of the state."""
     if y.shape != (size,):
         raise wrong_observation(controller, size, y)

@@ -1,4 +1,4 @@
-"""State feedback that acts on an estimate."""
+"""State feedback on the estimate of an estimator."""
 
 from typing import Any, NamedTuple
 
@@ -26,19 +26,22 @@ class _State(NamedTuple):
 
 
 class OutputFeedback(AbstractController):
-    """Any controller of the state, run on an estimate of it.
+    """A state-feedback controller that acts on an estimate of the state.
 
-    At each step the estimator takes in the observation, the controller acts on the mean
-    of its estimate, and the estimator predicts with the control that was really
-    applied, after saturation. Steps at which its `status` is no success are
-    `incidents["failed_estimate"]` of a rollout.
+    At each step the estimator updates its estimate with the observation, and the
+    controller acts on the mean of the estimate. Then the estimator predicts, with the
+    control that was applied after clipping.
+
+    A rollout counts the steps at which the `status` of the estimator is not successful,
+    in `incidents["failed_estimate"]`.
 
     **Arguments:**
 
-    - `controller`: a controller that reads the state.
-    - `estimator`: what estimates it, such as a [`delucax.estimators.KalmanFilter`][].
+    - `controller`: a controller that observes the state.
+    - `estimator`: the estimator of the state, such as a
+        [`delucax.estimators.KalmanFilter`][].
 
-    **Raises:** `ValueError` if either is of the wrong kind.
+    **Raises:** `ValueError` if one of them has the wrong type.
 
     !!! example
 
@@ -71,7 +74,7 @@ class OutputFeedback(AbstractController):
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
         keys = (None, None) if key is None else jax.random.split(key)
         state = self.estimator.init(key=keys[1])
-        # `applied` is not given the time, but the prediction needs it.
+        # The prediction needs the time, which `applied` does not get.
         time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
         memory = self.controller.init(key=keys[0])
         return _State(memory, state, time, Tally("failed_estimate"))
@@ -93,46 +96,54 @@ class OutputFeedback(AbstractController):
 
 
 class LQG(AbstractController):
-    r"""The linear-quadratic regulator on the state that a Kalman filter estimates,
+    r"""The linear-quadratic-Gaussian regulator: LQR on a Kalman filter's estimate.
 
-    `u = u_ref - K (mean - x_ref)`,
+    $$u = u_\mathrm{ref} - K (\hat x - x_\mathrm{ref})$$
 
-    `mean` being the filtered estimate, the current observation included; the prediction
-    takes the saturated control. Of all controllers that see `y = C x + v`,
-    `v ~ N(0, V)`, of `x_next = A x + B u + E w`, `w ~ N(0, W)`, it has the least
-    average cost `dx'Q dx + 2 dx'S du + du'R du`:
+    Here $\hat x$ is the filtered estimate, which includes the current observation. The
+    filter predicts with the control that was applied after clipping.
 
-    `trace(P E W E') + trace(K' (R + B'PB) K Sigma)`,
+    For the plant
 
-    `P` being the solution of the regulator's Riccati equation and `Sigma` the
-    covariance of the estimate.
+    $$x_{k+1} = A x_k + B u_k + E w_k, \qquad y_k = C x_k + v_k, \qquad
+    w_k \sim N(0, W), \quad v_k \sim N(0, V)$$
+
+    no other controller of the observations has a lower average of the cost $\delta
+    x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u + \delta u^\top R\, \delta u$
+    per step. This average is
+
+    $$\operatorname{tr}(P E W E^\top) +
+    \operatorname{tr}(K^\top (R + B^\top P B) K \Sigma)$$
+
+    with $P$ the solution of the regulator's Riccati equation and $\Sigma$ the
+    covariance of the filtered estimate.
 
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an
-        equilibrium; of [`delucax.linearize`][], for example.
+        equilibrium, for example from [`delucax.linearize`][].
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
-    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`.
+    - `W`: covariance of the disturbance, shape `(k, k)`.
     - `V`: covariance of the sensor noise, shape `(p, p)`.
     - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `mean`: of the first state, shape `(n,)`; `x_ref` by default.
-    - `covariance`: of the first state before it is observed, shape `(n, n)`; only
-        without `steady_state`, and then the identity by default.
-    - `steady_state`: use the filter's gain of the steady state at all times; true by
+    - `mean`: mean of the first state, shape `(n,)`; `x_ref` by default.
+    - `covariance`: covariance of the first state, before the first observation, shape
+        `(n, n)`; the identity by default. Only without `steady_state`.
+    - `steady_state`: use the steady-state gain of the filter at all times; true by
         default.
-    - `y_ref`: what is observed at the operating point, shape `(p,)`; `C x_ref` by
+    - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by
         default.
-    - `difference`: `(x, x_ref) -> deviation`, which wraps angles of the state;
-        subtraction by default.
-    - `observation_difference`: likewise for observations.
+    - `difference`: a function `(x, x_ref) -> deviation` that replaces subtraction of
+        states, for example to wrap angles.
+    - `observation_difference`: the same for observations.
 
     **Attributes:** `regulator`, a [`delucax.controllers.LQR`][], with `K` and `P`;
-    `estimator`, a [`delucax.estimators.KalmanFilter`][], with `L`; `average_cost`, a
-    scalar, of the steady state (`None` without it).
+    `estimator`, a [`delucax.estimators.KalmanFilter`][], with `L`; `average_cost`, the
+    average cost per step in the steady state, a scalar (`None` without `steady_state`).
 
-    **Raises:** `ValueError` as those two do; an error at run time if there is no
-    stabilising gain or no steady state of the filter.
+    **Raises:** `ValueError` for the same reasons as the regulator and the filter; an
+    error at run time if there is no stabilising gain or the filter has no steady state.
 
     Source: Åström, 1970.
 
@@ -182,7 +193,7 @@ class LQG(AbstractController):
     ):
         plant: Any = dynamics
         if isinstance(dynamics, LinearDynamics) and dynamics.C is not None:
-            # LQR takes dynamics that observe their state; here the filter supplies it.
+            # LQR accepts only an observed state; here the filter provides the state.
             plant = eqx.tree_at(lambda d: d.C, dynamics, None)
         self.regulator = LQR(plant, Q, R, S, difference=difference)
         start: Any = dict(mean=mean, covariance=covariance, steady_state=steady_state)
@@ -200,8 +211,8 @@ class LQG(AbstractController):
         shape = dynamics.control_size, dynamics.state_size
         if self.regulator.K.shape != shape:
             raise ValueError(
-                f"LQG: regulator.K must have shape {shape}, as the dynamics of "
-                f"estimator need, got {self.regulator.K.shape}."
+                f"LQG: regulator.K must have shape {shape} to fit the dynamics of "
+                f"the estimator, got {self.regulator.K.shape}."
             )
 
     @property
@@ -220,10 +231,10 @@ class LQG(AbstractController):
 
 @host_unless_traced
 def _average_cost(regulator: LQR, estimator: KalmanFilter, R: Array) -> Array:
-    """The cost of a step of the linear-quadratic-Gaussian regulator on average."""
+    """The average cost per step of the LQG regulator in the steady state."""
     K, P, dynamics = regulator.K, regulator.P, estimator.dynamics
-    # Separation: the first term is the cost with the state known, the second that of
-    # the control du = -K (mean - x) which acts on the error of the estimate.
+    # Separation principle: the first term is the cost if the state is known, the
+    # second is the cost of the control -K (mean - x) due to the estimation error.
     weight = K.T @ (R + dynamics.B.T @ P @ dynamics.B) @ K
     error: Any = estimator.updated_covariance
     return xp.trace(P @ estimator._noise(dynamics)) + xp.trace(weight @ error)

@@ -1,4 +1,4 @@
-"""A controller and a learned correction."""
+"""A controller with a learned correction."""
 
 import jax.random as jr
 from jaxtyping import Array, PyTree
@@ -10,22 +10,24 @@ from ..math import clip
 
 
 class Residual(AbstractController):
-    """A controller and a correction that is learned, such as an LQR and a network,
+    r"""A controller plus a learned correction, for example an LQR plus a network.
 
-    `u = clip(base(t, y), low, high) + correction(t, y)`.
+    $$u = \operatorname{clip}(\pi_\mathrm{base}(t, y), \mathrm{low}, \mathrm{high}) +
+    \pi_\mathrm{correction}(t, y)$$
+
+    Both controllers learn which control was applied in total.
+    [`delucax.training.fit`][] with `trainable="correction"` trains only the correction.
 
     **Arguments:**
 
-    - `base`: the controller that works without the correction.
-    - `correction`: another one, whose control is added.
-    - `bounds`: `(low, high)` to which the control of `base` is clipped, so that the
-        correction can undo it; none by default.
+    - `base`: the controller without the correction.
+    - `correction`: the controller whose control is added.
+    - `bounds`: `(low, high)`, each a number or of shape `(m,)`, to which the control of
+        `base` is clipped before the correction is added; none by default. Without them
+        a large control of `base` could leave the correction no effect.
 
-    Both are told the control that was applied in all.
-    [`delucax.training.fit`][] trains the correction alone by `trainable="correction"`.
-
-    **Raises:** `ValueError` if one of the two is not a controller, bounds cross, or in
-    a call the two controls differ in size.
+    **Raises:** `ValueError` if one of the two is not a controller, or low bounds are
+    above high ones; at run time, if the two controls differ in size.
 
     Source: Johannink et al., 2019; Silver, Allen, Tenenbaum and Kaelbling, 2018
     (residual policy learning).

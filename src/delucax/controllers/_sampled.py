@@ -1,4 +1,4 @@
-"""The sampled-data regulator, and the discretisation of quadratic costs."""
+"""The sampled-data regulator, and quadratic costs in discrete time."""
 
 from typing import Any
 
@@ -22,19 +22,20 @@ def sampled_weights(
     dt: ArrayLike,
     S: Numbers | None = None,
 ) -> tuple[Array, Array, Array]:
-    """The exact discretisation of a continuous quadratic cost under a held control,
+    r"""The exact weights of a continuous-time quadratic cost under a held control.
 
-    `x'Qd x + 2 x'Sd u + u'Rd u`
-    `= integral over [0, dt] of x(t)'Q x(t) + 2 x(t)'S u + u'R u`
+    $$x^\top Q_d x + 2 x^\top S_d u + u^\top R_d u =
+    \int_0^{\Delta t} \left( x(t)^\top Q x(t) + 2 x(t)^\top S u + u^\top R u \right)
+    dt$$
 
-    along `dx/dt = A x + B u` from `x`, with `u` held.
+    The integral follows $\dot x = A x + B u$ from $x(0) = x$, with $u$ constant.
 
     **Arguments:**
 
     - `system`: the linear system.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
-    - `dt`: the step, a positive number.
+    - `dt`: the step $\Delta t$, a positive number.
     - `S`: cross weight, shape `(n, m)`; zero by default.
 
     **Returns:** `(Qd, Rd, Sd)`, shapes `(n, n)`, `(m, m)` and `(n, m)`.
@@ -77,12 +78,12 @@ def _weights_over(
     A: Array, B: Array, Q: Array, R: Array, S: Any, dt: ArrayLike
 ) -> tuple[Array, Array, Array]:
     n, m = B.shape
-    # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
-    # of one exponential (Van Loan).
+    # With the held control as a state, du/dt = 0, the cost of a step is a Gramian,
+    # which takes one matrix exponential (Van Loan).
     zero = xp.zeros((m, n + m), A.dtype)
     field = xp.concatenate([xp.concatenate([A, B], axis=1), zero])
     charge = xp.block([[Q, S], [S.T, R]]).astype(A.dtype)
-    # integral of expm(F' s) charge expm(F s) over [0, dt], by blocks: Qd, Sd and Rd.
+    # The integral of expm(F' s) charge expm(F s) over [0, dt] has blocks Qd, Sd, Rd.
     total = gramian_over(field.T, charge, xp.asarray(dt, A.dtype))
     return total[:n, :n], total[n:, n:], total[:n, n:]
 
@@ -97,29 +98,35 @@ def lqrd(
     difference: Difference | None = None,
     point: OperatingPoint | None = None,
 ) -> LQR:
-    """The sampled-data regulator of a continuous problem: of all controls held over
-    each `dt` it minimises the integral over all time of
-    `dx'Q dx + 2 dx'S du + du'R du`.
+    r"""The linear-quadratic regulator of a continuous system with sampled control.
 
-    Its `P` is that of the continuous cost: the minimum from a deviation `dx` is
-    `dx' P dx`. As `dt` goes to 0 the gain goes to that of [`delucax.riccati.care`][].
+    Among all controls that are constant over each step, it minimises the integral over
+    all time of
+
+    $$\delta x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u +
+    \delta u^\top R\, \delta u$$
+
+    where $\delta x$ and $\delta u$ are the deviations from the operating point. Its `P`
+    belongs to this continuous-time cost: the minimum from a deviation $\delta x$ is
+    $\delta x^\top P\, \delta x$. As `dt` goes to 0, the gain goes to the gain of
+    [`delucax.riccati.care`][].
 
     **Arguments:**
 
-    - `system`: a linear system about an equilibrium, or any system, which is linearised
-        at the `point`, or else about the equilibrium it defines.
+    - `system`: a linear system about an equilibrium, or any other system, which is
+        linearised at `point` or, without a `point`, at the equilibrium that it defines.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `dt`: the step, a positive number.
     - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `difference`: `(x, x_ref) -> deviation`; that of a system that is not linear by
-        default.
-    - `point`: the [`delucax.dynamics.OperatingPoint`][] of [`delucax.trim`][] at which
-        `system` is linearised, at time 0.
+    - `difference`: a function `(x, x_ref) -> deviation`; by default subtraction for a
+        linear system, and the `difference` of any other system.
+    - `point`: the [`delucax.dynamics.OperatingPoint`][] about which to linearise
+        `system` at time 0, from [`delucax.trim`][].
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if `system` is no system or defines no equilibrium, a
+    **Raises:** `ValueError` if `system` is not a system or defines no equilibrium, a
     weight does not fit, or `dt` is not positive; an error at run time if there is no
     stabilising gain.
 
