@@ -47,43 +47,40 @@ class MPCState(NamedTuple):
 
 
 class MPC(AbstractController):
-    """Model predictive control (receding horizon): plan from the current state, apply
-    the first control, and plan again.
+    """Model predictive control: plan at each step, and apply the first control.
 
-    `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. It works
-    with every [`delucax.planning.AbstractPlanner`][], and with a cost
-    that depends on time, such as a reference to follow.
+    The control $u_k$ is the first control of a plan over `horizon` steps from the state
+    $y_k$ at time $t_k$. Any [`delucax.planning.AbstractPlanner`][] can make the plans.
+    The cost may depend on time, for example through a reference.
 
-    Each plan starts from the cheapest of a few trajectories from `y_k`, which are
-    computed together between the bounds:
+    **Starts.** Each plan starts from the cheapest of three trajectories from $y_k$,
+    which are computed together, within the bounds:
 
-    1. the last plan a step later, under its gains, its last control held,
-    2. the LQR about an operating point,
-    3. the control of that point, held.
+    1. the last plan, shifted by one step, under its feedback gains,
+    2. the trajectory under an LQR about an operating point,
+    3. the trajectory under the control of that point.
 
-    The second one keeps an unstable plant near the point of linearisation, and a plan
-    of [`delucax.planning.ILQR`][] without constraints costs at most as much as each of
-    them. It is computed when the controller is made, about the point that
-    [`delucax.planning.Start.default`][] chooses: the targets of the cost, or the
-    equilibrium of the dynamics, or zero where neither defines one, as with
-    [`delucax.costs.Function`][] or [`delucax.costs.Tracking`][] over dynamics of your
-    own. An unstable plant needs a `start` where it is to be held far from that point,
-    and where there is no LQR: the second derivative of the cost with respect to the
-    control is not positive definite there, no gain stabilises the plant, or the
-    dynamics cannot be differentiated.
+    The LQR keeps an unstable plant near the operating point. A plan of
+    [`delucax.planning.ILQR`][] without constraints costs at most as much as each of the
+    three. [`delucax.planning.Start.default`][] chooses the operating point and computes
+    the LQR once, when you make the controller. Give a `start` if you want to hold an
+    unstable plant far from that point, or if there is no LQR about it:
+    [`delucax.planning.Start.default`][] lists the reasons.
 
-    The status of a plan is in the controller's state: `result`, that of the last plan;
-    `iterations`, how many it took; and how often it was no success, `failures`, which
-    are `incidents["failed_plan"]` of a rollout. There too is `last`, a
-    [`delucax.planning.Start`][], the last plan a step later, from which the next one
-    starts. A plan that ran out of iterations or found no descent is used as it is, the
-    best so far. Where there is none to use, since every start diverges or the
-    constraints cannot hold, `throw` and `fallback` say what happens.
+    **Status.** The state of the controller has `result`, the status of the last plan;
+    `iterations`, the number of iterations it took; `failures`, the number of plans that
+    were not successful, which a rollout counts in `incidents["failed_plan"]`; and
+    `last`, the last plan shifted by one step, a [`delucax.planning.Start`][].
 
-    With `real_time` there is no search: each step solves one quadratic program of
-    [`delucax.planning.SQP`][] about the last plan a step later, and takes its full
-    step. `prepare` sets the program up before the state is measured, and `feedback`
-    solves it with at most `max_qp_steps` linear systems, `state.iterations` of them:
+    A plan that ran out of iterations or found no descent is still used, because it is
+    the best so far. A plan is unusable if every start diverges or the constraints
+    cannot hold. `throw` and `fallback` decide what happens then.
+
+    **Real time.** With `real_time` the planner does not iterate until it converges.
+    Each step solves one quadratic program of [`delucax.planning.SQP`][] about the last
+    plan, shifted by one step, and takes the full step. `prepare` sets up the program
+    before the state is measured. `feedback` solves it with at most `max_qp_steps`
+    linear systems; `state.iterations` tells how many:
 
         state = mpc.init()
         while True:
@@ -91,47 +88,50 @@ class MPC(AbstractController):
             y = measure()
             u, state = mpc.feedback(t, y, state)
 
-    A call of the controller does both. The first plan is about the first of `start`,
-    which a converged plan may give. Where a program cannot be solved, the next one is
-    about the same plan, a step later.
+    Calling the controller does both. The first program is about the first trajectory of
+    `start`, so give a converged plan there if you have one. If a program cannot be
+    solved, the next program is about the same plan, shifted by one more step.
 
-    Derivatives are those of the planner: of [`delucax.planning.ILQR`][] by the implicit
-    function theorem, NaN where a plan did not converge. For a planner that samples they
-    go through the chosen start; the choice itself has none.
+    **Derivatives.** The derivatives are those of the planner.
+    [`delucax.planning.ILQR`][] uses the implicit function theorem, and gives NaN if a
+    plan did not converge. Through a planner that samples, the derivatives are those of
+    the chosen start. The choice itself has no derivative.
 
     **Arguments:**
 
-    - `dynamics`: the model, which observes its state; around an estimator see
-        [`delucax.controllers.OutputFeedback`][].
-    - `cost`: the stage and final cost. A final cost that bounds what comes after the
-        horizon lets this be short.
-    - `horizon`: the steps `T` of a plan.
-    - `planner`: any [`delucax.planning.AbstractPlanner`][], with its options;
-        [`delucax.planning.ILQR`][] by default. Floating-point numbers among the options
-        can be differentiated and changed without compiling again. With `states` each
-        plan starts from these, and from the controls of the last plan, alone.
+    - `dynamics`: the model. Its observation must be its state. If the state is not
+        measured, put the MPC into a [`delucax.controllers.OutputFeedback`][].
+    - `cost`: the stage and final cost. The horizon can be short if the final cost
+        bounds the cost after it.
+    - `horizon`: the number of steps `T` of a plan.
+    - `planner`: any [`delucax.planning.AbstractPlanner`][]; [`delucax.planning.ILQR`][]
+        by default. You can differentiate with respect to its floating-point options,
+        and change them without compiling again. A planner that has `states` starts each
+        plan from these states and the controls of the last plan, and from nothing else.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
-    - `start`: what each plan may start from besides the last one:
-        [`delucax.planning.Start.default`][] by default, the second and third above;
-        controls in place of the third, shape `(T, m)`; or a
-        [`delucax.planning.Start`][] in place of both, such as another stabilising law,
-        or controls alone.
-    - `throw`: raise at run time where there is no plan to use (default). If false, the
-        last plan is used for one more step, under its gains, and then discarded; if
-        there is no plan in the next step either, the first one of `start`, by default
-        the LQR, is applied. With `real_time` the last plan is followed on.
-    - `fallback`: a controller to use in a step without a plan, which then does not
-        raise. Its state advances in every step. None by default.
-    - `real_time`: one quadratic program for each step, by
-        [`delucax.planning.SQP`][], the default planner then; false by default.
-    - `max_qp_steps`: the most linear systems of such a program, 50 by default.
-    - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
-        planners that take them; none by default.
-    - `difference`: `(x, x_ref) -> deviation`, as for the planner; subtraction by
+    - `start`: what a plan may start from besides the last plan. By default the second
+        and third trajectory above. Controls of shape `(T, m)` replace the control of
+        the third one. A [`delucax.planning.Start`][] replaces both, for example by
+        another stabilising feedback.
+    - `throw`: whether to raise at run time if there is no usable plan; true by default.
+        If false, the controller uses the last plan for one more step, under its gains,
+        and then discards it. If there is no usable plan in the next step either, it
+        applies the first trajectory of `start`, by default that of the LQR. With
+        `real_time`, it keeps following the last plan.
+    - `fallback`: a controller that acts in the steps without a usable plan, instead of
+        raising. It is called at every step, so its state is up to date. None by
         default.
+    - `real_time`: whether to solve one quadratic program per step; false by default.
+        The planner must then be a [`delucax.planning.SQP`][], which is also the
+        default.
+    - `max_qp_steps`: the most linear systems per quadratic program, 50 by default.
+    - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
+        planners that accept them; none by default.
+    - `difference`: a function `(x, x_ref) -> deviation` that the planner uses, for
+        example to wrap angles; subtraction by default.
 
-    **Raises:** `ValueError` on arguments of the wrong kind or shape; an error at run
+    **Raises:** `ValueError` if an argument has the wrong type or shape; an error at run
     time as `throw` says.
 
     Source: Richalet, Rault, Testud and Papon, 1978; Diehl, Bock and Schloeder, 2005
@@ -191,7 +191,7 @@ class MPC(AbstractController):
             start = start.checked(dynamics.state_size, m, "start", where)
             if start.horizon != horizon:
                 raise ValueError(
-                    f"{where}: start must have {horizon} steps, as the horizon, got "
+                    f"{where}: start must have {horizon} steps, the horizon, got "
                     f"{start.horizon}."
                 )
         else:
@@ -254,7 +254,7 @@ class MPC(AbstractController):
         )
 
     def _first(self) -> Start:
-        """The first start, with multipliers of zero."""
+        """The first trajectory of `start`, with multipliers of zero."""
         first, n = _first(self.start), self.dynamics.state_size
         x0: Any = np.zeros(n, first.controls.dtype)
         problem = self._problem(0.0, x0, x0.dtype)
@@ -273,14 +273,16 @@ class MPC(AbstractController):
         )
 
     def prepare(self, t: RealScalar, state: MPCState) -> MPCState:
-        """With `real_time`: set up the program of a step, before its state is known.
+        """Set up the program of a step before its state is known. Needs `real_time`.
 
         **Arguments:**
 
         - `t`: the time of the step.
-        - `state`: as `init`, `feedback` or a call returns it.
+        - `state`: the state from `init`, `feedback` or a call.
 
         **Returns:** the state for `feedback`.
+
+        **Raises:** `ValueError` without `real_time`.
         """
         _check_real_time(self.real_time, "prepare")
         return _prepared(self, as_float_array(t), state)
@@ -288,18 +290,18 @@ class MPC(AbstractController):
     def feedback(
         self, t: RealScalar, y: Observation, state: MPCState
     ) -> tuple[Control, MPCState]:
-        """With `real_time`: solve the program for the state.
+        """Solve the prepared program for the measured state. Needs `real_time`.
 
         **Arguments:**
 
-        - `t`: the time of the step, as for `prepare`.
-        - `y`: the state of the plant.
-        - `state`: as `prepare` returns it.
+        - `t`: the time of the step, the same as for `prepare`.
+        - `y`: the state of the plant, shape `(n,)`.
+        - `state`: the state from `prepare`.
 
-        **Returns:** `(u, state)`.
+        **Returns:** `(u, state)`: the control, shape `(m,)`, and the new state.
 
-        **Raises:** `ValueError` without `prepare`; an error at run time as `throw`
-        says.
+        **Raises:** `ValueError` without `real_time`, or if `state` is not from
+        `prepare`; an error at run time as `throw` says.
         """
         _check_real_time(self.real_time, "feedback")
         check_state(self, y, self.dynamics.state_size)
@@ -340,17 +342,17 @@ class MPC(AbstractController):
     def _moved_on(
         self, t: RealScalar, y: Observation, plan: Plan, state: MPCState
     ) -> Any:
-        """The control, whether there is no plan to use, and the next state."""
-        # Usable plans include those that ran out of iterations: the best so far beats
-        # the last one, which is a step older.
+        """The control, whether there is no usable plan, and the next state."""
+        # A plan that ran out of iterations is usable: it knows the current state, which
+        # the last plan does not.
         lost, u = ~plan.is_usable, plan.controls[0]
         spare, fallback = self._followed(y, state.last), None
         if self.fallback is not None:
             spare, fallback = self.fallback(t, y, state.fallback)
         u = jnp.where(lost, spare, u)
-        # The warm start is the plan a step later, its last step held for the new one. A
-        # lost plan is forgotten, or the next one would start from what had failed. One
-        # program that has no solution says nothing against the plan it is about.
+        # After a failure the warm start is reset, so that the next plan does not start
+        # from what failed. In real time it is kept, because a program without a
+        # solution says nothing against the plan that it is about.
         now = Start(plan.controls, plan.states, plan.gains, plan.multipliers)
         instead = state.last.shifted() if self.real_time else self._first()
         renewed = lambda new, old: jnp.where(lost, old, new).astype(old.dtype)
@@ -367,7 +369,7 @@ class MPC(AbstractController):
         """The first control of the last plan, under its gains."""
         assert last.states is not None and last.gains is not None
         x, u = last.states[0], last.controls[0]
-        # The gains of a plan that diverged may not be finite: then its controls alone.
+        # The gains of a plan that diverged may not be finite.
         tried = u - matvec(last.gains[0], deviation(y, x, self.difference))
         u = jnp.where(jnp.isfinite(tried), tried, u)
         if self.bounds is None:
@@ -376,7 +378,7 @@ class MPC(AbstractController):
         return jnp.minimum(jnp.maximum(u, low), high)
 
 
-# Functions, as a call of a module's method takes a tenth of a millisecond each.
+# Functions, because calling a compiled method of a module takes 0.1 ms longer.
 @quickly_compiled
 def _prepared(mpc: MPC, t: RealScalar, state: MPCState) -> MPCState:
     last, planner = state.last, mpc.planner
@@ -403,8 +405,8 @@ def _check_real_time(real_time: bool, name: str) -> None:
 def _checked(mpc: MPC, u: Control, lost: Array, result: Result) -> Control:
     throw = mpc.throw and mpc.fallback is None
     if throw and (isinstance(lost, Tracer) or lost):
-        # Attached to the control, which every caller uses: attached to the state it
-        # would be removed as dead code where the state is not read.
+        # Attached to the control, which every caller uses. Attached to the state, JAX
+        # would remove the error as dead code if the caller does not read the state.
         return result.error_if(u, lost)
     return u
 
@@ -418,7 +420,7 @@ def _first(starts: Start) -> Start:
 @host_unless_traced
 def _joined(last: Start, starts: Start) -> Start:
     """All starts as one batch, of which the planner refines the cheapest."""
-    # The last plan comes first: of starts of equal cost the first is taken.
+    # The last plan comes first, because the planner takes the first of equal cost.
     join = lambda a, b: xp.concatenate([a[None], b])
     joined = jax.tree.map(join, last.trajectories, starts.trajectories)
     return dataclasses.replace(joined, multipliers=last.multipliers)

@@ -29,7 +29,7 @@ from ..math import clip, matvec
 
 
 class _Select(eqx.Module):
-    """Entries of an observation."""
+    """Some entries of an observation, by index."""
 
     indices: tuple[int, ...] = eqx.field(static=True)
 
@@ -50,7 +50,7 @@ class _Project(eqx.Module):
 
 
 def _as_output(output: Any) -> Any:
-    """The outputs of the loops, as a function of the observation."""
+    """The map from an observation to the outputs of the loops, as a function."""
     if output is None or callable(output):
         return as_module(output)
     if isinstance(output, int | np.integer) and not isinstance(output, bool):
@@ -72,7 +72,7 @@ def _output_field() -> Any:
 
 
 def _as(after: Any, before: Any) -> Any:
-    """`after` in the types of `before`, as a loop must carry it."""
+    """`after` in the dtypes of `before`, because a loop must not change them."""
     return jax.tree.map(lambda a, b: a.astype(b.dtype), after, before)
 
 
@@ -95,7 +95,7 @@ class _AbstractPID(AbstractController):
 
     @property
     def loops(self) -> int:
-        """The number of loops: the size that all vectors have; 1 where all are
+        """The number of loops: the common size of all vectors, or 1 if all are
         numbers."""
         where = type(self).__name__
         low, high = self.bounds or (None, None)
@@ -126,7 +126,7 @@ class _AbstractPID(AbstractController):
         return jnp.zeros(self.loops, dtype)
 
     def _error(self, t: RealScalar, y: Array) -> tuple[Array, Array]:
-        """`(r(t) - h(y), h(y))`, checked to have an entry for each loop."""
+        """`(r(t) - h(y), h(y))`, checked to have one entry per loop."""
         name, output, loops = type(self).__name__, self.output, self.loops
         if isinstance(output, _Select) and max(output.indices) >= y.shape[0]:
             raise ValueError(
@@ -140,7 +140,7 @@ class _AbstractPID(AbstractController):
             what = "the observation has" if output is None else "output gives"
             raise ValueError(
                 f"{name}: expects {loops} outputs, one per loop, but {what} shape "
-                f"{measured.shape}; choose what each loop follows, such as output=0."
+                f"{measured.shape}. Choose what each loop follows, such as output=0."
             )
         reference = self.reference(t) if callable(self.reference) else self.reference
         reference = jnp.asarray(0 if reference is None else reference)
@@ -164,37 +164,45 @@ class _Memory(NamedTuple):
 
 
 class PID(_AbstractPID):
-    """Proportional, integral and derivative action, one loop per control.
+    r"""Proportional-integral-derivative (PID) control, one loop per control.
 
-    With the error `e = r(t) - h(y)`, over a step of `dt`:
+    With the error $e = r(t) - h(y)$ and steps of $\Delta t$:
 
-    `v = kp e + I + kd D`, `u = clip(v, low, high)`,
-    `I_next = I + dt (ki e + (u_applied - v) / T_a)`,
-    `D = (T_d D_before + z - z_before) / (T_d + dt)`,
+    $$\begin{aligned}
+    v_k &= k_p e_k + I_k + k_d D_k, \qquad u_k = \operatorname{clip}(v_k, \mathrm{low},
+    \mathrm{high}) \\
+    I_{k+1} &= I_k + \Delta t\, (k_i e_k + (u_k^\mathrm{applied} - v_k) / T_a) \\
+    D_k &= (T_d D_{k-1} + z_k - z_{k-1}) / (T_d + \Delta t)
+    \end{aligned}$$
 
-    `D` being the derivative of `z = -h(y)` (so that a jump of the reference makes no
-    kick), or of `e`, through a first-order lag; it starts at 0. The integral does not
-    leak. Its second term, back-calculation, keeps it from winding up: `u_applied` is
-    the control that was really applied, so the environment's bounds count as the
-    controller's own do. Where `ki` is 0 there is no integral.
+    The derivative $D$ passes through a first-order lag and starts at 0. By default it
+    is the derivative of $z = -h(y)$, so a jump of the reference gives no kick. With
+    `derivative_on="error"`, $z = e$.
+
+    The second term of the integral is back-calculation, which prevents windup. It uses
+    the control that was applied, so the bounds of the environment count too. A loop
+    with $k_i = 0$ has no integral.
 
     **Arguments:**
 
-    - `kp`, `ki`, `kd`: the gains, each a number or a vector with an entry for each
-        loop; 0 by default but for `kp`. Trainable. Units: of the control over those of
-        the error, its integral and its derivative.
-    - `dt`: the control interval, that of the environment.
-    - `reference`: r, a function of time, a vector or a number; 0 by default.
-    - `output`: h, what the loops follow: an index into the observation, a tuple of
-        indices, a matrix, or a function of the observation; all of it by default.
+    - `kp`, `ki`, `kd`: the gains $k_p$, $k_i$ and $k_d$, each a number or a vector with
+        an entry for each loop; trainable. `ki` and `kd` are 0 by default. Their units
+        are those of the control over those of the error, its integral and its
+        derivative.
+    - `dt`: the control interval $\Delta t$, the same as that of the environment.
+    - `reference`: $r$, a function of time, a vector or a number; 0 by default.
+    - `output`: $h$, what the loops follow: an index into the observation, a tuple of
+        indices, a matrix, or a function of the observation. By default the whole
+        observation.
     - `bounds`: `(low, high)`, each a number or a vector; none by default.
-    - `derivative_time_constant`: T_d of the lag, `dt` by default; 0 for none.
+    - `derivative_time_constant`: $T_d$, the time constant of the lag, `dt` by default;
+        0 for no lag.
     - `derivative_on`: `"measurement"` (default) or `"error"`.
-    - `anti_windup_time`: T_a, at least `dt`. By default the integral time `kp / ki` of
-        each loop, but not below `dt`.
+    - `anti_windup_time`: $T_a$, at least `dt`. By default the integral time `kp / ki`
+        of each loop, but at least `dt`.
 
-    **Raises:** `ValueError` if sizes do not fit, or a time is out of its range; when it
-    is run, if there are not as many outputs as loops.
+    **Raises:** `ValueError` if sizes do not fit, or a time is out of its range; at run
+    time, if the number of outputs is not the number of loops.
 
     Source: Åström and Hägglund, 2006.
 
@@ -231,7 +239,7 @@ class PID(_AbstractPID):
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
         )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
-        # Before the base's checks, because the other times are compared with it.
+        # Before the checks of the base class, because the other times need a valid dt.
         check_step(dt, "PID")
         check_range(dt if lag is None else lag, "derivative_time_constant", "PID")
         check_range(dt if windup is None else windup, "anti_windup_time", "PID", dt)
@@ -243,37 +251,33 @@ class PID(_AbstractPID):
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         error, measured = self._error(t, y)
         moving = -measured if self.derivative_on == "measurement" else error
-        # No derivative on the first call, which has nothing before it.
+        # The first call has no previous value, so its derivative is zero.
         step = jnp.where(state.started, moving - state.previous, 0)
         lag = self.derivative_time_constant
         lag = self.dt if lag is None else lag
-        # Backward Euler on `T_d D' + D = dz/dt`: stable whatever T_d, and with T_d = 0
-        # the plain difference `step / dt`.
+        # Backward Euler on `T_d D' + D = dz/dt`: stable for any T_d, and the plain
+        # difference `step / dt` for T_d = 0.
         slope = (lag * state.slope + step) / (lag + self.dt)
         asked = self.kp * error + state.integral + self.kd * slope
-        # The gain is inside of the sum, so that a change of it makes no jump
-        # (bumpless).
+        # The gain is inside the sum, so that a change of ki makes no jump (bumpless).
         integral = state.integral + self.dt * self.ki * error
-        # The integral of this step acts from the next one on, so that `applied`, which
-        # comes in between, corrects what the next control is made of.
+        # The new integral acts from the next step on, after `applied` has corrected it.
         after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
         return self._clip(asked, y), _as(after, state)
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
-        # Back-calculation: with the bounds of the environment included in u, because
-        # this is told what was applied.
+        # Back-calculation, from u as the environment applied it.
         correction = self.dt * self._windup_rate() * (u - state.asked)
         return _as(state._replace(integral=state.integral + correction), state)
 
     def _windup_rate(self):
-        """`1 / T_a`, and 0 where there is no integral to wind up."""
-        # Faster than the sample the correction would overshoot, and oscillate.
+        """`1 / T_a`, or 0 for a loop without an integral."""
+        # With T_a < dt the correction would overshoot and oscillate.
         fastest = 1 / self.dt
         if self.anti_windup_time is None:
             no_kp = self.kp == 0
-            # The integral time T_i = kp / ki for T_a, a textbook's choice for PI
-            # (Astrom and Hagglund, 2006). 1 in place of a kp of 0, because `where`
-            # differentiates both of its sides.
+            # T_a is the integral time kp / ki, as textbooks suggest for PI (Åström and
+            # Hägglund, 2006). The inner `where` avoids NaN gradients at kp = 0.
             rate = jnp.abs(self.ki / jnp.where(no_kp, 1, self.kp))
             rate = jnp.where(no_kp, fastest, jnp.minimum(rate, fastest))
         else:
@@ -288,26 +292,29 @@ class _Averages(NamedTuple):
 
 
 class LeakyPID(_AbstractPID):
-    """The PID of the original Deluca, whose integral is an exponential average.
+    r"""The PID of the original Deluca, whose integral is an exponential average.
 
-    With the error `e = r(t) - h(y)` and `a = dt / (dt + T)`:
+    With the error $e = r(t) - h(y)$ and $a = \Delta t / (\Delta t + T)$:
 
-    `I = I_before + a (e - I_before)`, `D = D_before + a (e - e_before - D_before)`,
-    `u = clip(kp e + ki I + kd D, low, high)`,
+    $$\begin{aligned}
+    I_k &= I_{k-1} + a\, (e_k - I_{k-1}) \\
+    D_k &= D_{k-1} + a\, (e_k - e_{k-1} - D_{k-1}) \\
+    u_k &= \operatorname{clip}(k_p e_k + k_i I_k + k_d D_k, \mathrm{low}, \mathrm{high})
+    \end{aligned}$$
 
-    all 0 at the start. The average does not wind up, nor does it remove an offset, and
-    the "derivative" is a difference that is not divided by `dt`; for those see
-    [`delucax.controllers.PID`][].
+    All of them start at 0. The average does not wind up, but it does not remove a
+    constant error either. The "derivative" is a difference that is not divided by `dt`.
+    For an exact integral and derivative, use [`delucax.controllers.PID`][].
 
     **Arguments:**
 
-    - `kp`, `ki`, `kd`: the gains, as of [`delucax.controllers.PID`][]; 3, 4 and 0 by
-        default.
-    - `dt`, `reference`, `output`, `bounds`: as there.
-    - `time_constant`: T, 0.5 by default.
+    - `kp`, `ki`, `kd`: the gains $k_p$, $k_i$ and $k_d$, as in
+        [`delucax.controllers.PID`][]; 3, 4 and 0 by default.
+    - `dt`, `reference`, `output`, `bounds`: as in [`delucax.controllers.PID`][].
+    - `time_constant`: $T$, 0.5 by default.
 
-    **Raises:** `ValueError` if sizes do not fit, or a time is not positive; when it is
-    run, if there are not as many outputs as loops.
+    **Raises:** `ValueError` if sizes do not fit, or a time is not positive; at run
+    time, if the number of outputs is not the number of loops.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).
