@@ -24,15 +24,18 @@ from ._operating_point import (
 
 
 class FiniteHorizonLQR(AbstractController):
-    """The linear-quadratic regulator over a finite horizon,
+    r"""The linear-quadratic regulator over a finite horizon.
 
-    `u[t] = u_r[t] - K[t] difference(x[t], r[t]) - k[t]`,
+    $$u_k = u_{r,k} - K_k\, \mathrm{difference}(x_k, r_k) - \kappa_k$$
 
-    which minimises the sum over steps `t < T` of `e'Q e + 2 e'S v + v'R v`, and
-    `e' final e` at the end, with `e = difference(x, r)` and `v = u - u_r`. All of the
-    reference and of a known disturbance is taken into account: `k`, the feed-forward,
-    is zero if the dynamics go from each `r[t]` to `r[t+1]` under `u_r[t]`, as along a
-    trajectory that was planned.
+    It minimises
+
+    $$\sum_{k < T} \left( e_k^\top Q e_k + 2 e_k^\top S v_k + v_k^\top R v_k \right) +
+    e_T^\top Q_f e_T, \qquad e = \mathrm{difference}(x, r), \quad v = u - u_r$$
+
+    The feed-forward control $\kappa$ takes the whole reference and the whole known
+    disturbance into account. It is zero if the dynamics go from each $r_k$ to $r_{k+1}$
+    under $u_{r,k}$, for example along a planned trajectory.
 
     **Arguments:**
 
@@ -41,23 +44,28 @@ class FiniteHorizonLQR(AbstractController):
     - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`, or `(T, n, m)`; zero by default.
-    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
-    - `horizon`: the number of steps `T`; by default those of time-varying `dynamics`.
-    - `reference`: the state to follow, a vector or a function of time; the operating
-        points by default.
-    - `control_reference`: the control from which deviations are charged, a vector or a
-        function of time; that of the operating points by default.
-    - `disturbance`: a disturbance known in advance, a vector or a function of time.
-    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
-    - `parallel`: solve the recursion in parallel over time, for accelerators.
+    - `final`: final weight $Q_f$, shape `(n, n)`, symmetric; zero by default.
+    - `horizon`: the number of steps `T`; by default the length of time-varying
+        `dynamics`.
+    - `reference`: $r$, the state to follow, a vector of shape `(n,)` or a function of
+        time; the operating points by default.
+    - `control_reference`: $u_r$, the control that costs nothing, a vector of shape
+        `(m,)` or a function of time; the control of the operating points by default.
+    - `disturbance`: a disturbance known in advance, a vector of shape `(k,)` or a
+        function of time; none by default.
+    - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
+        subtraction by default.
+    - `parallel`: whether to solve the recursion in parallel over time, for
+        accelerators; false by default.
 
-    **Attributes:** `K`, the gains, trainable, shape `(T, m, n)`; `k`, shape `(T, m)`;
-    `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`, shapes `(T, n)` and `(T, m)`. Outside
-    of the horizon the control is NaN, so that a rollout fails.
+    **Attributes:** `K`, the gains, trainable, shape `(T, m, n)`; `k`, the feed-forward
+    $\kappa$, trainable, shape `(T, m)`; `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`,
+    the references $r$ and $u_r$, shapes `(T, n)` and `(T, m)`. Before step 0 and from
+    step `T` on the control is NaN, which a rollout reports.
 
     **Raises:** `ValueError` if `dynamics` is not linear or does not observe its state,
-    there is no horizon, or a weight or signal does not fit; an error at run time if a
-    step has no minimum.
+    there is no horizon, or a weight or signal does not fit; an error at run time if the
+    cost of a step has no minimum.
 
     Source: Kalman, 1960; Anderson and Moore, 1990 (tracking).
 
@@ -104,7 +112,7 @@ class FiniteHorizonLQR(AbstractController):
         steps = dynamics.A.shape[0] if dynamics.is_time_varying else None
         if horizon is None and steps is None:
             raise ValueError(
-                f"{where}: horizon must be given, as dynamics are time-invariant."
+                f"{where}: horizon must be given, because dynamics are time-invariant."
             )
         T = check_count(steps if horizon is None else horizon, "horizon", where)
         if steps is not None:
@@ -113,8 +121,8 @@ class FiniteHorizonLQR(AbstractController):
         signals = as_signals(dynamics, given, where)
         self.x_ref, self.u_ref, d = _along(dynamics, signals, difference, T)
         A, B = (a if steps is None else a[:T] for a in (dynamics.A, dynamics.B))
-        # With the residual d of the reference the cost to go has a linear term, whose
-        # share of the control is the feed-forward k.
+        # The residual d of the reference gives the cost to go a linear term, and the
+        # control the feed-forward k.
         options: dict[str, Any] = dict(final=final, horizon=T, d=d, parallel=parallel)
         solution: Any = dre(A, B, Q, R, S, **options)
         self.K, self.k, self.P = solution.K, solution.k, solution.X
@@ -138,7 +146,7 @@ def _along(
     difference: Difference | None,
     T: int,
 ) -> tuple[Array, Array, Array]:
-    """The references at each step of the horizon, and the residuals of the state's."""
+    """The references at each step of the horizon, and the residual of each step."""
 
     def at(t):
         here = KnownSignals(dynamics.at(t), *signals, difference)
@@ -146,7 +154,7 @@ def _along(
 
     x_ref, u_ref, x_next = jax.vmap(at)(jnp.arange(T) * dynamics.dt)
     end = T * dynamics.dt
-    # The last step needs the reference one step beyond the horizon.
+    # The residual of the last step needs the reference one step later.
     if signals[0] is not None:
         last = signals[0](end)
     elif dynamics.is_time_varying and dynamics.A.shape[0] == T:
@@ -154,6 +162,6 @@ def _along(
     else:
         last = dynamics.at(end).x_ref
     targets = jnp.concatenate([x_ref[1:], last[None]])
-    # d[k], by which the dynamics miss r[k+1] from r[k]: e_next = A e + B v + d.
+    # d[k] is the error after a step from r[k]: e_next = A e + B v + d.
     d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
     return x_ref, u_ref, d

@@ -1,5 +1,4 @@
-"""The controllers that an environment defines: by its model and its cost, at its
-operating point."""
+"""Controllers from the model, the cost and the operating point of an environment."""
 
 from typing import Any, NamedTuple
 
@@ -20,10 +19,19 @@ from ._mpc import MPC
 
 
 class LocalModel(NamedTuple):
-    """A linear-quadratic model of an environment about an operating point.
+    r"""A linear-quadratic model of an environment about an operating point.
 
-    **Attributes:** `dynamics`, linear and about that point; `Q`, `R` and `S`, the
-    weights of `dx'Q dx + 2 dx'S du + du'R du`, shapes `(n, n)`, `(m, m)` and `(n, m)`.
+    The cost per step is, up to a constant and linear terms,
+
+    $$\delta x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u +
+    \delta u^\top R\, \delta u$$
+
+    where $\delta x$ and $\delta u$ are the deviations from the operating point.
+
+    **Attributes:**
+
+    - `dynamics`: linear dynamics about the operating point.
+    - `Q`, `R`, `S`: the weights of the cost, shapes `(n, n)`, `(m, m)` and `(n, m)`.
 
     !!! example
 
@@ -45,16 +53,18 @@ class LocalModel(NamedTuple):
 def local_model(
     environment: Environment, *, regularisation: float = 1e-4
 ) -> LocalModel:
-    """The dynamics of an environment and the curvature of its cost, both at the
-    operating point of `environment.trim()`: what a linear design needs.
+    """The linearised dynamics and the second-order cost of an environment.
 
-    A direction in which the cost is flat or concave there is given the weight
-    `regularisation` times the largest one, because designs need a definite one.
+    Both are taken at the operating point of `environment.trim()`. They are what a
+    linear design such as [`delucax.controllers.LQR`][] needs.
+
+    Linear designs need a positive definite cost. If the cost is flat or concave in some
+    direction, that direction gets the weight `regularisation` times the largest weight.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `regularisation`: 1e-4 by default.
+    - `regularisation`: the smallest weight relative to the largest, 1e-4 by default.
 
     **Returns:** a [`delucax.controllers.LocalModel`][].
 
@@ -81,15 +91,16 @@ def _local_model(environment: Any, regularisation: Any, where: str) -> LocalMode
     check_positive(regularisation, "regularisation", where)
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves(environment)):
         raise ValueError(
-            f"{where}: environment must hold values. Under jax.jit, jax.vmap or "
-            "jax.grad use delucax.linearize and delucax.controllers.LQR."
+            f"{where}: environment must hold values, got traced arrays. Under jax.jit, "
+            "jax.vmap or jax.grad use delucax.linearize and delucax.controllers.LQR."
         )
     point = environment.trim()
     x, u = point.x, point.u
     H = np.asarray(_curvature(environment.cost, x, u), float)
     if not np.all(np.isfinite(H)):
         raise ValueError(
-            f"{where}: the cost must be twice differentiable at x = {x}, u = {u}."
+            f"{where}: the cost of environment must be twice differentiable at the "
+            f"operating point x = {x}, u = {u}."
         )
     values, vectors = np.linalg.eigh(H)
     least = regularisation * max(values.max(), 1e-3)
@@ -101,26 +112,27 @@ def _local_model(environment: Any, regularisation: Any, where: str) -> LocalMode
 
 @eqx.filter_jit
 def _curvature(cost: Any, x: Array, u: Array) -> Array:
-    """H of the stage cost, `dz' H dz` to second order, `dz` the change of (x, u)."""
+    """The matrix `H` of the stage cost `dz' H dz` to second order in `z = (x, u)`."""
     n = x.shape[0]
-    # A cost that only counts may be of integers.
+    # A cost may return integers, which have no derivative.
     stage = lambda z: jnp.asarray(cost(jnp.zeros(()), x + z[:n], u + z[n:]), x.dtype)
     return jax.hessian(stage)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
 
 
 def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
-    """The LQR that an environment defines: that of
-    [`delucax.controllers.local_model`][].
+    """The LQR of an environment, for its linear-quadratic model.
+
+    [`delucax.controllers.local_model`][] computes that model.
 
     **Arguments:**
 
-    - `environment`: the environment. Its state must be observed.
-    - `regularisation`: of the weights, 1e-4 by default.
+    - `environment`: the environment. Its observation must be its state.
+    - `regularisation`: the smallest weight relative to the largest, 1e-4 by default.
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if the state is not observed, and where
-    [`delucax.controllers.local_model`][] raises; an error at run time if there is no
+    **Raises:** `ValueError` if the state is not observed, or for the reasons of
+    [`delucax.controllers.local_model`][]; an error at run time if there is no
     stabilising gain.
 
     !!! example
@@ -145,23 +157,26 @@ def local_mpc(
     real_time: bool = False,
     throw: bool = True,
 ) -> MPC:
-    """The MPC that an environment defines: by its model, its cost and its bounds, and
-    with the cost to go of an LQR, `dx' P dx`, at the end of each plan.
+    r"""The MPC of an environment: it plans with its model, its cost and its bounds.
+
+    With an `lqr`, each plan ends with the cost to go of that regulator,
+    $\delta x^\top P\, \delta x$.
 
     **Arguments:**
 
-    - `environment`: the environment. Its state must be observed.
-    - `lqr`: such as that of [`delucax.controllers.local_lqr`][]; by default plans end
-        with the final cost of the environment.
-    - `horizon`: the steps of a plan, 30 by default.
-    - `planner`: [`delucax.planning.ILQR`][] with at most 8 iterations by default, and
+    - `environment`: the environment. Its observation must be its state.
+    - `lqr`: the regulator whose cost to go is the final cost, such as that of
+        [`delucax.controllers.local_lqr`][]. By default plans end with the final cost of
+        the environment.
+    - `horizon`: the number of steps of a plan, 30 by default.
+    - `planner`: by default [`delucax.planning.ILQR`][] with at most 8 iterations, or
         [`delucax.planning.SQP`][] with `real_time`.
     - `real_time`, `throw`: as in [`delucax.controllers.MPC`][].
 
     **Returns:** a [`delucax.controllers.MPC`][].
 
-    **Raises:** `ValueError` if the observation has not the size of the state, and as
-    [`delucax.controllers.MPC`][] does.
+    **Raises:** `ValueError` if the size of the observation is not that of the state, or
+    for the reasons of [`delucax.controllers.MPC`][].
 
     !!! example
 
@@ -177,7 +192,7 @@ def local_mpc(
     where = "local_mpc"
     check_instance(environment, Environment, "environment", where)
     dynamics = environment.dynamics
-    # By the sizes, which are known of a traced sensor too.
+    # Only the sizes are compared, because they are known under a trace too.
     p, n = dynamics.observation_size, dynamics.state_size
     if p != n:
         raise ValueError(

@@ -67,10 +67,13 @@ class MPC(AbstractController):
     unstable plant far from that point, or if there is no LQR about it:
     [`delucax.planning.Start.default`][] lists the reasons.
 
-    **Status.** The state of the controller has `result`, the status of the last plan;
-    `iterations`, the number of iterations it took; `failures`, the number of plans that
-    were not successful, which a rollout counts in `incidents["failed_plan"]`; and
-    `last`, the last plan shifted by one step, a [`delucax.planning.Start`][].
+    **Status.** The state of the controller has
+
+    - `result`: the status of the last plan,
+    - `iterations`: the number of iterations of the last plan,
+    - `failures`: the number of plans that were not successful, which a rollout counts
+        in `incidents["failed_plan"]`,
+    - `last`: the last plan, shifted by one step, a [`delucax.planning.Start`][].
 
     A plan that ran out of iterations or found no descent is still used, because it is
     the best so far. A plan is unusable if every start diverges or the constraints

@@ -1,4 +1,4 @@
-"""Neural network policies, and their features."""
+"""Neural network policies, and the scaling of their inputs."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -29,28 +29,29 @@ from ._stochastic import Gaussian
 
 
 class MLP(AbstractController):
-    """A fully connected network of the observation,
+    r"""A fully connected network (multilayer perceptron) of the observation.
 
-    `u = network(features(y))`, and with bounds
-    `u = (high + low) / 2 + (high - low) / 2 * tanh(network(features(y)))`.
+    $$u = f(\phi(y)), \qquad \text{with bounds} \quad
+    u = \tfrac12 (\mathrm{high} + \mathrm{low}) +
+    \tfrac12 (\mathrm{high} - \mathrm{low}) \tanh f(\phi(y))$$
 
     **Arguments:**
 
-    - `in_size`: the size of the features.
+    - `in_size`: the size of the features $\phi(y)$.
     - `out_size`: the number of controls.
-    - `width`: units in a hidden layer, 64 by default.
-    - `depth`: hidden layers, 2 by default; 0 for a linear map.
-    - `features`: what the network is given of an observation, a function such as
-        `env.encode`; the observation itself by default.
-    - `bounds`: `(low, high)`, each a finite number or vector, that the control is
-        squashed into; none by default.
-    - `activation`: of the hidden layers, `jnp.tanh` by default.
-    - `key`: a random key, for the first weights.
+    - `width`: the number of units in a hidden layer, 64 by default.
+    - `depth`: the number of hidden layers, 2 by default; 0 for a linear map.
+    - `features`: $\phi$, a function of an observation, such as `env.encode`; the
+        observation itself by default.
+    - `bounds`: `(low, high)`, each a finite number or vector, between which the control
+        is squashed; none by default.
+    - `activation`: the activation function of the hidden layers, `jnp.tanh` by default.
+    - `key`: a random key for the initial weights.
 
-    **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
+    **Attributes:** `network`, the network $f$, an `eqx.nn.MLP`, trainable.
 
     **Raises:** `ValueError` if a size is below 1, bounds are not finite or there is no
-    key; when it is run, if the features have another size.
+    key; at run time, if the features have another size.
 
     !!! example
 
@@ -111,7 +112,7 @@ class MLP(AbstractController):
 
 
 def features_of(controller: Any, y: Array, size: int) -> Float[Array, " size"]:
-    """The features of an observation, or an error if there are not `size`."""
+    """The features of an observation, or an error unless there are `size` of them."""
     features = controller.features
     z = y if features is None else jnp.asarray(features(y))
     if z.shape != (size,):
@@ -124,13 +125,12 @@ def squash(u: Array, bounds: tuple[Array, Array] | None) -> Array:
     if bounds is None:
         return u
     low, high = bounds
-    # Smooth, where clipping has no gradient beyond a bound and learning stalls.
+    # Smooth, because clipping has no gradient beyond a bound, so learning would stall.
     return (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
 
 
 def check_squash(bounds: Any, size: int, where: str) -> None:
-    """Raise unless the bounds, if any, are ones that `size` controls can be squashed
-    into."""
+    """Raise unless the bounds are finite and fit `size` controls, or are `None`."""
     for end in as_bounds(bounds, where, size=size) or ():
         if is_concrete(end) and not np.all(np.isfinite(end)):
             raise ValueError(
@@ -146,19 +146,20 @@ def mlp_policy(
     head: Literal["deterministic", "gaussian"] = "deterministic",
     key: PRNGKey,
 ) -> AbstractController:
-    """A fully connected network made to fit an environment.
+    """A fully connected network that fits an environment.
 
-    It is given `environment.encode(y)`, and squashes into `environment.control_bounds`
-    where those are finite.
+    The network acts on `environment.encode(y)`. It squashes its controls between
+    `environment.control_bounds` if these are finite.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `width`: units in a hidden layer, 64 by default.
-    - `depth`: hidden layers, 2 by default.
-    - `head`: `"deterministic"` (default); or `"gaussian"`, whose standard deviation
-        starts at a quarter of the range of each control, or at 1 without bounds.
-    - `key`: a random key, for the first weights.
+    - `width`: the number of units in a hidden layer, 64 by default.
+    - `depth`: the number of hidden layers, 2 by default.
+    - `head`: `"deterministic"` (default) or `"gaussian"`. The standard deviation of a
+        Gaussian starts at a quarter of the range of each control, or at 1 without
+        bounds.
+    - `key`: a random key for the initial weights.
 
     **Returns:** a [`delucax.controllers.MLP`][], or a
     [`delucax.controllers.Gaussian`][] around one.
@@ -195,30 +196,32 @@ def mlp_policy(
     std = jnp.ones(size)
     if bounds is not None:
         std = jnp.broadcast_to((bounds[1] - bounds[0]) / 4, (size,))
-    # The bounds of the environment, infinite ones included: `log_prob` is then that of
-    # what is applied.
+    # All bounds of the environment, also infinite ones, so that `log_prob` is the
+    # log-probability of the applied control.
     return Gaussian(network, jnp.log(std), bounds=environment.control_bounds)
 
 
 class GRU(AbstractController):
-    """A gated recurrent network of the observations so far,
+    r"""A gated recurrent unit (GRU): a network with a memory of past observations.
 
-    `h = cell(features(y), h)`, `u = A h + b`, and with bounds
-    `u = (high + low) / 2 + (high - low) / 2 * tanh(A h + b)`.
+    $$h_k = \mathrm{cell}(\phi(y_k), h_{k-1}), \qquad u_k = A h_k + b$$
 
-    Its memory h begins at zero with each episode.
+    The memory $h$ starts at zero in each episode. With bounds the control is
+
+    $$u_k = \tfrac12 (\mathrm{high} + \mathrm{low}) +
+    \tfrac12 (\mathrm{high} - \mathrm{low}) \tanh(A h_k + b)$$
 
     **Arguments:**
 
-    - `in_size`, `out_size`, `features`, `bounds`, `key`: as of
+    - `in_size`, `out_size`, `features`, `bounds`, `key`: as in
         [`delucax.controllers.MLP`][].
     - `width`: the size of the memory, 32 by default.
 
-    **Attributes:** `cell`, an `eqx.nn.GRUCell`, and `readout`, an `eqx.nn.Linear`,
-    trainable.
+    **Attributes:** `cell`, an `eqx.nn.GRUCell`, and `readout`, an `eqx.nn.Linear` with
+    $A$ and $b$. Both are trainable.
 
     **Raises:** `ValueError` if a size is below 1, bounds are not finite or there is no
-    key; when it is run, if the features have another size.
+    key; at run time, if the features have another size.
 
     Source: Cho et al., 2014.
 
@@ -277,28 +280,30 @@ class GRU(AbstractController):
 def _recurrent(
     in_size: int, out_size: int, width: int, key: PRNGKey
 ) -> tuple[eqx.nn.GRUCell, eqx.nn.Linear]:
-    """A cell and a readout."""
+    """A cell and a readout with initial weights."""
     cell_key, readout_key = jr.split(key)
     cell = eqx.nn.GRUCell(in_size, width, key=cell_key)
     return cell, eqx.nn.Linear(width, out_size, key=readout_key)
 
 
 class Standardise(eqx.Module):
-    """Features shifted and scaled to mean 0 and standard deviation 1,
+    r"""Features scaled to mean 0 and standard deviation 1, as inputs of a network.
 
-    `clip((features(y) - mean) / std, -10, 10)`: the `features=` of a network.
+    $$z = \operatorname{clip}((\phi(y) - \mu) / \sigma, -10, 10)$$
 
-    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] set `mean` and `std` of
-    each one in their model from the observations of training.
+    Pass it as the `features` of a network. [`delucax.training.PPO`][] and
+    [`delucax.training.SHAC`][] set `mean` and `std` of every `Standardise` in their
+    model, from the observations during training.
 
     **Arguments:**
 
-    - `mean`: a vector with an entry for each feature.
-    - `std`: a vector of positive numbers, or one for all; 1 by default.
-    - `features`: of an observation, a function such as `env.encode`; the observation
-        itself by default.
+    - `mean`: $\mu$, a vector with an entry for each feature.
+    - `std`: $\sigma$, a vector of positive numbers, or one number for all features; 1
+        by default.
+    - `features`: $\phi$, a function of an observation, such as `env.encode`; the
+        observation itself by default.
 
-    **Raises:** `ValueError` if `std` is not positive, or numbers are not finite.
+    **Raises:** `ValueError` if `std` is not positive, or `mean` or `std` is not finite.
 
     !!! example
 
@@ -338,7 +343,7 @@ class Standardise(eqx.Module):
             )
 
     def of(self, y: Array) -> Array:
-        """The features, as they are.
+        """The features before they are scaled.
 
         **Arguments:** `y`: an observation.
 
@@ -347,12 +352,11 @@ class Standardise(eqx.Module):
         return y if self.features is None else jnp.asarray(self.features(y))
 
     def __call__(self, y: Array) -> Array:
-        """The features, standardised.
+        """The scaled features.
 
         **Arguments:** `y`: an observation.
 
         **Returns:** a vector.
         """
-        # Ten deviations, as in OpenAI's baselines: an outlier may not saturate the
-        # network.
+        # Clipped at ten deviations as in OpenAI's Baselines, because of outliers.
         return jnp.clip((self.of(y) - self.mean) / self.std, -10, 10)

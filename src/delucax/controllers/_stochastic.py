@@ -1,4 +1,4 @@
-"""Stochastic policies whose mean or logits another controller gives."""
+"""Stochastic policies around a controller that gives their mean or logits."""
 
 from dataclasses import KW_ONLY
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ class _State(NamedTuple):
 
 
 class _AroundBase(AbstractStochasticPolicy):
-    """A policy whose distribution is a function of what `base` gives."""
+    """A policy whose distribution is a function of the output of `base`."""
 
     base: eqx.AbstractVar[AbstractController]
 
@@ -51,36 +51,36 @@ class _AroundBase(AbstractStochasticPolicy):
 
     @property
     def has_memory(self) -> bool:
-        """Whether `base` has a state, on which the distribution depends."""
+        """Whether the distribution depends on `state`, because `base` has one."""
         start = lambda: eqx.filter(initial_state(self.base, jr.key(0)), eqx.is_array)
         return bool(jax.tree.leaves(jax.eval_shape(start)))
 
 
 class Gaussian(_AroundBase):
-    r"""Independent normal controls around those of another controller,
+    r"""A policy that adds Gaussian noise to the control of another controller.
 
-    `u = clip(mean + std e, low, high)`, `e ~ N(0, I)`,
+    $$u = \operatorname{clip}(\mu + \sigma e, \mathrm{low}, \mathrm{high}), \qquad
+    e \sim N(0, I)$$
 
-    with `mean` the control of `base`, which alone is the deterministic evaluation:
-    `gaussian.base`. The draw is differentiable as it is written, so that analytic
-    gradients pass through it with the noise held fixed.
+    The mean $\mu$ is the control of `base`. For a deterministic evaluation use
+    `gaussian.base`. The draw is differentiable: analytic gradients pass through it,
+    with the noise $e$ held fixed.
 
-    The log-probability is that of the control which comes out: its normal density
-    between the bounds, and at a bound the probability of all that is clipped to it.
-    Given the bounds of the environment, it therefore is the log-probability of the
-    controls that a [`delucax.Trajectory`][] records, and that of a run follows from its
-    record, without the draws.
+    The log-probability is that of the clipped control. Between the bounds it is the log
+    of the normal density. At a bound it is the log of the probability of all draws that
+    are clipped to it. If you pass the bounds of the environment, it is thus the
+    log-probability of the controls that a [`delucax.Trajectory`][] records.
 
     **Arguments:**
 
     - `base`: the controller whose control is the mean.
-    - `log_std`: the logarithm of the standard deviation, a number or a vector with an
-        entry for each control. Trainable.
+    - `log_std`: $\log \sigma$, a number or a vector with an entry for each control;
+        trainable.
     - `bounds`: `(low, high)`, each a number or a vector, such as `env.control_bounds`;
         none by default.
 
-    **Raises:** `ValueError` if `base` is not a controller or sizes do not fit; when it
-    is run, if there is no key.
+    **Raises:** `ValueError` if `base` is not a controller or sizes do not fit; at run
+    time, if there is no random key.
 
     Source: Williams, 1992; Fujita and Maeda, 2018 (clipped controls).
 
@@ -114,8 +114,8 @@ class Gaussian(_AroundBase):
         mean, base = self.base(t, y, state.base)
         if self.log_std.shape not in ((), mean.shape):
             raise ValueError(
-                f"Gaussian: log_std must be a number or have shape {mean.shape}, as "
-                f"the controls of its base have, got shape {self.log_std.shape}."
+                f"Gaussian: log_std must be a number or have shape {mean.shape}, like "
+                f"the control of base, got shape {self.log_std.shape}."
             )
         return mean, base
 
@@ -127,23 +127,23 @@ class Gaussian(_AroundBase):
         return u.astype(mean.dtype), _State(base, key)
 
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
-        """The log-probability with which `__call__(t, y, state)` gives `u`.
+        """The log-probability with which `__call__(t, y, state)` returns `u`.
 
-        **Arguments:** `t`, `y`, `state`: as of a call. `u`: a control, shape `(m,)`;
-            beyond the bounds it counts as clipped to them.
+        **Arguments:** `t`, `y`, `state`: as in a call. `u`: a control, shape `(m,)`. A
+        control beyond a bound counts as the bound.
 
-        **Returns:** a scalar: a density over the controls that are between their
-        bounds, a probability over those that are at one.
+        **Returns:** a scalar. It is the log of a density for the controls between their
+        bounds, times a probability for the controls at a bound.
         """
         mean, _ = self._mean(t, y, state)
         return self._log_prob(mean, u)
 
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
-        """The entropy of the normal draw, before the bounds,
+        r"""The entropy of the normal distribution, before clipping.
 
-        `sum_i log std_i + log(2 pi e) / 2`.
+        $$\sum_i \left( \log \sigma_i + \tfrac12 \log(2 \pi e) \right)$$
 
-        **Arguments:** `t`, `y`, `state`: as of a call.
+        **Arguments:** `t`, `y`, `state`: as in a call.
 
         **Returns:** a scalar.
         """
@@ -157,36 +157,37 @@ class Gaussian(_AroundBase):
         each = -0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
         if self.bounds is not None:
             low, high = self.bounds
-            # The double-where trick: an infinite bound has a NaN gradient even where
-            # `jnp.where` does not choose it.
+            # Without these, an infinite bound would give NaN gradients, even if the
+            # `jnp.where` below does not choose it.
             near_low = jnp.where(jnp.isinf(low), 0, low)
             near_high = jnp.where(jnp.isinf(high), 0, high)
-            # P(mean + std e >= high) = Phi((mean - high) / std), in logarithms, which
-            # do not underflow far out in the tail.
+            # P(mean + std e >= high) = Phi((mean - high) / std). Its logarithm does not
+            # underflow far out in the tail.
             below = (near_low - mean) / std
             above = (mean - near_high) / std
-            # A clipped draw has an atom at each bound (Fujita and Maeda, 2018).
+            # A clipped draw has positive probability at a bound (Fujita and Maeda).
             each = jnp.where(u >= high, log_ndtr(above), each)
             each = jnp.where(u <= low, log_ndtr(below), each)
         return jnp.sum(each).astype(mean.dtype)
 
     def total_log_prob(self, trajectory: Trajectory) -> Array:
-        """The log-probability of the controls of a recorded run,
+        r"""The log-probability of all controls of a recorded run.
 
-        `sum over k < length of log p(u_k | t_k, y_k, s_k)`.
+        $$\sum_{k < \mathrm{length}} \log p(u_k \mid t_k, y_k, s_k)$$
 
-        The record is data: it is held fixed when this is differentiated with respect to
-        the weights, while the state of `base` is recomputed and keeps its gradient.
-        A stochastic `base` is not supported: it would draw anew.
+        Derivatives with respect to the weights hold the record fixed. The state of
+        `base` is computed again, and its derivatives count. A stochastic `base` is not
+        supported, because it would draw again.
 
         **Arguments:** `trajectory`: one run of this controller, with its observations,
-            controls and costs; for a batch, use `jax.vmap`. The bounds of this
-            controller must be within those of the environment, or what is recorded is
-            not what was drawn.
+        controls and costs. Use `jax.vmap` for a batch. The bounds of this controller
+        must be within those of the environment, otherwise the recorded controls are not
+        the drawn ones.
 
         **Returns:** a scalar.
 
-        **Raises:** `ValueError` if something was not kept, or on a batch.
+        **Raises:** `ValueError` if the trajectory lacks one of these records, or is a
+        batch.
         """
         where = "Gaussian.total_log_prob"
         if trajectory.batch_shape:
@@ -197,8 +198,8 @@ class Gaussian(_AroundBase):
         record: Any = (trajectory.observations, trajectory.controls, trajectory.costs)
         if any(part is None for part in record):
             raise ValueError(
-                f"{where}: trajectory must keep observations, controls and costs; "
-                "got one that was rolled out with keep= and lacks some."
+                f"{where}: trajectory must keep observations, controls and costs, got "
+                f"keep={trajectory.keep}."
             )
         record = lax.stop_gradient((trajectory.times[:-1], *record))
 
@@ -213,21 +214,21 @@ class Gaussian(_AroundBase):
 
 
 class Categorical(_AroundBase):
-    r"""One of several controls, drawn with the probabilities that a base gives,
+    r"""A policy that draws one of several controls, with the probabilities of a base.
 
-    `u = actions[i]` with probability `softmax(base(t, y))[i]`.
+    $$P(u = a_i) = \operatorname{softmax}(\ell)_i, \qquad \ell = \mathrm{base}(t, y)$$
 
-    The draw has no derivative: it is trained by its log-probability
-    ([`delucax.training.LikelihoodRatio`][], [`delucax.training.PPO`][]).
+    The draw has no derivative. Train the policy by its log-probability, for example
+    with [`delucax.training.LikelihoodRatio`][] or [`delucax.training.PPO`][].
 
     **Arguments:**
 
-    - `base`: a controller whose outputs are the logits, one per action; such as a
+    - `base`: a controller that returns the logits $\ell$, one per action, such as a
         [`delucax.controllers.MLP`][].
-    - `actions`: the table, shape `(actions, m)`, such as `env.actions`.
+    - `actions`: the controls $a_i$, shape `(actions, m)`, such as `env.actions`.
 
-    **Raises:** `ValueError` if `base` is not a controller or `actions` no matrix; when
-    it is run, if there is no key or the base gives another number of logits.
+    **Raises:** `ValueError` if `base` is not a controller or `actions` is not a matrix;
+    at run time, if there is no random key or `base` gives another number of logits.
 
     Source: Williams, 1992.
 
@@ -255,7 +256,7 @@ class Categorical(_AroundBase):
 
     @property
     def greedy(self) -> AbstractController:
-        """The deterministic controller that gives the likeliest of the controls."""
+        """The deterministic controller that takes the most likely action."""
         return _Greedy(self)
 
     def _logits(self, t, y, state):
@@ -274,23 +275,22 @@ class Categorical(_AroundBase):
         return u.astype(y.dtype), _State(base, key)
 
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
-        """The log-probability with which `__call__(t, y, state)` gives `u`.
+        """The log-probability with which `__call__(t, y, state)` returns `u`.
 
-        **Arguments:** `t`, `y`, `state`: as of a call. `u`: a control, shape `(m,)`; it
-            counts as the nearest one of the table.
+        **Arguments:** `t`, `y`, `state`: as in a call. `u`: a control, shape `(m,)`. It
+        counts as the nearest of the `actions`.
 
         **Returns:** a scalar.
         """
         logits, _ = self._logits(t, y, state)
-        # Controls of a record may be rounded: the nearest row is the one that was
-        # drawn.
+        # The nearest, because the controls of a record may be rounded.
         away = jnp.sum((lax.stop_gradient(self.actions) - u) ** 2, axis=1)
         return logits[jnp.argmin(away)]
 
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
-        """The entropy of the draw, `-sum_i p_i log p_i`.
+        r"""The entropy of the distribution, $-\sum_i p_i \log p_i$.
 
-        **Arguments:** `t`, `y`, `state`: as of a call.
+        **Arguments:** `t`, `y`, `state`: as in a call.
 
         **Returns:** a scalar.
         """
@@ -299,7 +299,7 @@ class Categorical(_AroundBase):
 
 
 class _Greedy(AbstractController):
-    """The control that a `Categorical` gives most often."""
+    """The most likely action of a `Categorical`."""
 
     policy: Categorical
 
