@@ -1,8 +1,9 @@
-"""Barrier conditions along a plant: how they are made, and what a control does to them.
+"""Barrier conditions of a plant, and how a control changes them.
 
-In continuous time a barrier `b(t, x)` of relative degree one becomes the condition
-`db/dt + decay b >= 0`, and one of degree two the same of `db/dt + decay b`. In discrete
-time the change over a step takes the place of the derivative.
+In continuous time, a barrier `b(t, x)` of relative degree one gives the condition
+`db/dt + decay b >= 0`. A barrier of relative degree two gives the same condition for
+`db/dt + decay b` in place of `b`. In discrete time, the change over a step replaces the
+derivative.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -23,14 +24,14 @@ from ..systems import AbstractPlant, AbstractSystem
 
 
 _ROUNDING = 100.0
-"""Of a derivative by the control: in units of rounding, what counts as zero."""
+"""A derivative of up to this many units of rounding counts as zero."""
 _SAMPLES = 16
 
 Psi = Callable[[Array, Array], Array]
 
 
 class Conditions(eqx.Module):
-    """The barriers of a plant, and what their conditions are made of."""
+    """The barrier conditions of a plant."""
 
     plant: AbstractPlant
     functions: dict[str, Callable[..., Any]]
@@ -46,20 +47,22 @@ class Conditions(eqx.Module):
         return plant.vector_field(t, x, u, w)
 
     def no_disturbance(self, dtype: Any) -> Array | None:
-        """The disturbance of zero, as the plant takes it."""
+        """A disturbance of zero, or `None` if the plant takes none."""
         if self.disturbance is None and not self.plant.disturbance_names:
             return None
         return jnp.zeros(self.plant.disturbance_size, dtype)
 
     def values(self, t: Array, x: Array) -> Array:
-        """The barriers, one after the other."""
+        """The values of all barriers, in one vector."""
         parts = [jnp.ravel(jnp.asarray(f(t, x))) for f in self.functions.values()]
         whole = parts[0] if len(parts) == 1 else jnp.concatenate(parts)
         return whole.astype(x.dtype)
 
     def along(self, psi: Psi, order: int) -> Callable[[Array, Array, Array], Array]:
-        """The least change of `psi` along the plant, and what it may fall by: their sum
-        must not be negative."""
+        """The condition of `psi`: its least change along the plant, plus `decay psi`.
+
+        The least change is the one under the worst disturbance.
+        """
         decay = self.decay[:, order]
 
         def condition(t, x, u):
@@ -87,7 +90,7 @@ class Conditions(eqx.Module):
         return condition
 
     def first(self, t: Array, x: Array) -> Array:
-        """The condition of the first order where no control is in it."""
+        """The first-order condition of barriers of degree two, which has no control."""
         return self.along(self.values, 0)(t, x, jnp.zeros(self.control_size, x.dtype))
 
     @property
@@ -96,7 +99,7 @@ class Conditions(eqx.Module):
         return self.decay[np.arange(len(self.degrees)), np.array(self.degrees) - 1]
 
     def last(self, t: Array, x: Array) -> Array:
-        """What the last order of each condition keeps positive."""
+        """The function that each condition keeps positive: `b` or `db/dt + decay b`."""
         values = self.values(t, x)
         if 2 not in self.degrees:
             return values
@@ -108,7 +111,7 @@ class Conditions(eqx.Module):
         return self.plant.control_size
 
     def __call__(self, t: Array, x: Array, u: Array) -> Array:
-        """The conditions, each of the order of its barrier."""
+        """The conditions, each of the relative degree of its barrier."""
         if set(self.degrees) == {2}:
             return self.along(self.first, 1)(t, x, u)
         first = self.along(self.values, 0)(t, x, u)
@@ -119,20 +122,20 @@ class Conditions(eqx.Module):
 
 
 def check_plant(plant: Any, where: str) -> None:
-    """Raise unless the plant is a system or dynamics, with a control."""
+    """Raise unless the plant is a system or dynamics, and has a control."""
     if not isinstance(plant, AbstractSystem | AbstractDynamics):
         raise ValueError(
-            f"{where}: plant must be an AbstractSystem or an AbstractDynamics (of an "
-            f"environment give its `dynamics`), got {type(plant).__name__}."
+            f"{where}: plant must be an AbstractSystem or an AbstractDynamics (for an "
+            f"environment, pass its `dynamics`), got {type(plant).__name__}."
         )
     if plant.control_size == 0:
-        raise ValueError(f"{where}: plant must have a control, got none.")
+        raise ValueError(f"{where}: plant must have at least one control, got none.")
 
 
 def sizes_of(
     functions: Mapping[str, Callable[..., Any]], state_size: int, where: str
 ) -> tuple[int | None, ...]:
-    """How many values each barrier returns; `None` for a number."""
+    """The number of values that each barrier returns; `None` for a scalar."""
     dtype, sizes = jnp.result_type(float), []
     given = [jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (state_size,))]
     for name, function in functions.items():
@@ -141,8 +144,8 @@ def sizes_of(
             like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *given)
         except (TypeError, IndexError) as error:
             raise ValueError(
-                f"{where}: barriers[{name!r}] fails when it is called with (t, x), x "
-                f"of shape ({state_size},): {error}"
+                f"{where}: barriers[{name!r}] fails when it is called with (t, x), "
+                f"with x of shape ({state_size},): {error}"
             ) from error
         shape = getattr(like, "shape", () if isinstance(like, int | float) else None)
         if shape is None or len(shape) > 1 or 0 in shape:
@@ -171,28 +174,30 @@ def by_entry(
     default: float | None,
     where: str,
 ) -> Array:
-    """A number for each value of the barriers, given for all or by the barrier. `like`
-    is the shape that one may have besides that of a number."""
+    """A number, or an array of shape `like`, for each value of the barriers.
+
+    It is given once for all barriers, or in a dictionary by the name of the barrier.
+    """
     by_name = isinstance(value, Mapping)
     if by_name and (unknown := sorted(set(map(str, value)) - set(sizes))):
         raise ValueError(
-            f"{where}: {name} must be by the names of barriers, {sorted(sizes)}, got "
-            f"{unknown}."
+            f"{where}: {name} must have the names of barriers as keys, "
+            f"{sorted(sizes)}, got {unknown}."
         )
     rows = []
     for of, size in sizes.items():
         one = value.get(of, default) if by_name else value
         if one is None:
-            raise ValueError(f"{where}: {name} must have a value for {of!r}.")
+            raise ValueError(f"{where}: {name} must have a value for {of!r}, got none.")
         array = as_float_array(one)
         if not eqx.is_inexact_array(array) or array.shape not in ((), like):
             pair = " or a pair" if like else ""
             raise ValueError(
-                f"{where}: {name} must be a number{pair}, or a dictionary of them by "
-                f"barrier, got {shortened(one)}."
+                f"{where}: {name} must be a number{pair}, or a dictionary of these by "
+                f"the names of barriers, got {shortened(one)}."
             )
         rows += [array] * (size or 1)
-    # What is known stays known while other things are traced.
+    # So that concrete values stay concrete under a trace.
     with jax.ensure_compile_time_eval():
         return jnp.stack([jnp.broadcast_to(row, like) for row in rows])
 
@@ -200,7 +205,7 @@ def by_entry(
 def as_degrees(
     value: Any, sizes: Mapping[str, int | None], where: str
 ) -> tuple[int, ...]:
-    """Relative degrees as they were given, one for each value of the barriers."""
+    """The given relative degrees, one for each value of the barriers."""
     given = np.asarray(by_entry(value, "degrees", (), sizes, None, where))
     if not np.all((given == 1) | (given == 2)):
         raise ValueError(f"{where}: degrees must be 1 or 2, got {value}.")
@@ -208,7 +213,7 @@ def as_degrees(
 
 
 def sample_states(plant: AbstractPlant) -> np.ndarray:
-    """States about the equilibrium, or about zero, that fill a box of half-width 1."""
+    """States that fill a box of half-width 1 about the equilibrium, or about zero."""
     n = plant.state_size
     try:
         centre = np.asarray(plant.equilibrium()[0])
@@ -218,7 +223,7 @@ def sample_states(plant: AbstractPlant) -> np.ndarray:
 
 
 def _scattered(count: int, size: int) -> np.ndarray:
-    """Points of the unit cube: multiples of roots of primes, modulo 1 (Weyl)."""
+    """Points that fill the unit cube evenly (Weyl, by square roots of primes)."""
     primes, candidate = [], 2
     while len(primes) < size:
         if all(candidate % prime for prime in primes):
@@ -228,7 +233,7 @@ def _scattered(count: int, size: int) -> np.ndarray:
 
 
 class _Traced(ValueError):
-    """Nothing can be computed at sample states."""
+    """The plant or the barriers are traced, so nothing can be checked."""
 
 
 def checked_degrees(
@@ -240,8 +245,10 @@ def checked_degrees(
     is_disturbed: bool,
     where: str,
 ) -> tuple[int, ...]:
-    """The relative degrees, of a system that is affine. Those that are `known` are
-    checked unless something is traced."""
+    """The relative degrees of the barriers, after a check that a system is affine.
+
+    The `known` degrees are compared with the computed ones, unless something is traced.
+    """
     try:
         if isinstance(plant, AbstractSystem):
             check_affine(plant, states, is_disturbed, where)
@@ -255,8 +262,8 @@ def checked_degrees(
     for name, given, degree in zip(names, known, degrees, strict=True):
         if given != degree:
             raise ValueError(
-                f"{where}: degrees must be {degree} for {name!r}, which sees the "
-                f"control by then and not before, got {given}."
+                f"{where}: degrees must be {degree} for {name!r}, the first order at "
+                f"which it sees the control, got {given}."
             )
     return known
 
@@ -268,16 +275,16 @@ def relative_degrees(
     states: Any,
     where: str,
 ) -> tuple[int, ...]:
-    """The relative degree of each barrier, by its derivatives at sample states."""
-    # It does not depend on the decay, which may be traced.
+    """The relative degree of each barrier, from its derivatives at sample states."""
+    # Any decay gives the same degrees, and the given one may be traced.
     ones: Any = np.ones((len(names), 2))
     conditions = Conditions(plant, functions, ones, None)
     first, known = _at_samples(_sees_control, conditions, states, where, 0)
     if not np.all(known):
         raise ValueError(
-            f"{where}: barriers must be finite at one of the sample states, and "
-            f"{names[int(np.argmin(known))]!r} is not at any: give `states` at which "
-            "it is."
+            f"{where}: barriers must be finite at one of the sample states, but "
+            f"{names[int(np.argmin(known))]!r} is not finite at any of them. Pass "
+            "`states` at which it is."
         )
     degrees = np.where(first, 1, 2)
     if not np.all(first):
@@ -285,10 +292,11 @@ def relative_degrees(
         if not np.all(first | second):
             name = names[int(np.argmin(first | second))]
             is_discrete = isinstance(plant, AbstractDynamics)
-            when = "two steps later" if is_discrete else "by its second derivative"
+            when = "two steps later" if is_discrete else "in its second derivative"
             raise ValueError(
                 f"{where}: barriers must see the control at relative degree 1 or 2, "
-                f"and {name!r} does not, not even {when}, at any sample state."
+                f"but {name!r} does not at any sample state: the control has no effect "
+                f"on it even {when}."
             )
     return tuple(int(degree) for degree in degrees)
 
@@ -308,25 +316,24 @@ def check_affine(
         if not known:
             raise ValueError(
                 f"{where}: plant must have a finite vector field at one of the sample "
-                "states: give `states` at which it has."
+                "states, but it has none. Pass `states` at which it is finite."
             )
         if curved:
             raise ValueError(
                 f"{where}: plant must have a vector field that is affine in the "
-                f"{argument}, f(t, x) + g(t, x) u, and that of "
-                f"{type(conditions.plant).__name__} is not. Discretise it: in discrete "
-                "time the filter linearises."
+                f"{argument}, such as f(t, x) + g(t, x) u, but the "
+                f"field of {type(conditions.plant).__name__} is not. Discretise the "
+                "plant: in discrete time the filter linearises."
             )
 
 
 def _at_samples(test, conditions: Conditions, states: Any, where: str, option: Any):
-    """Two booleans for each barrier, or of the plant: whether `test` holds at any of
-    the states, and whether any of them told."""
+    """Whether `test` holds at any of the states, and whether any decides it."""
     with jax.ensure_compile_time_eval():
         holds, known = _tested(test, conditions, jnp.asarray(states, float), option)
         if not is_concrete(holds):
             raise _Traced(
-                f"{where}: degrees must be given where plant or barriers are traced."
+                f"{where}: degrees must be given if plant or barriers are traced."
             )
     holds, known = np.asarray(holds), np.asarray(known)
     return np.any(holds & known, 0), np.any(known, 0)
@@ -353,7 +360,7 @@ def _sees_control(conditions: Conditions, t: Array, x: Array, order: int):
 
 
 def _is_curved(conditions: Conditions, t: Array, x: Array, with_disturbance: bool):
-    """Whether the field of a sum of inputs is not the sum of those of each."""
+    """Whether the field at a sum of inputs is not the sum of the fields."""
     m = conditions.control_size
     k = conditions.plant.disturbance_size if with_disturbance else 0
     one, two = jnp.asarray(4 * _scattered(2, m + k) - 2, x.dtype)

@@ -1,4 +1,4 @@
-"""The margin that covers a control held over a step."""
+"""The margin of a barrier condition for a control that is held over a step."""
 
 import itertools
 from typing import Any
@@ -19,9 +19,9 @@ from ._barriers import Conditions
 _MOST = 2_000_000
 _AT_ONCE = 4096
 _ROUNDS = 100
-"""In which the limits grow; each takes in more cells of the grid, or is the last."""
+"""The most rounds in which the limits grow, as more cells of the grid come in."""
 _FEW = 5
-"""Rounds in which they shrink; each is valid."""
+"""The rounds in which the limits shrink. The limits are valid after each of them."""
 
 
 def hold_margin(
@@ -33,15 +33,22 @@ def hold_margin(
     times: tuple[Any, Any] | None,
     where: str,
 ) -> Array:
-    """Half of `dt` times the fastest fall of the change of each barrier, where it may
-    come to zero within a step."""
+    """Half of `dt` times the fastest fall of the change of each barrier.
+
+    Only points from which the barrier may reach zero within a step count.
+    """
     if not isinstance(conditions.plant, AbstractSystem):
-        raise ValueError(f"{where}: plant must be in continuous time.")
+        raise ValueError(
+            f"{where}: plant must be in continuous time, an AbstractSystem, got "
+            f"{type(conditions.plant).__name__}."
+        )
     check_step(dt, where)
     check_count(points, "points", where, 3)
     n, m = conditions.plant.state_size, conditions.control_size
     if bounds is None or not all(np.all(np.isfinite(end)) for end in bounds):
-        raise ValueError(f"{where}: bounds of the controls must be given and finite.")
+        raise ValueError(
+            f"{where}: bounds of the controls must be given and finite, got {bounds}."
+        )
     if not isinstance(states, tuple | list) or len(states) != 2:
         raise ValueError(f"{where}: states must be a pair (low, high).")
     ends = [finite_vector(end, n, "states", where) for end in states]
@@ -51,7 +58,10 @@ def hold_margin(
     with jax.ensure_compile_time_eval():
         decay = np.asarray(conditions.last_decay)
         if not dt * np.max(decay) <= 1:
-            raise ValueError(f"{where}: dt must be at most 1 / decay, got {dt}.")
+            raise ValueError(
+                f"{where}: dt must be at most 1 / decay, got dt {dt} and decay "
+                f"{np.max(decay)}."
+            )
         box = tuple(whole(end, n) for end in ends)
         margins = _margins(conditions, float(dt), box, controls, times, points, where)
         return jnp.asarray(margins, conditions.decay.dtype)
@@ -72,8 +82,8 @@ def _margins(
     varies = not is_constant(lambda t: conditions(t, x, u), zero)
     if varies and times is None:
         raise ValueError(
-            f"{where}: times must be given, (start, end), where a barrier or the plant "
-            "depends on time."
+            f"{where}: times must be given, (start, end), because a barrier or the "
+            "plant depends on time."
         )
     if times is not None:
         pair = np.asarray(times, float)
@@ -89,10 +99,10 @@ def _margins(
     if np.prod(shape, dtype=float) > _MOST:
         raise ValueError(
             f"{where}: points must give a grid of at most {_MOST} points, got "
-            f"{' x '.join(map(str, shape))}: take fewer."
+            f"{' x '.join(map(str, shape))}. Choose fewer points."
         )
     flat = np.stack([a.ravel() for a in np.meshgrid(*axes, indexing="ij")], 1)
-    # A rate is affine in the disturbance, and greatest at a corner.
+    # A rate is affine in the disturbance, so it is greatest at a corner.
     corners = np.zeros((1, 0))
     if conditions.disturbance is not None:
         size = conditions.plant.disturbance_size
@@ -104,24 +114,28 @@ def _margins(
     )
     safe = _in_cells(holds, np.logical_or)
     if not safe.any():
-        raise ValueError(f"{where}: states must hold a point at which barriers hold.")
+        raise ValueError(
+            f"{where}: states must have a point at which all barriers hold, but they "
+            "hold at no point of the grid."
+        )
     rates = [
         _fastest(fall[..., j], change[..., j], psi[..., j], safe, decay, dt)
         for j, decay in enumerate(np.asarray(conditions.last_decay).tolist())
     ]
     if not np.all(np.isfinite(rates)):
         raise ValueError(
-            f"{where}: states must be a box in which the conditions have derivatives "
-            "wherever the barriers hold; one is not finite there."
+            f"{where}: states must be a box in which the derivatives of the conditions "
+            "are finite at all points at which the barriers hold, but one is not."
         )
     return dt * np.array(rates) / 2
 
 
 @eqx.filter_jit
 def _falls(conditions: Conditions, flat: Array, corners: Array) -> Any:
-    """At points of time, state and control: how fast the change of what must stay
-    positive falls, for each of the disturbances; the change; what must stay positive;
-    and whether all barriers hold."""
+    """The fall of the change of `psi`, the change, `psi`, and whether barriers hold.
+
+    All are evaluated at the points `(t, x, u)`, the fall for each of the disturbances.
+    """
     n = conditions.plant.state_size
 
     def at(z):
@@ -154,10 +168,11 @@ def _fastest(
 ) -> float:
     """The fastest fall of the change of `psi`, on the way to `psi = 0` within a step.
 
-    Back from there, `psi` is at most `dt` times its own fastest fall, and its change at
-    most `dt` times the fall that is sought: both are raised from zero until they hold.
-    On from the sample, the change is at least `-decay psi`, less the same. This limit
-    lowers both, and they stay valid.
+    Go back in time from `psi = 0`: `psi` is at most `dt` times its own fastest fall,
+    and its change is at most `dt` times the fall that is sought. Both limits are raised
+    from zero until they are consistent. Go forward from the sample: the change is at
+    least `-decay psi`, less the same amount. This lowers both limits, and they stay
+    valid.
     """
     low, high = (_in_cells(change, join) for join in (np.minimum, np.maximum))
     near = _in_cells(psi, np.minimum)
@@ -181,12 +196,12 @@ def _fastest(
     for _ in range(_FEW):
         now = measured(rate, reach, -decay * reach - dt * rate)
         rate, reach = min(now[0], rate), min(now[1], reach)
-    # A NaN is not greater than what came before it.
+    # `max` and `min` may drop a NaN.
     return rate if np.all(np.isfinite(now)) else np.nan
 
 
 def _in_cells(values: np.ndarray, join: Any) -> np.ndarray:
-    """What the corners of each cell of a grid have together."""
+    """The values at the corners of each cell of a grid, joined."""
     for axis in range(values.ndim):
         if values.shape[axis] > 1:
             ends = np.moveaxis(values, axis, 0)
@@ -195,7 +210,7 @@ def _in_cells(values: np.ndarray, join: Any) -> np.ndarray:
 
 
 def _corners_of(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The points that are corners of some cells."""
+    """The points that are corners of some of the cells."""
     for axis, length in enumerate(shape):
         if length > 1:
             cells = np.moveaxis(cells, axis, 0)
@@ -206,9 +221,11 @@ def _corners_of(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _highest(fall: np.ndarray, inside: np.ndarray) -> float:
-    """The largest value of a smooth function that is known on a grid: between points it
-    exceeds the larger by at most an eighth of the square of the step times the second
-    derivative, along each axis."""
+    """The largest value of a smooth function that is known at the points of a grid.
+
+    Along each axis, a function exceeds the larger of two neighbours by at most an
+    eighth of the second difference.
+    """
     if not inside.any():
         return 0.0
     most = np.max(fall[inside])

@@ -1,9 +1,9 @@
-"""The least change of a control under affine conditions and bounds.
+"""The smallest change of a control that satisfies affine conditions and bounds.
 
 `minimise 1/2 sum_i weight_i (u_i - n_i)^2` such that `s + A (u - n) >= 0` and
-`low <= u <= high`. Where one condition is active, the solution is where an increasing,
-piecewise linear function of one multiplier is zero. Otherwise it is that of a small
-quadratic program.
+`low <= u <= high`. With one active condition, the solution is the zero of an
+increasing, piecewise linear function of one multiplier. Otherwise a small quadratic
+program is solved.
 """
 
 from collections.abc import Callable
@@ -21,20 +21,20 @@ from ..math._small import dot, matvec
 
 
 _ELASTIC = 0.4
-"""The linear price of a hard condition in the quadratic program is rounding to minus
-this power: above the multipliers of a program that has a solution, unless two
-conditions are opposed to about as many digits."""
+"""In the quadratic program, the linear price of a hard condition is the unit of
+rounding to minus this power. That is above the multipliers of a feasible program,
+unless two conditions are almost opposed."""
 
 
 _LEAST, _MOST = 0.3, 30.0
-"""The curvature of a Lagrangian, in units of that of the cost, is kept between them."""
+"""Bounds of the estimated curvature of the Lagrangian, relative to that of the cost."""
 
 
 class Task(NamedTuple):
-    """What may be changed, and at what price.
+    """A nominal control, its bounds, and what changes and missed conditions cost.
 
-    A condition without a `price` is hard; one with a price may be missed by `d`, which
-    costs `1/2 price d^2`.
+    A condition without a `price` is hard. A condition with a price may be missed by
+    `d`, which costs `1/2 price d^2`.
     """
 
     nominal: Array
@@ -45,7 +45,7 @@ class Task(NamedTuple):
 
 
 def least_change(task: Task, s: Array, A: Array) -> Array:
-    """The control for conditions whose values at the nominal one are `s`."""
+    """The control under conditions whose values at the nominal control are `s`."""
     if len(s) == 1:
         price = None if task.price is None else task.price[0]
         return _for_one(task, s[0], A[0], price)
@@ -53,7 +53,7 @@ def least_change(task: Task, s: Array, A: Array) -> Array:
 
 
 def missed(task: Task, s: Array, A: Array, u: Array) -> tuple[Array, Array]:
-    """By how much conditions are missed, and the size of the terms in them."""
+    """The amount by which each condition is missed, and the size of its terms."""
     n = task.nominal
     over = jnp.maximum(-(s + matvec(A, u - n)), 0)
     size = jnp.abs(s - matvec(A, n)) + matvec(jnp.abs(A), jnp.abs(u) + jnp.abs(n))
@@ -63,7 +63,7 @@ def missed(task: Task, s: Array, A: Array, u: Array) -> tuple[Array, Array]:
 def judged(task: Task, over: Array, size: Array, converged: Any) -> Result:
     """The status of a control that misses conditions by `over`."""
     eps = float(jnp.finfo(over.dtype).eps)
-    # Negated, so that a NaN is a failure.
+    # `~(<=)` instead of `>`, so that a NaN is a failure.
     fails = ~(over <= eps**0.5 * size + 100 * eps)
     if task.price is not None:
         fails = fails & ~jnp.isfinite(task.price)
@@ -74,27 +74,27 @@ def judged(task: Task, over: Array, size: Array, converged: Any) -> Result:
 
 
 def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
-    """The control for one condition, in closed form."""
+    """The control under one condition, in closed form."""
     n, low, high, weight, _ = task
     give = jnp.zeros((), s.dtype) if price is None else 1 / price
     way = a / weight
     if low is None or high is None:
-        # Negated comparisons, so that a NaN is passed on.
+        # The 0 is chosen only if s >= 0 is true, so that a NaN is passed on.
         push = jnp.where(s >= 0, 0, -s) / _unless_zero(dot(a, way) + give)
         return n + push * way
-    # The multiplier at which each control enters the box, and that at which it leaves.
+    # The multipliers at which each control enters and leaves its bounds.
     ahead, moves = jnp.where(way > 0, high, low), way != 0
     behind = jnp.where(way > 0, low, high)
     pace = jnp.where(moves, way, 1)
     enters, leaves = (jnp.maximum((end - n) / pace, 0) for end in (behind, ahead))
 
     def is_short(push):
-        """Whether the condition is not met yet at a multiplier."""
+        """Whether the condition is not met yet at this multiplier."""
         value = s + dot(a, jnp.clip(n + push * way, low, high) - n) + push * give
         return ~(value >= 0)
 
-    # By the sign at its own two multipliers: the place of the solution among all would
-    # be lost where rounding differs between copies of them.
+    # Each control is classified by the sign at its own two multipliers. Sorting all
+    # multipliers would be wrong if rounding differs between copies of one of them.
     finite = jnp.isfinite(leaves)
     has_entered = moves & jax.vmap(is_short)(enters)
     has_left = moves & finite & jax.vmap(is_short)(jnp.where(finite, leaves, 0))
@@ -110,13 +110,16 @@ def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
 
 
 def _unless_zero(size: Array) -> Array:
-    """A divisor that is 1 where it would be zero."""
+    """`size`, or 1 if it is zero, as a divisor."""
     return jnp.where(size > jnp.finfo(size.dtype).tiny, size, 1)
 
 
 def _for_several(task: Task, s: Array, A: Array) -> Array:
-    """The control for several conditions: that for one of them, if it meets the others,
-    else of a quadratic program."""
+    """The control under several conditions.
+
+    If the control for one of them meets the others, it is the solution. Otherwise a
+    quadratic program is solved.
+    """
     price = task.price
     one = lambda s, a, p: _for_one(task, s, a, p)
     tried = jax.vmap(one, in_axes=(0, 0, None if price is None else 0))(s, A, price)
@@ -131,16 +134,19 @@ def _for_several(task: Task, s: Array, A: Array) -> Array:
 
 
 def _by_program(task: Task, s: Array, A: Array) -> Array:
-    """The control by a quadratic program that always has a solution: a hard condition
-    may be missed at a linear price that no other solution is worth."""
+    """The control from a quadratic program that always has a solution.
+
+    A hard condition may be missed, but at a linear price so high that it is missed only
+    if there is no other solution.
+    """
     n, low, high, weight, price = task
     root = jnp.sqrt(weight)
     A = A / root
     size = jnp.sum(A * A, 1)
     is_seen = size > jnp.finfo(size.dtype).tiny
     length = jnp.sqrt(jnp.where(is_seen, size, 1))
-    # In units of the largest change that a condition alone asks for. The solution does
-    # not depend on the unit.
+    # The unit is the largest change that one condition needs. The solution does not
+    # depend on it, so no derivative goes through it.
     far = lax.stop_gradient(jnp.max(jnp.where(is_seen, -s / length, 0)))
     far = jnp.where(far > 0, far, 1)
     lower = jnp.where(is_seen, -s / (length * far), -jnp.inf)
@@ -155,7 +161,7 @@ def _by_program(task: Task, s: Array, A: Array) -> Array:
     if low is not None and high is not None:
         bounds = root * (low - n) / far, root * (high - n) / far
     P, q = jnp.eye(len(n), dtype=s.dtype), jnp.zeros(len(n), s.dtype)
-    # Tighter than the default: bounds may be large in the unit of the change.
+    # Tighter than the default, because bounds may be large in this unit.
     tol = float(jnp.finfo(s.dtype).eps) ** 0.625
     problem = qp.Dense(P, q, bounds=bounds, rows=rows)
     solution = qp.solve(problem, rtol=tol, atol=tol, throw=False)
@@ -166,11 +172,12 @@ def _by_program(task: Task, s: Array, A: Array) -> Array:
 def least_change_sequentially(
     task: Task, conditions: Callable[[Array], Array], most: int
 ) -> Any:
-    """The control under conditions that are not affine in it: a fixed point of
-    linearising them at a control and solving for the next one.
+    """The control under conditions that are not affine in it.
 
-    The curvature of the Lagrangian is a multiple of the weights, which the last two
-    steps tell; 1 would be that of the cost alone, and need not converge.
+    The conditions are linearised at a control and solved for the next one, until the
+    control stays. The curvature of the Lagrangian is a multiple of the weights,
+    estimated from the last two steps. A multiple of 1, for the cost alone, need not
+    converge.
     """
     n, dtype = task.nominal, task.nominal.dtype
     close = jnp.finfo(dtype).eps ** 0.75
@@ -191,7 +198,7 @@ def least_change_sequentially(
         u, last, curvature, pull, count = carry
         after = next_of(u, curvature)
         step = after - u
-        # How the pull to the nominal control changes along the last step.
+        # The curvature: the change of the pull to n along the last step.
         size = dot(last, last)
         estimate = dot(pull - curvature * step, last) / jnp.where(size > 0, size, 1)
         new = jnp.where(size > 0, jnp.clip(estimate, _LEAST, _MOST), 1)

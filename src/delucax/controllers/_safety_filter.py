@@ -1,4 +1,4 @@
-"""A filter that makes any controller safe: control barrier functions."""
+"""A filter that makes any controller safe, by control barrier functions."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -60,82 +60,99 @@ class SafetyFilterState(NamedTuple):
 
 
 class SafetyFilter(AbstractController):
-    r"""The least change of a controller's action that keeps barriers at least zero.
+    r"""A filter that makes any controller safe, with the least change of its control.
 
-    With the action `n` of the controller, the control is the solution of
+    The filter takes the control $n$ of a controller, and keeps barriers $b(t, x)$ at
+    zero or above. It solves
 
     $$\min_u \tfrac12 \sum_i \mathrm{weight}_i\,(u_i - n_i)^2
     \quad\text{such that}\quad c(t, x, u) \ge \mathrm{margin}, \quad
-    \mathrm{low} \le u \le \mathrm{high}.$$
+    \mathrm{low} \le u \le \mathrm{high}$$
 
-    For a system in continuous time, `f(t, x, u, w)` affine in `u`, a barrier `b(t, x)`
-    whose derivative sees the control (relative degree one) gives the condition
+    **Continuous time.** The vector field $f(t, x, u, w)$ must be affine in $u$. A
+    barrier has relative degree one if its first derivative depends on the control. Its
+    condition is
 
-    `c = db/dt + decay b`,
+    $$c = \dot b + \mathrm{decay}\; b$$
 
-    and one whose second derivative does (degree two) gives it for `db/dt + decay b`,
-    with a second decay. The constructor determines the degree. Where the control is
-    applied at all times, `b >= 0` then holds for ever if it does at first; of degree
-    two, if `db/dt + decay b >= 0` does too.
+    A barrier has relative degree two if only its second derivative depends on the
+    control. Its condition is the same for $\dot b + \mathrm{decay}\; b$ in place of
+    $b$, with a second decay. The filter determines the degree when you make it.
 
-    For dynamics in discrete time the change over a step takes the place of the
-    derivative: `c = b(t + dt, F(t, x, u)) - (1 - decay) b(t, x)`. The condition is
-    linearised at the action, then again at each solution, until the solution stays.
-    If no barrier is at risk, that is one linearisation.
+    If the filter acts at all times and $b \ge 0$ at the start, then $b \ge 0$ at all
+    times. For degree two, $\dot b + \mathrm{decay}\; b \ge 0$ must hold at the start
+    too.
+
+    **Discrete time.** The change over a step replaces the derivative:
+
+    $$c = b(t + \Delta t, F(t, x, u)) - (1 - \mathrm{decay})\, b(t, x)$$
+
+    The filter linearises the condition at $n$, and again at each solution, until the
+    solution stays. If no barrier is at risk, one linearisation is enough.
 
     **Disturbances.** With `disturbance`, the condition holds for the worst
-    `|w_i| <= disturbance_i`, in both orders of degree two: of continuous time exactly,
-    as `f` must be affine in `w`; of discrete time to the first order.
+    $|w_i| \le \mathrm{disturbance}_i$, in both orders of degree two. This is exact in
+    continuous time, where $f$ must be affine in $w$. In discrete time it is exact to
+    first order in $w$.
 
-    **A control that is held.** Between two samples a condition falls.
-    [`held`][delucax.controllers.SafetyFilter.held] computes a margin that covers it.
+    **A control that is held.** If the control is held between samples, a condition can
+    fall in between. [`held`][delucax.controllers.SafetyFilter.held] computes a margin
+    that covers this.
 
-    **Where it cannot be.** A condition with a `price` may be missed by `d`, which costs
-    `1/2 price d^2`. If the hard conditions cannot all hold between the bounds, the
-    control is the one between the bounds that misses them least, by the sum of the
-    distances to them. Such a step is counted in `incidents["failed_filter"]` of a
-    rollout. The state has of the last step `missed`, by how much each condition was
-    missed; `result`: `no_feasible_point` then, `ill_posed` if a number was NaN, and
-    `not_converged` if a condition in discrete time was missed after `max_iterations`;
-    the number of failures, `failures`; and `iterations`, the linearisations.
+    **Conditions that cannot hold.** A condition with a `price` may be missed by $d$,
+    which costs $\tfrac12\, \mathrm{price}\; d^2$. If the hard conditions cannot all
+    hold within the bounds, the filter returns the control within the bounds with the
+    smallest sum of the distances to these conditions. A rollout counts such steps in
+    `incidents["failed_filter"]`. The state of the controller has, for the last step,
 
-    One active condition is solved in closed form, several by [`delucax.qp.solve`][].
-    Derivatives are exact in both modes, so that a policy can be trained through the
-    filter. The control is not smooth where a condition becomes active; there the
-    derivative is that of one side, or NaN of a quadratic program. In discrete time they
-    follow from the implicit function theorem, and mean nothing if not converged.
+    - `missed`: by how much each condition was missed,
+    - `result`: the status: `no_feasible_point` if a hard condition was missed,
+        `ill_posed` if a number was NaN, `not_converged` if a condition in discrete time
+        was still missed after `max_iterations`,
+    - `iterations`: the number of linearisations,
+
+    and `failures`, the number of failed steps so far.
+
+    **Derivatives.** You can train a policy through the filter. The derivatives are
+    exact, in discrete time by the implicit function theorem if the filter converged.
+    The control is not smooth in states where a condition becomes active. There the
+    derivative is that of one side, or NaN if [`delucax.qp.solve`][] found the control.
+    It does so if several conditions are active. One active condition is solved in
+    closed form.
 
     **Arguments:**
 
     - `controller`: any controller.
     - `plant`: an [`delucax.AbstractSystem`][], affine in the control, or an
-        [`delucax.AbstractDynamics`][]. It observes its state; around an estimator see
+        [`delucax.AbstractDynamics`][]. The filter must observe the state of the plant.
+        If it is not measured, put the filter into a
         [`delucax.controllers.OutputFeedback`][].
     - `barriers`: a function `b(t, x)` that returns a number or a vector, or a
-        dictionary of such functions, whose keys name them. An `eqx.Module` with
-        [`delucax.parameter`][] fields can be differentiated with respect to them.
+        dictionary of such functions. You can differentiate with respect to the
+        [`delucax.parameter`][] fields of a barrier that is an `eqx.Module`.
     - `decay`: how fast a barrier may fall, 1 by default: a rate (1/s) in continuous
-        time, a fraction up to 1 in discrete time. A number; a pair for the two orders
-        of degree two; or a dictionary of these by barrier.
-    - `margin`: what each condition must be at least, 0 by default, in its own units. A
-        number, or a dictionary by barrier.
-    - `disturbance`: bounds of `|w|`, a number or one for each; none by default.
+        time, a fraction from 0 to 1 in discrete time. A number; or a pair, for the two
+        orders of degree two; or a dictionary of these by the name of the barrier.
+    - `margin`: the least value of each condition, in its own units; 0 by default. A
+        number, or a dictionary by the name of the barrier.
+    - `disturbance`: bounds of $|w|$, a number or of shape `(k,)`; none by default.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
-    - `price`: of a missed condition; a number, or a dictionary by barrier, which leaves
-        the others hard. All are hard by default.
-    - `weight`: the price of a change of each control, 1 by default; a number or of
-        shape `(m,)`.
-    - `states`: where the relative degree and that the system is affine are checked,
-        shape `(k, n)`; by default 16 points at most 1 from the equilibrium, or zero.
+    - `price`: the price of missing a condition, a number or a dictionary by the name of
+        the barrier. Barriers without a price are hard. By default all are hard.
+    - `weight`: the price of changing each control, a number or of shape `(m,)`; 1 by
+        default.
+    - `states`: the states at which the filter checks the relative degree and that the
+        system is affine, shape `(k, n)`. By default 16 points in a box of half-width 1
+        about the equilibrium, or about zero.
     - `degrees`: the relative degree of each barrier, 1 or 2; a number, or a dictionary
-        by barrier. It is for where plant or barriers are traced: nothing is checked at
-        sample states then.
+        by the name of the barrier. Give it if the plant or the barriers are traced:
+        then it cannot be determined, and is not checked.
     - `max_iterations`: the most linearisations in discrete time, 20 by default.
 
-    **Raises:** `ValueError` on arguments of the wrong kind, shape or value; if a
-    barrier does not see the control up to degree two, by its name; if the system is not
-    affine in the control, or in a disturbance that is bounded.
+    **Raises:** `ValueError` if an argument has the wrong type, shape or value, if a
+    barrier has no relative degree of 1 or 2, or if the system is not affine in the
+    control, or in a bounded disturbance.
 
     Source: Ames et al., 2017 and 2019; Nguyen and Sreenath, 2016, Xiao and Belta, 2019
     (degree two); Jankovic, 2018 (disturbances); Agrawal and Sreenath, 2017 (discrete
@@ -195,7 +212,7 @@ class SafetyFilter(AbstractController):
         given = barriers if isinstance(barriers, Mapping) else {"barrier": barriers}
         if not given:
             raise ValueError(f"{where}: barriers must not be empty.")
-        # In the order that JAX gives to the keys of a dictionary.
+        # Sorted, because JAX sorts the keys of a dictionary.
         keys = sorted(given, key=str)
         self.barriers = {str(key): as_module(given[key]) for key in keys}
         self.sizes = sizes_of(self.barriers, n, where)
@@ -211,8 +228,8 @@ class SafetyFilter(AbstractController):
             size = plant.disturbance_size
             if isinstance(plant, AbstractSystem) and not plant.disturbance_names:
                 raise ValueError(
-                    f"{where}: disturbance needs a plant with disturbance_names, whose "
-                    f"field it enters, and {type(plant).__name__} has none."
+                    f"{where}: plant must have disturbance_names if disturbance is "
+                    f"given, got {type(plant).__name__}, which has none."
                 )
             self.disturbance = as_entries(disturbance, size, "disturbance", where)
         self.bounds = check_control_bounds(bounds, m, where)
@@ -220,7 +237,7 @@ class SafetyFilter(AbstractController):
         with jax.ensure_compile_time_eval():
             self.weight = jnp.broadcast_to(weight, (m,))
         self.max_iterations = check_count(max_iterations, "max_iterations", where)
-        # The numbers are checked before anything is computed with them.
+        # Checked here, because the degrees are computed with these numbers.
         self.degrees = (1,) * len(self.names)
         self.__check_init__()
         known = None if degrees is None else as_degrees(degrees, sizes, where)
@@ -265,8 +282,10 @@ class SafetyFilter(AbstractController):
 
     @property
     def conditions(self) -> Conditions:
-        """The conditions without their margin: a function of `(t, x, u)`, whose values
-        are in the order of `names`."""
+        """The conditions without their margin: a function of `(t, x, u)`.
+
+        It returns a vector, in the order of `names`.
+        """
         given = self.plant, self.barriers, self.decay, self.disturbance
         return Conditions(*given, degrees=self.degrees)
 
@@ -278,36 +297,40 @@ class SafetyFilter(AbstractController):
         times: tuple[float, float] | None = None,
         points: int = 11,
     ) -> "SafetyFilter":
-        """The filter with a margin for a control that is held over `dt`.
+        r"""The filter with a larger margin, for a control that is held over `dt`.
 
-        A condition is `c = d + decay psi`: `psi` is what it keeps positive, the barrier
-        or `db/dt + decay b`, and `d` its least change. Let `c >= margin` at a sample,
-        and `-dd/dt <= M` until the next one. Then `s` after the sample
+        Write a condition as $c = \Delta + \mathrm{decay}\; \psi$. Here $\psi$ is the
+        function that it keeps positive, either $b$ or $\dot b + \mathrm{decay}\; b$,
+        and $\Delta$ is the smallest rate of change of $\psi$. Let
+        $c \ge \mathrm{margin}$ at a sample, and let $\Delta$ fall at a rate of at most
+        $M$ until the next sample. Then, at a time $s$ after the sample,
 
-        `psi >= (1 - decay s) psi_0 + s (margin - s M / 2)`,
+        $$\psi \ge (1 - \mathrm{decay}\; s)\, \psi_0 + s\, (\mathrm{margin} - s M / 2)$$
 
-        which is not negative with `margin = dt M / 2` and `decay dt <= 1`. So barriers
-        that hold at first hold at all times.
+        This is not negative if $\mathrm{margin} = \mathrm{dt}\; M / 2$ and
+        $\mathrm{decay} \cdot \mathrm{dt} \le 1$. So barriers that hold at the start
+        hold at all times.
 
-        `M` is a maximum over the controls between the bounds, the disturbances, and the
-        states at which all barriers hold and from which `psi` can fall to zero within
-        `dt`. It is taken at the corners of the cells of a grid that have such points in
-        them, with an allowance for what is between them from its second differences:
-        see that more points change it little. It supposes that the states stay in the
-        box, and that the filter does not fail.
+        The method computes $M$ as a maximum over the controls within the bounds, the
+        disturbances, and the states at which all barriers hold and from which $\psi$
+        can reach zero within `dt`. It evaluates the corners of the grid cells that
+        contain such points, and adds an allowance for the points in between, from
+        second differences. Check that more `points` change the margin little. The
+        result is valid if the states stay in the box and the filter does not fail.
 
         **Arguments:**
 
-        - `dt`: the time for which a control is held.
-        - `states`: a pair `(low, high)`, each of shape `(n,)`: a box that the states do
-            not leave.
-        - `times`: `(start, end)`, if a barrier or the plant depends on time.
-        - `points`: of the grid for each state, each control and time, 11 by default.
+        - `dt`: the time over which a control is held.
+        - `states`: a pair `(low, high)`, each of shape `(n,)`: a box that contains all
+            states of a run.
+        - `times`: `(start, end)`, needed if a barrier or the plant depends on time.
+        - `points`: the number of grid points for each state, each control and time, 11
+            by default.
 
-        **Returns:** the filter, with this added to its `margin`.
+        **Returns:** the filter, with this amount added to its `margin`.
 
-        **Raises:** `ValueError` in discrete time, without finite bounds, on a box of
-        the wrong shape, or on a grid that is too large.
+        **Raises:** `ValueError` in discrete time, without finite bounds, for a box of
+        the wrong shape, or for a grid that is too large.
 
         Source: Breeden, Garg and Panagou, 2022 (the margin by the second derivative
         along a step); Cortez et al., 2019.
@@ -346,8 +369,8 @@ class SafetyFilter(AbstractController):
         m = self.plant.control_size
         if jnp.shape(nominal) != (m,):
             raise ValueError(
-                f"SafetyFilter: controller must return a control of shape ({m},), as "
-                f"the plant takes, got {jnp.shape(nominal)}."
+                f"SafetyFilter: controller must return a control of shape ({m},) for "
+                f"the plant, got {jnp.shape(nominal)}."
             )
         u, over, count, result = self._least_change(t, y, nominal.astype(y.dtype))
         after = SafetyFilterState(
@@ -359,10 +382,10 @@ class SafetyFilter(AbstractController):
         )
         return u, after
 
-    # An accelerator's rounded products would let the plant through its barriers.
+    # With the low precision of an accelerator's products, barriers would be violated.
     @full_precision
     def _least_change(self, t: RealScalar, y: Array, nominal: Array) -> tuple:
-        """The control, what the conditions miss, how many iterations, the status."""
+        """The control, the missed amounts, the linearisations and the status."""
         task, conditions = self._task(nominal), self._above(t, y)
         if isinstance(self.plant, AbstractDynamics):
             u, over, size, count, converged = least_change_sequentially(
@@ -380,7 +403,7 @@ class SafetyFilter(AbstractController):
         return state._replace(controller=memory)
 
     def _above(self, t: RealScalar, x: Array) -> Callable[[Array], Array]:
-        """The conditions, as functions of the control that must not be negative."""
+        """The conditions less their margin, as a function of the control."""
         time, margin = jnp.asarray(t, x.dtype), self.margin.astype(x.dtype)
         return lambda u: self.conditions(time, x, u) - margin
 
@@ -393,7 +416,7 @@ class SafetyFilter(AbstractController):
         return Task(nominal, low, high, self.weight.astype(dtype), price)
 
     def _named(self, values: Array) -> dict[str, Array]:
-        """Values of the conditions by the names of their barriers."""
+        """Values of the conditions, by the names of their barriers."""
         named, start = {}, 0
         for name, size in zip(self.barriers, self.sizes, strict=True):
             part = values[start] if size is None else values[start : start + size]
