@@ -1,1 +1,1 @@
-"""Controllers that learn while they run; `delucax.controllers` exports them."""
+"""Controllers that learn while they run. `delucax.controllers` exports them."""

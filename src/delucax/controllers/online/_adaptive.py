@@ -23,15 +23,15 @@ from ..._typing import PRNGKey, Real, RealScalar
 
 
 class AdaptiveState(NamedTuple):
-    """The state of the experts.
+    """The state of an `Adaptive` controller.
 
-    - `experts`: their states, with a leading axis of slots.
-    - `weights`: of each, 0 in an empty slot; they add up to 1.
-    - `ends`: the step at which each dies.
-    - `step`: how many steps were made, and `t`, the time of the current one.
-    - `mean`, `variance`: of the losses lately.
-    - `chosen`: the slot that is followed, and `key`, of the next choice; `None` where
-      all are mixed.
+    - `experts`: the states of the experts, with a leading axis of slots.
+    - `weights`: the weight of each expert, 0 for an empty slot. Their sum is 1.
+    - `ends`: the step at which each expert expires.
+    - `step`: the number of steps so far. `t`: the time of the current one.
+    - `mean`, `variance`: those of the recent losses.
+    - `chosen`: the slot that is followed. `key`: the random key of the next choice.
+        Both are `None` if the experts are mixed.
     """
 
     experts: PyTree
@@ -46,36 +46,42 @@ class AdaptiveState(NamedTuple):
 
 
 class Adaptive(AbstractController):
-    """An online learner made to keep up with a plant or disturbances that change.
+    r"""An online learner that adapts to a plant or disturbances that change.
 
-    Copies of `base`, the experts, run side by side on the same observations. Every
-    `every` steps a new one begins that has learned nothing; the i-th expires after
-    `every (4 2^k + 1)` steps, 2^k being the largest power of two that divides i, so
-    that there is at all times one that began shortly after any change. The first never
-    expires. If no slot is free, the one that would expire next is dropped.
+    Copies of `base`, the experts, run in parallel on the same observations. Every
+    `every` steps a new expert starts, which has learned nothing yet. The $i$-th expert
+    expires after `every` $(4 \cdot 2^k + 1)$ steps, where $2^k$ is the largest power of
+    two that divides $i$. So there is always an expert that started shortly after any
+    change. The first expert never expires. If no slot is free, the expert that would
+    expire next is dropped.
 
-    The weights follow the counterfactual losses,
-    `p_i <- p_i exp(-rate (loss_i - mean loss) / spread)`, `spread` being the standard
-    deviation of the losses lately, so that their scale does not matter; then a
-    fraction `share` is distributed evenly over all active experts, so that each can
-    rise quickly.
+    The weights of the experts follow their counterfactual losses:
 
-    With `play="mix"` the control is `u = sum_i p_i u_i`. With `"switch"` it is that of
-    one expert, drawn again only with the probability by which its weight has fallen, so
-    that it seldom changes. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
+    $$p_i \leftarrow p_i \exp(-\mathrm{rate}\, (\ell_i - \bar \ell) / \sigma)$$
+
+    Here $\bar \ell$ is the mean loss under the weights, and $\sigma$ the standard
+    deviation of the recent losses, so the scale of the losses does not matter. Then a
+    fraction `share` of the total weight is distributed evenly over all active experts,
+    so that any of them can rise quickly.
+
+    With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` it is
+    the control of one expert, which seldom changes: a new one is drawn only with the
+    probability by which its weight has fallen. With [`delucax.controllers.gpc`][] as
+    base, this is AdaGPC.
 
     **Arguments:**
 
-    - `base`: an [`delucax.AbstractLearner`][], such as one of
-        [`delucax.controllers.gpc`][].
-    - `slots`: the number of experts that are active at once, 8 by default.
-    - `every`: steps until the next expert begins, 64 by default.
-    - `rate`: of the weights, 0.5 by default.
-    - `share`: distributed evenly at each step, above 0 and at most 1; 0.02 by default.
+    - `base`: an [`delucax.AbstractLearner`][], such as [`delucax.controllers.gpc`][]
+        makes.
+    - `slots`: the largest number of active experts, 8 by default.
+    - `every`: the number of steps between the starts of two experts, 64 by default.
+    - `rate`: the rate of the weights, 0.5 by default.
+    - `share`: the fraction that is distributed evenly at each step, above 0 and at most
+        1; 0.02 by default.
     - `play`: `"mix"` (default) or `"switch"`.
 
     **Raises:** `ValueError` if `base` is not a learner or a number is out of its range;
-    when it is run with `"switch"`, if there is no key.
+    at run time with `"switch"`, if there is no random key.
 
     Source: Gradu, Hazan and Minasyan, 2020; Hazan and Seshadhri, 2009 (lifetimes);
     Herbster and Warmuth, 1998 (share); Geulen, Voecking and Winkler, 2010 (switching).
@@ -148,12 +154,12 @@ class Adaptive(AbstractController):
     def _reweighted(
         self, losses: Float[Array, " slots"], state: AdaptiveState
     ) -> AdaptiveState:
-        """New weights, up to a factor, and perhaps another choice, after a step."""
+        """The state with new weights, not normalised, and perhaps another choice."""
         old, alive = state.weights, state.weights > 0
-        # An empty slot holds a stale state, whose loss may not be finite.
+        # The loss of an empty slot may not be finite.
         losses = jnp.where(alive, losses, 0)
         played = old @ losses
-        # The mean of all losses at first, then an exponential one over `every` steps.
+        # A plain mean at first, then an exponential one over about `every` steps.
         fading = 1 / jnp.minimum(state.step + 1, self.every).astype(old.dtype)
         mean = state.mean + fading * (played - state.mean)
         variance = state.variance + fading * ((played - mean) ** 2 - state.variance)
@@ -163,7 +169,8 @@ class Adaptive(AbstractController):
         new = jnp.where(alive, old * jnp.exp(-self.rate * excess), 0)
         state = state._replace(mean=mean, variance=variance)
         if state.chosen is not None:
-            # Normalised so that no weight rises, as costs of at least 0 would have it.
+            # Relative to the best expert, so that no weight rises, as it would be with
+            # losses of at least 0.
             best = jnp.min(jnp.where(alive, excess, jnp.inf))
             kept = jnp.exp(-self.rate * (excess[state.chosen] - best))
             state = self._rechosen(new, kept, state)
@@ -172,30 +179,29 @@ class Adaptive(AbstractController):
     def _rechosen(
         self, weights: Array, kept: ArrayLike, state: AdaptiveState
     ) -> AdaptiveState:
-        """Keep the expert that is followed with probability `kept`."""
+        """The state with the same choice with probability `kept`, else with another."""
         assert state.key is not None and state.chosen is not None
         key, toss, draw = jr.split(state.key, 3)
         stays = jr.uniform(toss) < kept
-        # An empty slot has the weight 0, whose logarithm, -inf, is never drawn.
+        # An empty slot has weight 0, so its logarithm is -inf and it is never drawn.
         other = jr.categorical(draw, jnp.log(weights)).astype(state.chosen.dtype)
         return state._replace(chosen=jnp.where(stays, state.chosen, other), key=key)
 
     def _renewed(self, state: AdaptiveState) -> AdaptiveState:
-        """After births and deaths."""
+        """The state after new experts have started and old ones expired."""
         step, ends = state.step, state.ends
         is_birth, births = step % self.every == 0, jnp.maximum(step // self.every, 1)
-        # An empty slot ended before any that lives, so it comes first.
+        # The slot that expires first. An empty one has expired before all others.
         slot = jnp.argmin(ends)
-        # `births & -births` is the largest power of two that divides it.
-        # The lifetimes of Hazan and Seshadhri, 2009: of so many births only about their
-        # logarithm live at a time, some of them young and some old.
+        # `births & -births` is the largest power of two that divides it. With these
+        # lifetimes (Hazan and Seshadhri, 2009), about log(births) experts are active.
         life = self.every * (4 * (births & -births) + 1)
         newborn = is_birth & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)
         old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
 
         def renewed(leaf, before, after):
-            # Write the leaves that a birth changes alone: most stay as they are.
+            # Only leaves that a start changes are written. Most stay the same.
             if after is before:
                 return leaf
             mask = newborn.reshape((-1,) + (1,) * (leaf.ndim - 1))
@@ -207,8 +213,8 @@ class Adaptive(AbstractController):
         kept = alive & ~newborn
         weights = jnp.where(kept, state.weights, 0)
         weights = weights / jnp.sum(weights)
-        # Herbster and Warmuth's share: no weight falls below share / (number alive), so
-        # an expert that becomes the best leads after some log(1 / share) / rate steps.
+        # No weight falls below share / (number of active experts), so a new best expert
+        # leads after about log(1 / share) / rate steps (Herbster and Warmuth, 1998).
         weights = (1 - self.share) * weights + self.share * (alive / jnp.sum(alive))
         weights = weights.astype(state.weights.dtype)
         state = state._replace(experts=experts, ends=ends, weights=weights)

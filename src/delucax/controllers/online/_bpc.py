@@ -1,4 +1,4 @@
-"""Learning from the cost alone."""
+"""An online learner that observes only the cost."""
 
 import functools
 from typing import NamedTuple
@@ -24,12 +24,12 @@ from ._policy import LinearPolicy
 class BPCState(NamedTuple):
     """The state of a `BPC`.
 
-    - `loop`: of the plant and the base controller.
-    - `theta`: what has been learned, and `optimiser`, the state of the optimiser.
-    - `tried`: the unit directions that theta was moved in, newest first.
-    - `level`: the running mean of the cost, and `steps`, how many it is of.
-    - `key`: of the next direction.
-    - `refused`: how many updates were not finite, and so were not made.
+    - `loop`: the state of the plant and the base controller.
+    - `theta`: what has been learned. `optimiser`: the state of the optimiser.
+    - `tried`: the last unit directions in which theta was moved, newest first.
+    - `level`: the mean of the costs so far. `steps`: their number.
+    - `key`: the random key of the next direction.
+    - `refused`: the number of updates that were refused, because they were not finite.
     """
 
     loop: ClosedLoopState
@@ -43,39 +43,41 @@ class BPCState(NamedTuple):
 
 
 class BPC(AbstractController):
-    """The bandit perturbation controller, which observes the scalar cost of each step,
+    r"""The bandit perturbation controller, which learns from observed costs alone.
 
-    `u_t = base(y_t) + (theta_t + delta e_t) s`, `e_t` uniform on the unit sphere,
+    $$u_t = \mathrm{base}(y_t) + (\theta_t + \delta e_t)\, s_t$$
 
-    with s the last disturbances (nature's outputs where the state is not observed).
-    After the step theta moves against
+    The direction $e_t$ is uniform on the unit sphere. The signal $s_t$ is the last
+    disturbances, or nature's outputs if the state is not observed. After each step,
+    theta moves against
 
-    `g_t = (d / delta) (c_t - level_t) sum_{i < horizon} e_{t-i}`,
+    $$g_t = \frac{d}{\delta} (c_t - \bar c_t) \sum_{i < \mathrm{horizon}} e_{t-i}$$
 
-    an estimate of the gradient of the cost that a fixed theta would have had, in
-    dimension d; `level_t` is the mean of the costs before, which changes no expectation
-    and takes most of the variance away. Its regret grows as `T^(3/4)`.
+    This estimates the gradient of the cost that a fixed theta of dimension $d$ would
+    have had. $\bar c_t$ is the mean of the previous costs. It reduces the variance, and
+    does not change the expectation. The regret grows as $T^{3/4}$.
 
     **Arguments:**
 
-    - `dynamics`: the model, which recovers the disturbances.
-    - `base`: a controller that stabilises the dynamics, such as
+    - `dynamics`: the model, from which the disturbances are computed.
+    - `base`: a controller that stabilises the dynamics, such as an
         [`delucax.controllers.LQR`][].
-    - `memory`: the number of past values of the signal, 5 by default: each adds a
-        dimension to search.
-    - `horizon`: the number of steps whose directions enter the gradient, 5 by default.
-    - `delta`: the size of the directions tried; by default 0.2 over the size of the
-        first response of the observation to a unit of control.
-    - `learning_rate`: scales the optimiser's step; by default 0.05 over the same size.
+    - `memory`: the number of past values of the signal, 5 by default. Each value adds
+        dimensions to the search.
+    - `horizon`: the number of past directions in the gradient, 5 by default.
+    - `delta`: $\delta$, the size of the directions. By default 0.2 divided by the size
+        of the first response of the observation to a unit of control.
+    - `learning_rate`: the scale of the optimiser's step; 0.05 divided by the same size
+        by default.
     - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
         default.
-    - `radius`: theta is kept inside this ball in the Frobenius norm, by default 50 over
-        the same size.
+    - `radius`: the largest Frobenius norm of theta; 50 divided by the same size by
+        default.
 
-    **Attributes:** `policy.start`, the first theta, trainable, zero.
+    **Attributes:** `policy.start`, the initial theta, trainable; zero at first.
 
-    **Raises:** `ValueError` if the base does not stabilise the dynamics or does not fit
-    them, or a number is out of its range; when it is run, if there is no key.
+    **Raises:** `ValueError` if `base` does not stabilise the dynamics or does not fit
+    them, or a number is out of its range; at run time, if there is no random key.
 
     Source: Gradu, Hallman and Hazan, 2020.
 
@@ -117,7 +119,7 @@ class BPC(AbstractController):
         where = "BPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         memory = check_count(memory, "memory", where)
-        # Long enough for the response to a control to reach any state.
+        # After `state_size` steps, a control can have reached any state.
         loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
         scale = functools.partial(in_first_responses, loop, where)
         start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
@@ -134,7 +136,7 @@ class BPC(AbstractController):
 
     @property
     def learns_from_cost(self) -> bool:
-        """True: the cost is all that it observes."""
+        """True: the controller learns from the cost alone."""
         return True
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
@@ -154,7 +156,7 @@ class BPC(AbstractController):
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         key, now = jr.split(state.key)
         direction = jr.normal(now, state.theta.shape, self.loop.dtype)
-        # A normal vector over its length is uniform on the sphere (Muller, 1959).
+        # A normal vector divided by its length is uniform on the sphere (Muller, 1959).
         direction = direction / safe_norm(direction, axis=None)
         theta = state.theta + self.delta * direction
         policy = lambda features: self.policy(theta, features)
@@ -166,12 +168,12 @@ class BPC(AbstractController):
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         cost = cost.astype(state.level.dtype)
         steps = state.steps + 1
-        # The first cost has nothing to be compared with.
+        # There is no mean to compare the first cost with.
         off = jnp.where(state.steps > 0, cost - state.level, 0)
         size = state.theta.size
         # The one-point estimate of Flaxman, Kalai and McMahan (2005): the mean of
         # (d / delta) c(theta + delta e) e over the sphere is the gradient of c smoothed
-        # over the ball. A cost counts for all directions whose effect may still last.
+        # over the ball. The cost depends on all directions of the last steps.
         gradient = size / self.delta * off * jnp.sum(state.tried, axis=0)
         return projected_step(self, gradient.astype(state.theta.dtype), state)._replace(
             loop=self.loop.applied(u, cost, state.loop),

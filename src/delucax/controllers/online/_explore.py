@@ -1,4 +1,4 @@
-"""Control of a plant that is not known."""
+"""Online control of an unknown plant."""
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY
@@ -21,15 +21,15 @@ from ._closed_loop import shift
 
 
 class ExploreState(NamedTuple):
-    """The state of an exploring controller.
+    """The state of an `Explore` controller.
 
-    - `step`: how many steps were made.
+    - `step`: the number of steps so far.
     - `excitations`: the last random controls, newest first.
-    - `moments`: of the state with the random control j + 1 steps before, summed up,
-      shape `(order + 1, n, m)`.
-    - `model`: the dynamics that were identified, and `arrays`, the controller made for
-      them; `inner` is its state.
-    - `key`: of the next random control.
+    - `moments`: sums of the products of the state and the random control `j + 1` steps
+        before, shape `(order + 1, n, m)`.
+    - `model`: the identified dynamics. `arrays`: those of the controller for them.
+        `inner`: the state of that controller.
+    - `key`: the random key of the next control.
     """
 
     step: Int[Array, ""]
@@ -42,35 +42,36 @@ class ExploreState(NamedTuple):
 
 
 class Explore(AbstractController):
-    """Explore, identify, then control: an online learner for an unknown linear plant.
+    r"""Explore, identify, then control: an online learner for an unknown linear plant.
 
-    For `steps` steps the control is `u_t = -K x_t + scale e_t`, the entries of e random
-    signs. Their correlation with the states that follow does not depend on what the
-    disturbances are, even if an adversary chose them:
+    In the first `steps` steps the control is $u_t = -K x_t + a\, e_t$, where the
+    entries of $e_t$ are random signs. The correlation of $e_t$ with the states that
+    follow does not depend on the disturbances, even if an adversary chooses them:
 
-    `N_j = mean over t of x_{t+j+1} e_t' / scale`, which tends to `(A - BK)^j B`,
+    $$N_j = \tfrac1a \operatorname{mean}_t\, x_{t+j+1} e_t^\top \to (A - B K)^j B$$
 
-    `B = N_0`, and `A - BK` is the least-squares solution of
-    `(A - BK) [N_0 ... N_{order-1}] = [N_1 ... N_order]`. From then on the controller
-    that `build` makes for `x_next = A x + B u` is used. With
-    [`delucax.controllers.gpc`][] and `steps` near `T^(2/3)`, its regret over T steps
-    grows as `T^(2/3)`.
+    So $B = N_0$, and $A - B K$ is the least-squares solution of
+
+    $$(A - B K)\, [N_0 \cdots N_{q-1}] = [N_1 \cdots N_q]$$
+
+    After that the control comes from the controller that `build` makes for
+    $x_{t+1} = A x_t + B u_t$. With [`delucax.controllers.gpc`][] and `steps` near
+    $T^{2/3}$, the regret over $T$ steps grows as $T^{2/3}$.
 
     **Arguments:**
 
-    - `build`: a function that makes a controller for a given
-        [`delucax.LinearDynamics`][]. It is called under `jax.jit`: a learner needs its
-        `horizon` given.
-    - `K`: a gain that stabilises the plant, shape `(m, n)`; zero for one that is stable
-        by itself.
-    - `steps`: of exploration.
-    - `scale`: the size of the random controls, 1 by default.
-    - `order`: how many steps of the response are compared, n by default: as many as it
-        takes to move the state anywhere.
+    - `build`: a function that makes a controller for a [`delucax.LinearDynamics`][]. It
+        is called under `jax.jit`, so a learner in it must be given its `horizon`.
+    - `K`: a gain that stabilises the plant, shape `(m, n)`; zero if the plant is stable
+        without control.
+    - `steps`: the number of steps of exploration.
+    - `scale`: $a$, the size of the random controls, 1 by default.
+    - `order`: $q$, the number of steps of the response that are compared. By default
+        `n`, which is enough to move the state anywhere.
     - `dt`: the control interval, 1 by default.
 
     **Raises:** `ValueError` if `build` does not make a controller, `K` is not a matrix
-    or a number is out of its range; when it is run, if there is no key.
+    or a number is out of its range; at run time, if there is no random key.
 
     Source: Hazan, Kakade and Singh, 2020; Chen and Hazan, 2021.
 
@@ -116,7 +117,7 @@ class Explore(AbstractController):
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
         own = check_key(key, "Explore.init")
         (m, n), dtype = self.K.shape, self.K.dtype
-        # A placeholder, for the structure of the state; stable, so that designs exist.
+        # A placeholder for the structure of the state. It is stable, so designs exist.
         A, B = jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype)
         model = LinearDynamics(A, B, dt=self.dt)
         arrays, inner = self._designed(model)
@@ -134,9 +135,8 @@ class Explore(AbstractController):
         if y.shape != self.K.shape[1:]:
             raise wrong_observation(self, self.K.shape[1], y)
         dtype, y = y.dtype, y.astype(self.K.dtype)
-        # Row j of the excitations is that of j + 1 steps ago.
-        # Signs e have E[e e'] = I and are independent of the past: x e' has the mean of
-        # the response alone, whatever the disturbances.
+        # Signs e have E[e e'] = I and are independent of all else, so the mean of x e'
+        # is the response, for any disturbances. Row j is from j + 1 steps ago.
         moments = y[:, None] * state.excitations[:, None, :] / self.scale**2
         exploring = state.step < self.steps
         moments = jnp.where(exploring, state.moments + moments, state.moments)
@@ -160,24 +160,23 @@ class Explore(AbstractController):
         return state._replace(inner=inner, step=state.step + 1)
 
     def _identified(self, state: ExploreState) -> ExploreState:
-        # Lag j was observed j steps fewer.
+        # There are j fewer observations of lag j.
         counts = self.steps - 1 - jnp.arange(self.order + 1)
         N = state.moments / counts[:, None, None].astype(state.moments.dtype)
         before = jnp.concatenate(list(N[:-1]), axis=1)
         after = jnp.concatenate(list(N[1:]), axis=1)
         gram = before @ before.T
-        # A direction that was not excited is left as it is.
+        # Regularised, for directions that were not excited.
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
         gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
-        # F = N_after N' (N N')^-1, the least squares of F N = N_after.
         closed_loop = solve(gram, before @ after.T).T
-        # What was identified is A - B K, the plant under the gain: B K is added back.
+        # A = (A - B K) + B K.
         model = LinearDynamics(closed_loop + N[0] @ self.K, N[0], dt=self.dt)
         arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)
 
     def _designed(self, model: LinearDynamics) -> tuple[PyTree, PyTree]:
-        """The arrays of the controller for a model, and its state."""
+        """The arrays of the controller for a model, and its initial state."""
 
         @eqx.filter_jit
         def design(model):
@@ -185,13 +184,15 @@ class Explore(AbstractController):
             check_controller(controller, "what build makes", "Explore")
             return eqx.filter(controller, eqx.is_array), controller.init(key=None)
 
-        # A weak type would change in the loop, where `cond` wants one type.
+        # `lax.cond` needs the same types in both branches: none may be weak.
         strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731
         return jax.tree.map(strong, design(model))
 
     def _controller(self, state: ExploreState) -> AbstractController:
-        """The controller of the arrays in the state. All else that it consists of is
-        the same for every model."""
+        """The controller with the arrays in the state.
+
+        All else in it is the same for every model.
+        """
         build = lambda model: eqx.filter(self.build(model), eqx.is_array, inverse=True)
         return eqx.combine(state.arrays, eqx.filter_eval_shape(build, state.model))
 

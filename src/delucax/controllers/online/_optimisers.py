@@ -1,4 +1,4 @@
-"""The steps of online learners."""
+"""The optimisers of online learners."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,15 +14,17 @@ from ..._check import check_positive
 
 
 def projected_step(owner: Any, gradient: PyTree, state: Any, **extra: Any) -> Any:
-    """The state of a learner (`owner`) whose `theta` and `optimiser` have made a step;
-    where that is not finite, they stay as they are and the step is counted as
-    `refused`. `extra` is for the optimisers that take more than a gradient."""
+    """The state of a learner (`owner`) after a step of its optimiser and a projection.
+
+    If the result is not finite, `theta` and `optimiser` stay the same, and the step is
+    counted in `refused`. `extra` holds further arguments for the optimiser.
+    """
     optimiser = optax.with_extra_args_support(owner.optimiser)
     rate = extra["learning_rate"] = owner.learning_rate
     before = state.theta, state.optimiser
     step, after = optimiser.update(gradient, state.optimiser, state.theta, **extra)
     add = lambda old, step: old + (rate * step).astype(old.dtype)
-    # Projected after the step (Zinkevich, 2003): the bound on the regret needs the set.
+    # The projection is needed for the bound on the regret (Zinkevich, 2003).
     new = owner.policy.project(jax.tree.map(add, state.theta, step)), after
     floats = jax.tree.leaves(eqx.filter(new, eqx.is_inexact_array))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
@@ -41,8 +43,7 @@ def _adagrad_norm_update(
     updates: Any, state: Any, params: Any = None
 ) -> tuple[PyTree, Array]:
     del params
-    # One step size for all weights, from a sum that includes this gradient: so no step
-    # is longer than the learning rate, not even the first.
+    # The sum includes this gradient, so that no step is longer than the learning rate.
     total = state + optax.tree.norm(updates, squared=True)
     some = total > 0
     scale = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, total, 1)), 0)
@@ -53,16 +54,16 @@ _ADAGRAD_NORM = optax.GradientTransformation(_adagrad_norm_init, _adagrad_norm_u
 
 
 def adagrad_norm() -> optax.GradientTransformation:
-    r"""Gradient descent whose step does not depend on the scale of the loss,
+    r"""Gradient descent whose step does not depend on the scale of the loss.
 
-    `theta_next = theta - learning_rate g_t / sqrt(sum_{s <= t} |g_s|^2)`,
+    $$\theta_{t+1} = \theta_t - \eta\, \frac{g_t}{\sqrt{\sum_{s \le t} |g_s|^2}}$$
 
-    with `learning_rate` that of the learner. With convex losses and a set of diameter D
-    its regret is at most `(D^2 / (2 learning_rate) + learning_rate) sqrt(sum |g|^2)`,
-    without knowing how large gradients will be or how many there are.
+    Here $\eta$ is the `learning_rate` of the learner. For convex losses and a set of
+    diameter $D$, the regret is at most $(D^2 / (2 \eta) + \eta) \sqrt{\sum_t |g_t|^2}$.
+    The optimiser needs to know neither the size nor the number of the gradients.
 
-    **Returns:** an `optax.GradientTransformation`, the same at each call, so that two
-    learners share what was compiled.
+    **Returns:** an `optax.GradientTransformation`. Each call returns the same object,
+    so learners with it share compiled code.
 
     Source: Streeter and McMahan, 2010; Ward, Wu and Bottou, 2019.
 
@@ -83,8 +84,12 @@ def adagrad_norm() -> optax.GradientTransformation:
 
 
 class OnlineNewtonState(NamedTuple):
-    """A root of the inverse of the curvature so far with its prior; the sum of the
-    traces of what was added to it, and how many times something was."""
+    """The state of `online_newton`.
+
+    - `root`: a root of the inverse of the prior plus the curvature so far.
+    - `total`: the sum of the traces of the curvatures that were added.
+    - `count`: how many of them were not zero.
+    """
 
     root: Float[Array, "d d"]
     total: Float[Array, ""]
@@ -98,7 +103,7 @@ def _online_newton_init(params: PyTree) -> OnlineNewtonState:
 
 
 class _OnlineNewtonUpdate(eqx.Module):
-    """A module, so that it can be saved and two for one prior are equal."""
+    """A module, so that it can be saved, and two with the same prior are equal."""
 
     prior: float = eqx.field(static=True)
 
@@ -115,39 +120,38 @@ class _OnlineNewtonUpdate(eqx.Module):
         del params, others
         if curvature is None:
             raise ValueError(
-                "online_newton: update must be given the curvature of the loss, which "
-                "OnlineLearner knows and BPC, which sees the cost alone, does not."
+                "online_newton: update must be given the curvature of the loss. An "
+                "OnlineLearner knows it, but BPC, which sees only the cost, does not."
             )
         gradient, unravel = ravel_pytree(updates)
         factor = curvature()
         root, total, count = state
         size = jnp.sum(factor**2)
-        # Where this update is larger than all before it by 1 / sqrt(eps), they would be
-        # lost in rounding: start anew.
+        # If this update is larger than the total so far by 1 / sqrt(eps), the total
+        # would be lost in rounding, so start again.
         first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
         total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
         new_total, new_count = total + size, count + (size > 0)
-        # Until the prior is outweighed it is worth `prior` of the average step so far.
+        # In the first `prior` steps, rescale the prior to `prior` average steps so far.
         mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
         early = (size > 0) & (count > 0) & (count < self.prior)
-        # The prior: a multiple of the identity with the trace of `prior` average
-        # updates.
+        # The prior is a multiple of the identity, with the trace of `prior` updates.
         fresh = gradient.size / (self.prior * jnp.where(first, size, 1))
         fresh = jnp.sqrt(fresh) * jnp.eye(gradient.size, dtype=gradient.dtype)
         after = jnp.where(early, mean(new_total, new_count), 1)
         scale = jnp.sqrt(jnp.where(early, mean(total, count) / after, 1))
         root = jnp.where(first, fresh, scale * root)
-        # Sherman and Morrison's P - P c c'P / (1 + c'P c) for each column c, on a root
-        # of P: Potter's form stays positive whatever the rounding.
+        # Sherman and Morrison's P - P c c'P / (1 + c'P c) for each column c. Potter's
+        # form, on a root of P, stays positive despite rounding.
         for column in factor.T:
             along = column @ root
             gain = 1 + along @ along
             root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
-        # P g = root root' g. `projected_step` multiplies by the learning rate, but
-        # Newton's step has a length of its own: it is divided out.
+        # P g = root root' g. Divided by the learning rate, because `projected_step`
+        # multiplies by it, but Newton's step has a length of its own.
         step = root @ (gradient @ root) / learning_rate
-        # A trust region of radius 1 (times the learning rate): early curvature is a
-        # guess.
+        # A trust region of radius 1 (times the learning rate), because the curvature of
+        # the first steps is a guess.
         squared = jnp.sum(step**2)
         long = squared > 1
         step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
@@ -155,29 +159,34 @@ class _OnlineNewtonUpdate(eqx.Module):
 
 
 def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
-    r"""Newton's step with all the curvature so far,
+    r"""Newton's method online, with the curvature of all losses so far.
 
-    `theta_next = theta - P_t g_t`, `P_t^-1 = prior c I + sum_{s <= t} J_s' H_s J_s`,
+    $$\theta_{t+1} = \theta_t - P_t g_t, \qquad
+    P_t^{-1} = n c I + \sum_{s \le t} J_s^\top H_s J_s$$
 
-    no longer than `learning_rate`, that of the learner. J_s is the derivative of the
-    observation and control of step s by theta, H_s the curvature of the cost at them
-    (its positive part, where the cost is not convex), and c the mean curvature of a
-    weight over the first `prior` steps that have any: so the prior weighs as much as
-    that many steps, whatever the scales of cost, disturbance and weights. With
-    quadratic costs it is recursive least squares, and its regret grows as `log(T)`.
+    A step is at most as long as the `learning_rate` of the learner. $J_s$ is the
+    derivative of the observation and control of step $s$ with respect to $\theta$.
+    $H_s$ is the curvature of the cost at them, or its positive part if the cost is not
+    convex. $c$ is the mean curvature per weight over the first $n$ steps that have any.
+    So the prior weighs as much as $n$ steps, for any scale of cost, disturbance and
+    weights.
 
-    Only an [`delucax.controllers.OnlineLearner`][] can use it: it hands the curvature
-    over. The state has a number for each pair of weights, and a step takes as many
-    operations.
+    With quadratic costs this is recursive least squares, and its regret grows as
+    $\log T$.
 
-    **Arguments:** `prior`: steps, 100 by default. A small one learns fast where the
-    features are much alike, a large one keeps noise out of what is learned.
+    Only an [`delucax.controllers.OnlineLearner`][] can use it, because it provides the
+    curvature. The memory and the time of a step grow with the square of the number of
+    weights.
 
-    **Returns:** an `optax.GradientTransformationExtraArgs`; those of one prior are
-    equal, so that two learners share what was compiled.
+    **Arguments:** `prior`: $n$, the weight of the prior in steps, 100 by default. A
+    small one learns fast if the features are similar to each other. A large one keeps
+    noise out of what is learned.
 
-    **Raises:** `ValueError` if `prior` is not positive; when it is used, if it is not
-    given the curvature.
+    **Returns:** an `optax.GradientTransformationExtraArgs`. Those with the same prior
+    are equal, so learners with them share compiled code.
+
+    **Raises:** `ValueError` if `prior` is not positive; when it is used without a
+    curvature.
 
     Source: Simchowitz, 2020; Hazan, Agarwal and Kale, 2007; Potter, 1963 (the form).
 
@@ -200,13 +209,15 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
 
 
 def positive_root(H: Float[Array, "z z"]) -> Float[Array, "z z"]:
-    """The Cholesky factor of the positive part of a symmetric matrix; columns that
-    have no positive pivot are zero."""
-    # Pivots below are rounding, and their square roots would be noise.
+    """The Cholesky factor of the positive part of a symmetric matrix.
+
+    A column without a positive pivot is zero.
+    """
+    # A smaller pivot is rounding, and its square root would be noise.
     slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)
 
-    # Cholesky's factorisation column by column, in Python: the sizes are those of y and
-    # u, and a pivot that is not positive is left out instead of making NaN.
+    # Column by column in Python, because the matrix is small and a pivot that is not
+    # positive must be left out, not give NaN.
     columns = []
     for j in range(len(H)):
         pivot = H[j, j]

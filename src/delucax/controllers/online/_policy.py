@@ -1,4 +1,4 @@
-"""The policies that are learned: maps from features to controls."""
+"""The policies that an online learner learns: maps from features to controls."""
 
 import abc
 
@@ -17,19 +17,19 @@ from ._closed_loop import ClosedLoop
 
 
 _FUSED = 8192
-"""Products of up to so many terms are one loop, not a call of a library each step."""
+"""Up to this size, a sum of products compiles to one loop, which is faster."""
 
 
 class AbstractPolicy(eqx.Module):
-    """A family of maps `v = policy(theta, features)` and the set that `theta` is in."""
+    """A family of maps `v = policy(theta, features)`, and a set of allowed `theta`."""
 
     @abc.abstractmethod
     def init(self) -> PyTree:
-        """The first `theta`."""
+        """The initial `theta`."""
 
     @abc.abstractmethod
     def at(self, theta: PyTree) -> "AbstractPolicy":
-        """The same family, starting with `theta`."""
+        """The same family, with `theta` as the initial one."""
 
     @abc.abstractmethod
     def __call__(
@@ -39,7 +39,7 @@ class AbstractPolicy(eqx.Module):
 
     @abc.abstractmethod
     def project(self, theta: PyTree) -> PyTree:
-        """The nearest point of the set."""
+        """The nearest allowed `theta`."""
 
     def pull_back(
         self,
@@ -47,15 +47,17 @@ class AbstractPolicy(eqx.Module):
         response: Float[Array, "h o m"],
         features: Float[Array, "h f"],
     ) -> Float[Array, "o weights"]:
-        """The derivative by theta, in one row, of `sum_h response_h v_h`, with `v_h`
-        the control for the features of step h."""
+        """The derivative of `sum_h response_h v_h` with respect to theta, in one row.
+
+        Here `v_h` is the control for the features of step `h`.
+        """
         flat, unravel = ravel_pytree(theta)
 
         def outcome(flat):
             v = jax.vmap(self, in_axes=(None, 0))(unravel(flat), features)
             return jnp.einsum("hom,hm->o", response, v)
 
-        # Few outcomes, many weights: reverse mode.
+        # Reverse mode, because there are few outcomes and many weights.
         return jax.jacrev(outcome)(flat)
 
 
@@ -91,7 +93,7 @@ class LinearPolicy(AbstractPolicy):
 
 
 class NetworkPolicy(AbstractPolicy):
-    """`v = network(features)`, where `theta` are the network's weights."""
+    """`v = network(features)`, where `theta` is the weights of the network."""
 
     start: eqx.nn.MLP = weight()
 
@@ -109,11 +111,11 @@ class NetworkPolicy(AbstractPolicy):
 
 
 class FixedPolicy(AbstractController):
-    """The policy of an online learner, held fixed,
+    r"""The policy of an online learner, which no longer learns.
 
-    `u_t = base(y_t) + policy(theta, features_t)`.
+    $$u_t = \mathrm{base}(y_t) + \mathrm{policy}(\theta, \phi_t)$$
 
-    `learner.fixed(theta)` makes it.
+    Here $\phi_t$ are the features. `learner.fixed(theta)` makes one.
     """
 
     loop: ClosedLoop
