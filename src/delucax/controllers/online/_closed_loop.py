@@ -1,4 +1,4 @@
-"""The plant under its base controller, on top of which a learner acts."""
+"""The closed loop of a plant and a base controller, to which a learner adds."""
 
 import math
 from collections.abc import Callable
@@ -24,21 +24,21 @@ from .._output_feedback import LQG
 
 
 _AFFINE = (Zero, Constant, Linear, LQR, LQI, LQG, HInfinity)
-"""Controllers whose control and state depend on the observation by an affine map that
-is the same at all times."""
+"""Controllers whose control and next state are an affine map of the observation and the
+state, the same map at all times."""
 _IMPULSE_DECAY, _HORIZON_RANGE = 0.03, (10, 1000)
-"""What is left of an impulse at the end of a roll-out, and the shortest and longest."""
+"""The part of an impulse that is left after the default horizon, and its limits."""
 _MEMORY_DECAY, _MEMORY_RANGE = 0.1, (10, 50)
-"""The same of the default memory. A longer policy gains a little, and costs more to
-learn: under noise it is worse."""
+"""The part that is left after the default memory, and its limits. A longer memory gains
+little, and takes longer to learn. Under noise it is worse."""
 
 
 class Tangents(NamedTuple):
-    """Derivatives of one step of the closed loop.
+    """The derivatives of one step of the closed loop.
 
-    With `z` the state of the plant and that of the base controller, and `v` what is
-    added to the base's control: `z_next = transition z + input v`, and the observation
-    and the base's control are `output z`.
+    With `z` the state of the plant and of the base controller, and `v` the added
+    control: `z_next = transition z + input v`. The observation and the control of the
+    base are `output z`.
     """
 
     transition: Float[Array, "*T q q"]
@@ -50,17 +50,17 @@ class ClosedLoopState(NamedTuple):
     """The state of the closed loop.
 
     - `base`: the state of the base controller.
-    - `t`, `y`, `u_base`: of the current step.
-    - `started`: whether a step was made.
-    - `signal`: its last values, newest first.
-    - `predicted`: the state to which the model went without a disturbance; `None` if
-      the state is not observed.
-    - `added`: what was added to the base's control, newest first.
-    - `forced`: the forced response, the state that those controls alone have brought
-      about; `None` if the signal is not nature's output.
-    - `now`: the derivatives of the current step, and `impulses`: what is left, in the
-      state, of an impulse at each of the last steps. Both are `None` where they are the
-      same at all times.
+    - `t`, `y`, `u_base`: the time, observation and control of the base at this step.
+    - `started`: whether a step has been made.
+    - `signal`: the last values of the signal, newest first.
+    - `predicted`: the next state without a disturbance, by the model; `None` if the
+        state is not observed.
+    - `added`: the last added controls, newest first.
+    - `forced`: the forced response, which is the state due to the added controls alone;
+        `None` if the signal is not nature's output.
+    - `now`: the derivatives of this step. `impulses`: the responses of the state to an
+        impulse at each of the last steps. Both are `None` if they are the same at all
+        times.
     """
 
     base: Any
@@ -77,21 +77,24 @@ class ClosedLoopState(NamedTuple):
 
 
 class ClosedLoop(eqx.Module):
-    """A plant and the base controller that a learner adds its own control to.
+    """A plant and its base controller, to whose control a learner adds its own.
 
-    What a learner adds is a function of features: the last values of a signal that does
-    not depend on what was added, or filters of them, side by side in one vector.
+    The added control is a function of features. These are the last values of a signal
+    that does not depend on the added control, or filters of these values, in one
+    vector.
 
-    - `tangents`: the derivatives of a step, and `response`: that of the observation and
-      of the base's control to an impulse; `None` where they change.
-    - `first_response`: the size of the first change of the observation that a unit of
-      added control makes; `None` if the dynamics define no equilibrium.
-    - `filters`: shape `(f, memory)`, newest first; `None` for the values themselves.
-    - `horizon`: the length of the roll-out.
-    - `memory`: how many values of the signal are kept.
+    - `tangents`: the derivatives of a step. `response`: the response of the observation
+        and the control of the base to an impulse. Both are `None` if they change with
+        time.
+    - `first_response`: the size of the first response of the observation to a unit of
+        added control; `None` if the dynamics define no equilibrium.
+    - `filters`: shape `(f, memory)`, newest value first; `None` for the values
+        themselves.
+    - `horizon`: the length of the counterfactual roll-out.
+    - `memory`: the number of values of the signal that are kept.
     - `observed`: whether the observation is the state.
-    - `nature`: whether the signal is nature's output, that of the closed loop without
-      what the learner adds; otherwise it is the last disturbance.
+    - `nature`: whether the signal is nature's output, the observation that the closed
+        loop would give without the added control. Otherwise it is the last disturbance.
     """
 
     dynamics: AbstractDynamics
@@ -124,8 +127,8 @@ class ClosedLoop(eqx.Module):
         is_constant = is_lti and isinstance(base, _AFFINE)
         if not is_constant and not self.observed:
             raise ValueError(
-                f"{where}: where the state is not observed, dynamics must be linear "
-                "and time-invariant, and base an affine controller such as LQG; got "
+                f"{where}: if the state is not observed, dynamics must be linear and "
+                "time-invariant, and base an affine controller such as LQG, got "
                 f"{type(dynamics).__name__} and {type(base).__name__}."
             )
         tangents = _equilibrium_tangents(dynamics, base)
@@ -136,8 +139,8 @@ class ClosedLoop(eqx.Module):
         if filters is not None:
             memory = filters.shape[1]
         elif memory is None:
-            # Newton's step, for nature's outputs and for loops that change, pays for
-            # each number that it learns: there the memory is the shortest.
+            # Nature's outputs and loops that change use Newton's method, whose cost
+            # grows with the square of the weights: so their memory is the shortest.
             is_cheap = is_constant and not self.nature
             rate = radius if is_cheap and radius is not None else 0.0
             memory = _steps(rate, _MEMORY_DECAY, *_MEMORY_RANGE)
@@ -155,13 +158,13 @@ class ClosedLoop(eqx.Module):
             if self.response.shape[1:] != (p + m, m):
                 raise ValueError(
                     f"ClosedLoop: response must have shape (h, {p + m}, {m}), got "
-                    f"{self.response.shape}; build the learner anew for dynamics of "
-                    "another size."
+                    f"{self.response.shape}. For dynamics of another size, make a new "
+                    "learner."
                 )
 
     @property
     def dtype(self) -> Any:
-        """The precision of the state."""
+        """The dtype of the state."""
         arrays = jax.tree.leaves(eqx.filter(self.dynamics, eqx.is_inexact_array))
         return jnp.result_type(*arrays) if arrays else jnp.zeros(()).dtype
 
@@ -172,7 +175,7 @@ class ClosedLoop(eqx.Module):
         return count * self.dynamics.observation_size
 
     def init(self, key: Any, horizon: int) -> ClosedLoopState:
-        """Before the first step; `horizon` is 0 without counterfactuals."""
+        """The state before the first step. `horizon` is 0 without counterfactuals."""
         dynamics, dtype = self.dynamics, self.dtype
         n, m, p = dynamics.state_size, dynamics.control_size, dynamics.observation_size
         base = self.base.init(key=key)
@@ -202,8 +205,8 @@ class ClosedLoop(eqx.Module):
         state: ClosedLoopState,
         policy: Callable[[Array], Array],
     ) -> tuple[Float[Array, " f"], Float[Array, " m"], ClosedLoopState]:
-        """The features of this step, what `policy` adds for them, and the state with
-        the base's control and the derivatives of the step."""
+        """The features of this step, the control that `policy` adds, and the new
+        state."""
         if y.shape != state.y.shape:
             raise wrong_observation(owner, state.y.shape[0], y)
         t, y, before = jnp.asarray(t, self.dtype), y.astype(self.dtype), state.base
@@ -218,12 +221,12 @@ class ClosedLoop(eqx.Module):
         return features, v, state._replace(signal=signal, now=now)
 
     def _disturbance(self, state: ClosedLoopState) -> Float[Array, " n"]:
-        """The last disturbance: the state less where the model went."""
+        """The last disturbance: the state minus the state that the model predicted."""
         assert state.predicted is not None
-        # w_{t-1} = x_t - F(x_{t-1}, u_{t-1}), an angle by the shorter way.
+        # w_{t-1} = x_t - F(x_{t-1}, u_{t-1}), with wrapped angles.
         off = self.dynamics.difference(state.y, state.predicted)
         size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
-        # The same step compiled twice may differ in rounding, which is no disturbance.
+        # A step that is compiled twice may differ in rounding, which is no disturbance.
         is_more = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
         return jnp.where(state.started & is_more, off, 0)
 
@@ -238,7 +241,7 @@ class ClosedLoop(eqx.Module):
     def applied(
         self, u: Float[Array, " m"], cost: Array, state: ClosedLoopState
     ) -> ClosedLoopState:
-        """After the step, with the control that was applied."""
+        """The state after the step, given the control that was applied."""
         u = u.astype(self.dtype)
         tangents: Any = self.tangents if state.now is None else state.now
         v = u - state.u_base
@@ -246,12 +249,11 @@ class ClosedLoop(eqx.Module):
         if predicted is not None:
             predicted, _ = self.dynamics.advance(state.t, state.y, u, None)
         if impulses is not None:
-            # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}: each
-            # is moved on by one step, so that no product is computed twice.
+            # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}. Each
+            # product is updated by one factor.
             impulses = shift(tangents.input, tangents.transition @ impulses)
         if forced is not None:
-            # With what was really applied, so that saturation does not look like a
-            # disturbance.
+            # With the applied control, so that clipping is not taken for a disturbance.
             forced = matvec(tangents.transition, forced) + matvec(tangents.input, v)
         return state._replace(
             base=self.base.applied(u, cost, state.base),
@@ -268,18 +270,19 @@ class ClosedLoop(eqx.Module):
         v_past: Float[Array, "h m"],
         state: ClosedLoopState,
     ) -> tuple[Float[Array, " p"], Float[Array, " m"]]:
-        """The observation and control of this step, had `v` been added at it and
-        `v_past` at the steps of the roll-out before, newest first."""
-        # Superposition: of a linear loop exact, else to first order about the true run.
-        # Only the difference from what was added counts, so that saturation and noise
-        # stay in.
+        """The observation and control of this step if other controls had been added.
+
+        These are `v` at this step, and `v_past` at the previous steps, newest first.
+        """
+        # Superposition, about the true run with its noise and clipped controls: exact for
+        # a linear loop, and otherwise to first order.
         change = jnp.einsum("hom,hm->o", self.past(state), v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
 
     def past(self, state: ClosedLoopState) -> Float[Array, "h o m"]:
-        """The response of observation and base's control to what was added at each step
-        of the roll-out, newest first."""
+        """The response of observation and base control to a control added at each past
+        step."""
         if self.response is not None:
             return self.response
         assert state.now is not None and state.impulses is not None
@@ -287,35 +290,37 @@ class ClosedLoop(eqx.Module):
 
 
 def shift(new: Array, history: Array) -> Array:
-    """A history, newest first, with its oldest entry dropped."""
+    """A history, newest first, with a new entry, and without its oldest one."""
     return jnp.concatenate([new[None], history])[: history.shape[0]]
 
 
 def in_first_responses(
     loop: ClosedLoop, where: str, given: ArrayLike | None, name: str, units: float
 ) -> Any:
-    """A step size or radius as given, or so many `units / first_response`: in units of
-    the control that undoes what was observed."""
+    """A step size or radius: the `given` one, or `units / first_response`.
+
+    One over the first response is the control that undoes a unit of the observation.
+    """
     if given is not None:
         check_step(given, where, name)
         return given
     if loop.first_response is None:
         raise ValueError(
-            f"{where}: {name} must be given, for dynamics that define no equilibrium."
+            f"{where}: {name} must be given, because dynamics define no equilibrium."
         )
     return _quotient(units, loop.first_response)
 
 
 @host_unless_traced
 def _quotient(units, size):
-    # Where a control never shows there is no unit; 1 keeps the quotient finite.
+    # If no control has an effect, there is no unit. 1 keeps the quotient finite.
     return units / xp.where(size > 0, size, xp.ones_like(size))
 
 
 def _check_control(
     dynamics: AbstractDynamics, base: AbstractController, where: str
 ) -> None:
-    """Raise unless a base controller gives a control that dynamics take."""
+    """Raise unless the base controller gives a control that fits the dynamics."""
     check_instance(base, AbstractController, "base", where)
     size = dynamics.observation_size
     act = lambda base: base(jnp.zeros(()), jnp.zeros(size), base.init(key=None))
@@ -323,18 +328,19 @@ def _check_control(
         u, _ = eqx.filter_eval_shape(act, base)
     except ValueError as error:
         raise ValueError(
-            f"{where}: base must take an observation of size {size}, as dynamics "
-            f"give; {error}"
+            f"{where}: base must take the observation of dynamics, of size {size}: "
+            f"{error}"
         ) from error
     if u.shape != (dynamics.control_size,):
         raise ValueError(
-            f"{where}: base must give a control of size {dynamics.control_size}, as "
-            f"dynamics take, got shape {u.shape}."
+            f"{where}: base must give a control of size {dynamics.control_size} for "
+            f"dynamics, got shape {u.shape}."
         )
 
 
 def _vector(state: Any) -> tuple[Array, Any]:
-    """The floating-point part of a controller's state as a vector, and the way back."""
+    """The floating-point part of a controller's state as a vector, and the inverse
+    map."""
     floats, rest = eqx.partition(state, eqx.is_inexact_array)
     vector, unravel = ravel_pytree(floats)
     return vector, lambda z: eqx.combine(unravel(z.astype(vector.dtype)), rest)
@@ -349,7 +355,7 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
         y = dynamics.observe(t, x)
         u, after = base(t, y, back(z[n:]))
         x_next, _ = dynamics.advance(t, x, u + v, None)
-        # The base learns what was applied, so that its anti-windup is part of the loop.
+        # With `applied`, so that the anti-windup of the base is part of the loop.
         after = base.applied(u + v, jnp.zeros((), x.dtype), after)
         z_next = jnp.concatenate([x_next, _vector(after)[0].astype(x.dtype)])
         return jnp.concatenate([z_next, y.astype(x.dtype), u.astype(x.dtype)])
@@ -362,8 +368,10 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
 def _equilibrium_tangents(
     dynamics: AbstractDynamics, base: AbstractController
 ) -> Tangents | None:
-    """The derivatives at the operating point, at each time if they depend on it; `None`
-    if the dynamics define no such point."""
+    """The derivatives at the operating point, or at each time if they depend on time.
+
+    `None` if the dynamics define no operating point.
+    """
     if isinstance(dynamics, LinearDynamics) and dynamics.is_time_varying:
         return _tangents_along(dynamics, base, dynamics.x_ref, dynamics.u_ref)
     try:
@@ -375,7 +383,7 @@ def _equilibrium_tangents(
 
 @eqx.filter_jit
 def _tangents_along(dynamics, base, x, u) -> Tangents:
-    """The derivatives at one point, or at one for each time."""
+    """The derivatives at one point, or at one point for each time."""
 
     def at(t, x, u):
         state = base.init(key=None)
@@ -390,21 +398,26 @@ def _tangents_along(dynamics, base, x, u) -> Tangents:
 
 @host_unless_traced
 def _responses(tangents, horizon, p):
-    """The response to an impulse, at first if it depends on time; and the size of its
-    first row that is not zero in the first `p` entries."""
+    """The response to an impulse, and the size of its first nonzero row.
+
+    The rows count in their first `p` entries. If the response depends on time, it is
+    that at the first step.
+    """
     transition, now, output = (M if M.ndim == 2 else M[0] for M in tangents)
-    # Markov parameters: row j is the response to an impulse j + 1 steps ago.
+    # Row j, a Markov parameter, is the response to an impulse j + 1 steps ago.
     step = lambda z, _: (transition @ z, output @ z)
     response = scan(step, now, xp.arange(horizon))[1]
     sizes = xp.sqrt(xp.sum(response[:, :p] ** 2, axis=(1, 2)))
-    # A control may take several steps to show; smaller responses are rounding.
+    # A control may need several steps to have an effect. Smaller rows are rounding.
     slack = xp.finfo(sizes.dtype).eps ** 0.5 * xp.max(sizes)
     return response, sizes[xp.argmax(sizes > slack)]
 
 
 def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> int:
-    """As given, or until an impulse has faded; raise unless the base stabilises the
-    plant."""
+    """The `horizon`, by default the number of steps until an impulse has faded.
+
+    It raises unless the base stabilises the plant.
+    """
     given = None if horizon is None else check_count(horizon, "horizon", where)
     if radius is not None and not radius < 1:
         raise ValueError(
@@ -415,30 +428,32 @@ def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> i
         return given
     if radius is None:
         raise ValueError(
-            f"{where}: horizon must be given inside a transformation of JAX, or for "
-            "dynamics that define no equilibrium: its default needs the closed loop."
+            f"{where}: horizon must be given inside a JAX transformation, or if "
+            "dynamics define no equilibrium, because its default needs the closed loop."
         )
     return _steps(radius, _IMPULSE_DECAY, *_HORIZON_RANGE)
 
 
 def _steps(radius: float, left: float, least: int, most: int) -> int:
-    """After how many steps no more than a part `left` is left, between limits."""
-    # radius^steps = left.
+    """The number of steps after which a part `left` is left, within limits."""
+    # Solves radius^steps = left.
     steps = math.log(left) / math.log(radius) if 0 < radius < 1 else 0
     return min(max(least, math.ceil(steps)), most)
 
 
 def _spectral_radius(tangents: Tangents) -> float | None:
-    """The largest spectral radius of what an added control can move; `None` if it is
-    traced."""
+    """The largest spectral radius of the states that an added control can move.
+
+    `None` if they are traced.
+    """
     if not (is_concrete(tangents.transition) and is_concrete(tangents.input)):
         return None
     q, m = tangents.input.shape[-2:]
     transitions = np.asarray(tangents.transition, float).reshape(-1, q, q)
     reached = np.any(np.asarray(tangents.input).reshape(-1, q, m) != 0, axis=(0, 2))
-    # The states that the added control reaches, as a graph: q sweeps suffice.
+    # Which states the added control reaches, in a graph: q sweeps are enough.
     for _ in range(q):
         reached = reached | np.any(transitions[..., reached] != 0, axis=(0, 2))
-    # States of the base that no control moves, such as a covariance, do not decay.
+    # Other states, such as a covariance in the base, need not decay.
     parts = transitions[:, reached][:, :, reached]
     return max(np.max(np.abs(np.linalg.eigvals(part)), initial=0) for part in parts)

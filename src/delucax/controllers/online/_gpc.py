@@ -1,4 +1,4 @@
-"""Learners by their features: the last values of a signal, or filters of them."""
+"""Online learners with different features: a signal's last values, or filters."""
 
 import functools
 import itertools
@@ -33,19 +33,20 @@ def gpc(
     optimiser: optax.GradientTransformation | None = None,
     radius: Any = None,
 ) -> OnlineLearner:
-    """The gradient perturbation controller,
+    r"""The gradient perturbation controller, which learns from past disturbances.
 
-    `u_t = base(x_t) + sum_{i=1..memory} E_i w_{t-i}`,
+    $$u_t = \mathrm{base}(x_t) + \sum_{i=1}^{\mathrm{memory}} E_i w_{t-i}, \qquad
+    w_{t-1} = x_t - F(t-1, x_{t-1}, u_{t-1})$$
 
-    with `w_{t-1} = x_t - F(t-1, x_{t-1}, u_{t-1})`, the disturbances so far, recovered
-    with the control that was applied. E follows the gradient of what each step would
-    have cost under it: see [`delucax.controllers.OnlineLearner`][]. Against the best
-    fixed E in hindsight its regret over T steps grows as `sqrt(T)`, whatever the
-    disturbances are.
+    The disturbances $w$ are computed from the states, with the controls that were
+    applied. The matrices $E$ follow the gradient of the cost that each step would have
+    had under them: see [`delucax.controllers.OnlineLearner`][]. Compared with the best
+    fixed $E$ in hindsight, the regret over $T$ steps grows as $\sqrt T$, for any
+    disturbances.
 
-    The dynamics are linear, time-varying or not, or any others that observe their
-    state; those are linearised along the way, and the disturbance is the residual of
-    the nonlinear map.
+    The dynamics may be linear, time-invariant or time-varying, or nonlinear with an
+    observed state. Nonlinear dynamics are linearised along the run. Their disturbance
+    is the residual of the nonlinear map.
 
     **Arguments:**
 
@@ -55,29 +56,27 @@ def gpc(
     - `base`: a controller that stabilises the dynamics; by default the
         [`delucax.controllers.LQR`][] for the curvature of the cost at the operating
         point.
-    - `memory`: the number of past disturbances; by default the least h, of 10 at least
-        and 50 at most, with `rho^h <= 0.1`, rho being the spectral radius of the closed
-        loop. It is 10 where dynamics are not linear and time-invariant, and inside a
-        transformation of JAX, where the loop cannot be seen.
-    - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
-        1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
-        loop.
-    - `learning_rate`: scales the optimiser's step; of Newton's method, the longest
-        step. By default `0.15 / |B|_F`, with `|B|` the size of what a unit of control
-        does to the state in a step.
-    - `optimiser`: an Optax transformation; by default
-        [`delucax.controllers.adagrad_norm`][] where dynamics are linear and
-        time-invariant, and otherwise [`delucax.controllers.online_newton`][]. Neither
-        needs a scale of the cost; the second learns faster, and a step of it takes ten
-        times as long.
-    - `radius`: E is kept inside this ball in the Frobenius norm, `50 / |B|_F` by
-        default.
+    - `memory`: the number of past disturbances. By default the smallest $h$ from 10 to
+        50 with $\rho^h \le 0.1$, where $\rho$ is the spectral radius of the closed
+        loop. It is 10 if `dynamics` are not linear and time-invariant, or inside a JAX
+        transformation, where the closed loop is not known.
+    - `horizon`: the length of the counterfactual roll-out. By default the smallest $h$
+        from 10 to 1000 with $\rho^h \le 0.03$.
+    - `learning_rate`: the scale of the optimiser's step. For Newton's method it is the
+        longest step. By default $0.15 / |B|$, where $|B|$ is the size of the change of
+        the state by a unit of control in one step (Frobenius norm).
+    - `optimiser`: an Optax transformation. By default
+        [`delucax.controllers.adagrad_norm`][] if `dynamics` are linear and
+        time-invariant, otherwise [`delucax.controllers.online_newton`][]. Neither
+        depends on the scale of the cost. The second learns faster, but each of its
+        steps takes ten times as long.
+    - `radius`: the largest Frobenius norm of $E$, $50 / |B|$ by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
-    has the disturbances and `theta`, shape `(m, memory n)`, the matrices E side by
-    side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. Its state has the
+    disturbances in `loop.signal`, and the matrices $E$ side by side in `theta`, shape
+    `(m, memory n)`.
 
-    **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
+    **Raises:** `ValueError` if `base` does not stabilise the dynamics, does not fit
     them or cannot be designed, the cost is not a scalar, the state is not observed, or
     a number is out of its range.
 
@@ -106,8 +105,9 @@ def gpc(
     learner = linear_learner("gpc", *given, memory=memory, nature=False)
     if not learner.loop.observed:
         raise ValueError(
-            "gpc: dynamics must observe their state (drc learns from outputs), got "
-            f"{dynamics.observation_size} outputs of {dynamics.state_size} states."
+            "gpc: dynamics must observe their state, got "
+            f"{dynamics.observation_size} outputs of {dynamics.state_size} states. Use "
+            "drc, which learns from outputs."
         )
     return learner
 
@@ -123,47 +123,49 @@ def drc(
     optimiser: optax.GradientTransformation | None = None,
     radius: Any = None,
 ) -> OnlineLearner:
-    """The disturbance response controller, for a state that is not observed,
+    r"""The disturbance response controller, for a state that is not observed.
 
-    `u_t = base(y_t) + sum_{j=0..memory-1} M_j nature_{t-j}`,
+    $$u_t = \mathrm{base}(y_t) + \sum_{j=0}^{\mathrm{memory} - 1} M_j\, \eta_{t-j},
+    \qquad \eta_t = y_t - G(v)_t$$
 
-    where nature's output, `nature_t = y_t - G(v)_t`, is what the closed loop would have
-    shown had nothing been added to the base's control; `G(v)` is the loop's response to
-    all that was added, saturation included. M follows the gradient of what each step
-    would have cost under it, in the past too: see
-    [`delucax.controllers.OnlineLearner`][]. Its regret against the best fixed M in
-    hindsight grows as `sqrt(T)`.
+    $\eta_t$ is nature's output: the observation that the closed loop would have given
+    if nothing had been added to the control of the base. $G(v)$ is the response of the
+    closed loop to all that was added, after clipping. The matrices $M$ follow the
+    gradient of the cost that each step would have had if they had been used in the past
+    too: see [`delucax.controllers.OnlineLearner`][]. The regret against the best fixed
+    $M$ in hindsight grows as $\sqrt T$.
 
-    With `base` zero it is the gradient response controller; a base such as
-    [`delucax.controllers.LQG`][] gives its performance at the start, and stabilises
-    plants that are unstable.
+    With a `base` of zero, it is the gradient response controller. A base such as
+    [`delucax.controllers.LQG`][] gives good control from the start, and stabilises
+    unstable plants.
 
     **Arguments:**
 
-    - `dynamics`: the model; linear and time-invariant where the state is not observed.
-    - `cost`: the stage cost, a differentiable function of `(t, y, u)`: of the
-        observation, which is all that it is given.
-    - `base`: a controller that stabilises the dynamics; by default the
-        [`delucax.controllers.LQG`][] for the curvature of the cost and for disturbances
-        and sensor noise of unit covariance ([`delucax.controllers.LQR`][] where the
-        state is observed).
+    - `dynamics`: the model. It must be linear and time-invariant if the state is not
+        observed.
+    - `cost`: the stage cost, a differentiable function of `(t, y, u)`, where `y` is the
+        observation.
+    - `base`: a controller that stabilises the dynamics. By default the
+        [`delucax.controllers.LQG`][] for the curvature of the cost, and for
+        disturbances and sensor noise of unit covariance; or
+        [`delucax.controllers.LQR`][] if the state is observed.
     - `memory`: the number of outputs, 10 by default.
-    - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
-        1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
-        loop.
-    - `learning_rate`: scales the optimiser's step; of Newton's method, the longest
-        step. By default 0.15 over the size of the first response of the output to a
-        unit of control.
-    - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] with
-        a prior of 4 steps by default.
-    - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the
-        same size.
+    - `horizon`: the length of the counterfactual roll-out. By default the smallest $h$
+        from 10 to 1000 with $\rho^h \le 0.03$, where $\rho$ is the spectral radius of
+        the closed loop.
+    - `learning_rate`: the scale of the optimiser's step. For Newton's method it is the
+        longest step. By default 0.15 divided by the size of the first response of the
+        observation to a unit of control.
+    - `optimiser`: an Optax transformation; by default
+        [`delucax.controllers.online_newton`][] with a prior of 4 steps.
+    - `radius`: the largest Frobenius norm of $M$; by default 50 divided by the same
+        size.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
-    has nature's outputs and `theta`, shape `(m, memory p)`, the matrices M side by
-    side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. Its state has nature's
+    outputs in `loop.signal`, and the matrices $M$ side by side in `theta`, shape
+    `(m, memory p)`.
 
-    **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
+    **Raises:** `ValueError` if `base` does not stabilise the dynamics, does not fit
     them or cannot be designed, the cost is not a scalar, or a number is out of its
     range.
 
@@ -205,43 +207,45 @@ def sfc(
     optimiser: optax.GradientTransformation | None = None,
     radius: Any = None,
 ) -> OnlineLearner:
-    """The spectral filtering controller,
+    r"""The spectral filtering controller, which learns from filters of a long memory.
 
-    `u_t = base(y_t) + M_0 s_t + sum_i M_i f_i(s_{t-1}, ..., s_{t-memory})`,
+    $$u_t = \mathrm{base}(y_t) + M_0 s_t + \sum_i M_i f_i(s_{t-1}, \dots,
+    s_{t-\mathrm{memory}}), \qquad f_i(s) = \sigma_i^{1/4} \sum_k \phi_i(k)\, s_{t-k}$$
 
-    where the signal s is the last disturbance if the state is observed, nature's output
-    otherwise, and `f_i(s) = sigma_i^(1/4) sum_k phi_i(k) s_{t-k}` with
-    `(sigma_i, phi_i)` the largest eigenvalues and eigenvectors of the matrix
-    `H_jk = (1 - margin)^(j + k - 1) / (j + k - 1)`.
+    The signal $s$ is the last disturbance if the state is observed, and nature's output
+    otherwise. $\sigma_i$ and $\phi_i$ are the largest eigenvalues, with their
+    eigenvectors, of the matrix
 
-    A few such filters do for a long memory what [`delucax.controllers.gpc`][] and
-    [`delucax.controllers.drc`][] need a matrix per step for: there is less to learn
-    where the closed loop is slow. They depend on the memory and the margin alone, not
-    on the plant.
+    $$H_{jk} = \frac{(1 - \mathrm{margin})^{j + k - 1}}{j + k - 1}$$
+
+    For a long memory, [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][]
+    need a matrix for each step, but a few filters are enough here. So there is less to
+    learn if the closed loop is slow. The filters depend only on the memory and the
+    margin, not on the plant.
 
     The double spectral controller, for a state that is not observed, also adds
 
-    `sum_i M'_i f_i(s_t, ...) + sum_{i <= j} M''_ij (f_i * f_j)(s_t, ...)`,
+    $$\sum_i M'_i f_i(s_t, \dots) + \sum_{i \le j} M''_{ij} (f_i * f_j)(s_t, \dots)$$
 
-    `f_i * f_j` being one filter after the other, which represents what an observer,
-    itself a filter, makes of the past.
+    where $f_i * f_j$ is one filter after the other. These can represent an observer,
+    which is itself a filter of the past.
 
     **Arguments:**
 
     - `dynamics`, `cost`, `base`, `horizon`, `learning_rate`, `optimiser`, `radius`: as
-        for [`delucax.controllers.drc`][].
-    - `filters`: how many, 5 by default.
+        in [`delucax.controllers.drc`][].
+    - `filters`: the number of filters, 5 by default.
     - `memory`: the number of past values that are filtered, 30 by default.
-    - `margin`: the stability margin, between 0 and 1: memories that fade as
-        `(1 - margin)^k` or faster are well represented. 0.2 by default.
-    - `double`: the double spectral controller; false by default.
+    - `margin`: the stability margin, between 0 and 1, 0.2 by default. The filters
+        represent memories well that fade as $(1 - \mathrm{margin})^k$ or faster.
+    - `double`: whether to use the double spectral controller; false by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
-    has the last `memory + 1` values, or `2 memory` with `double`, and `theta` the
-    matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. Its state has the last
+    `memory + 1` values of the signal in `loop.signal`, or `2 memory` with `double`, and
+    the matrices $M$ side by side in `theta`.
 
-    **Raises:** `ValueError` as [`delucax.controllers.drc`][]; and if there are more
-    filters than the memory has room for, or the margin is not between 0 and 1.
+    **Raises:** `ValueError` for the reasons of [`delucax.controllers.drc`][], or if
+    `filters` is larger than `memory`, or `margin` is not between 0 and 1.
 
     Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (spectral control).
 
@@ -275,10 +279,10 @@ def sfc(
     def padded(rows, first):
         return np.pad(rows, ((0, 0), (first, length - first - rows.shape[1])))
 
-    # s_t by itself, and the filters on what is before it: phi_i(k) is for s_{t-k}.
+    # The first row is s_t itself. The filters start at s_{t-1}.
     rows = [np.eye(1, length), padded(bank, 1)]
     if double:
-        # f_i * f_j is f_j * f_i: a matrix for each pair.
+        # f_i * f_j equals f_j * f_i, so one matrix per unordered pair.
         pairs = itertools.combinations_with_replacement(bank, 2)
         twice = np.stack([np.convolve(first, second) for first, second in pairs])
         rows += [padded(bank, 0), padded(twice, 0)]
@@ -299,28 +303,31 @@ def neural_gpc(
     optimiser: optax.GradientTransformation | None = None,
     key: PRNGKey,
 ) -> OnlineLearner:
-    """A network in place of the matrices of [`delucax.controllers.gpc`][],
+    r"""A neural network in place of the matrices of [`delucax.controllers.gpc`][].
 
-    `u_t = base(y_t) + network(s_t, ..., s_{t-memory+1})`,
+    $$u_t = \mathrm{base}(y_t) + \mathrm{network}(s_t, \dots, s_{t-\mathrm{memory}+1})$$
 
-    where the signal s is the last disturbance if the state is observed, nature's output
-    otherwise. The network starts by adding nothing. There is no bound on its regret;
-    it is for costs and plants that a linear map of the past does not suit.
+    The signal $s$ is the last disturbance if the state is observed, and nature's output
+    otherwise. The output of the network is zero at first. There is no bound on the
+    regret. Use it for costs and plants for which a linear map of the past is not
+    enough.
 
     **Arguments:**
 
-    - `dynamics`, `cost`, `base`, `memory`, `horizon`: as for
+    - `dynamics`, `cost`, `base`, `memory`, `horizon`: as in
         [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][].
-    - `width`, `depth`: of the hidden layers, 32 units in 1 layer by default.
-    - `learning_rate`: scales the optimiser's step, 1e-3 by default.
+    - `width`, `depth`: the number of units in a hidden layer, 32 by default, and the
+        number of hidden layers, 1 by default.
+    - `learning_rate`: the scale of the optimiser's step, 1e-3 by default.
     - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
         default.
-    - `key`: a random key, for the first weights.
+    - `key`: a random key for the initial weights.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` are the
-    network's weights.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` is the weights
+    of the network.
 
-    **Raises:** `ValueError` as [`delucax.controllers.gpc`][].
+    **Raises:** `ValueError` for the reasons of [`delucax.controllers.gpc`][], or if
+    there is no random key.
 
     Source: Chen, Minasyan, Lee and Hazan, 2022.
 
@@ -346,8 +353,7 @@ def neural_gpc(
     sizes = loop.feature_size, dynamics.control_size, width, depth
     network = mlp(*sizes, dtype=loop.dtype, key=key)
     last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
-    # The last layer alone is zero: the layers before give it features, and so a
-    # gradient.
+    # Only the last layer is zero, so that its gradient is not zero.
     network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
     optimiser = adagrad_norm() if optimiser is None else optimiser
     return OnlineLearner(loop, cost, NetworkPolicy(network), learning_rate, optimiser)
@@ -355,19 +361,18 @@ def neural_gpc(
 
 @functools.lru_cache
 def spectral_filters(memory: int, count: int, margin: float) -> np.ndarray:
-    """The filters, shape `(count, memory)`, newest first.
+    """The filters of `sfc`, shape `(count, memory)`, newest value first.
 
     Source: Hazan, Singh and Zhang, 2017.
     """
     index = np.arange(1, memory + 1)
     total = index[:, None] + index[None, :] - 1.0
-    # In float64 whatever JAX computes in: the eigenvalues of this Hankel matrix fall
-    # off exponentially (Hazan, Singh and Zhang, 2017), so that a few filters suffice,
-    # and float32 would lose the small ones in rounding.
+    # In float64 always: the eigenvalues of this Hankel matrix decay exponentially, and
+    # float32 would lose the small ones.
     values, vectors = np.linalg.eigh((1 - margin) ** total / total)
     values, vectors = values[::-1][:count], vectors[:, ::-1][:, :count]
-    # The sign of an eigenvector is arbitrary: LAPACK's choice depends on its version.
+    # The sign of an eigenvector is arbitrary, and depends on the version of LAPACK.
     sign = np.where(vectors.sum(axis=0) < 0, -1.0, 1.0)
-    # sigma^(1/4) lets a filter count by what it explains, as in the bound on the
-    # regret; the least eigenvalues may round to below zero.
+    # The bound on the regret has the factor sigma^(1/4). The smallest eigenvalues may
+    # round to below zero.
     return (np.maximum(values, 0.0) ** 0.25 * sign * vectors).T

@@ -1,4 +1,4 @@
-"""The best controller of a class, once the disturbances are known."""
+"""The best fixed controller in hindsight, and regret."""
 
 from typing import Any, NamedTuple
 
@@ -38,41 +38,43 @@ def best_in_hindsight(
     iterations: int = 30,
     tolerance: float | None = None,
 ) -> Hindsight:
-    """The fixed controller that would have cost least, the disturbances being known:
+    r"""The fixed controller with the lowest cost, once the disturbances are known.
 
-    `min over theta of sum_t c(t, x_t(theta), u_t(theta)) + final(x_T(theta))`,
+    $$\min_\theta \; \sum_t c(t, x_t(\theta), u_t(\theta)) + c_f(x_T(\theta))$$
 
-    with theta the trainable weights of `controller` (of `learner.fixed()` those of its
-    policy, not of its base), from
-    the start and under the disturbances and sensor noise of `trajectory`. It is found
-    by Newton's method with Levenberg's damping through the rollout, and is the global
-    minimum where the cost is convex in theta: of a disturbance-action policy on a
-    linear plant with a convex cost it is, of a linear gain in general not.
+    Here $\theta$ is the trainable weights of `controller`. For `learner.fixed()` it is
+    the weights of the policy, not of the base. The run has the same start, disturbances
+    and sensor noise as `trajectory`.
+
+    The search is Newton's method with Levenberg's damping, through the rollout. It
+    finds the global minimum if the cost is convex in $\theta$. That is the case for a
+    disturbance-action policy on a linear plant with a convex cost, but in general not
+    for a linear gain.
 
     - `gpc(...).fixed()`: the best disturbance-action policy.
     - `drc(...).fixed()`: the best disturbance-response policy.
-    - `Linear(K)` or `LQR(...)`: the best gain, from that one on.
+    - `Linear(K)` or `LQR(...)`: the best gain near the given one.
     - `OpenLoop(controls)`: the best open loop, for short horizons.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `controller`: the class, and where the search starts.
-    - `trajectory`: a run with its states and disturbances, over the whole of which the
-        search goes.
-    - `iterations`: Newton steps at most, 30 by default.
-    - `tolerance`: stop when the predicted decrease is below this part of the cost; by
-        default the square root of the rounding error.
+    - `controller`: the class of controllers, and the start of the search.
+    - `trajectory`: a run with its states and disturbances. The search covers its whole
+        length.
+    - `iterations`: the most Newton steps, 30 by default.
+    - `tolerance`: the search stops if the predicted decrease is below this fraction of
+        the cost; by default the square root of the rounding error.
 
     **Returns:** a named tuple of
 
-    - `controller`: the best of the class, and `trajectory`, its run;
+    - `controller`: the best controller of the class, and `trajectory`, its run;
     - `decrement`: the predicted decrease of the last Newton step, relative to the cost;
-    - `iterations`: steps tried;
-    - `result`: success, or `delucax.RESULTS.not_converged`.
+    - `iterations`: the number of steps tried;
+    - `result`: successful, or `delucax.RESULTS.not_converged`.
 
     **Raises:** `ValueError` if the trajectory has no states or disturbances (or
-    observations, where they are noisy), or the controller no trainable weights.
+    observations, if they are noisy), or the controller has no trainable weights.
 
     !!! example
 
@@ -94,8 +96,8 @@ def best_in_hindsight(
     states, w = trajectory.states, trajectory.disturbances
     if states is None or w is None:
         raise ValueError(
-            f"{where}: trajectory must have its states and disturbances, got one that "
-            f"kept {trajectory.keep}."
+            f"{where}: trajectory must have its states and disturbances, got one with "
+            f"keep={trajectory.keep}."
         )
     weights, _ = _split(controller)
     if not jax.tree.leaves(weights):
@@ -109,13 +111,12 @@ def best_in_hindsight(
     if environment.sensor_noise is not None:
         if trajectory.observations is None:
             raise ValueError(
-                f"{where}: trajectory must have its observations, in an environment "
-                "with sensor noise."
+                f"{where}: trajectory must have its observations, because environment "
+                f"has sensor noise, got one with keep={trajectory.keep}."
             )
         observe = jax.vmap(environment.dynamics.observe)
         exact = observe(trajectory.times[:-1], states[:-1])
-        # The sensor noise that there was, not a new draw: all are compared under the
-        # same.
+        # The recorded sensor noise, not a new draw, so that all runs are comparable.
         noise = FromArray(trajectory.observations - exact)
         environment = eqx.tree_at(lambda e: e.sensor_noise, environment, noise)
     given = states[0], w, trajectory.steps, iterations, tolerance
@@ -123,21 +124,21 @@ def best_in_hindsight(
 
 
 def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... T"]:
-    """By how much a run has cost more than another, up to each step,
+    r"""The regret: by how much a run has cost more than another, up to each step.
 
-    `regret_k = sum_{t <= k} (cost_t - comparator's cost_t)`.
+    $$\mathrm{regret}_k = \sum_{t \le k} (c_t - c^*_t)$$
 
-    The final costs are left out.
+    Here $c^*$ is the cost of the other run. Final costs do not count.
 
     **Arguments:**
 
     - `trajectory`: a run with its costs.
-    - `comparator`: another under the same disturbances, such as that of
+    - `comparator`: another run under the same disturbances, such as that of
         [`delucax.controllers.best_in_hindsight`][].
 
     **Returns:** shape `(T,)`.
 
-    **Raises:** `ValueError` if one has no costs, or they differ in length.
+    **Raises:** `ValueError` if one of them has no costs, or they differ in length.
 
     !!! example
 
@@ -166,8 +167,8 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... 
 
 
 def _split(controller: AbstractController) -> tuple[PyTree, PyTree]:
-    """The weights that the search moves, and the rest."""
-    # A policy is judged on top of the base that it was given.
+    """The weights that the search changes, and the rest of the controller."""
+    # For a policy of a learner, the base stays the same.
     inside = "policy" if isinstance(controller, FixedPolicy) else ""
     marks = [
         role == "weight"
@@ -192,8 +193,7 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
 
     def derivatives(theta):
         total = lambda theta: run(theta, checkpoint="sqrt")[1].total_cost  # noqa: E731
-        # One linearisation, then a batch of products with the Hessian: forward over
-        # reverse.
+        # Forward over reverse: one linearisation, then a batch of Hessian products.
         (cost, gradient), jvp = jax.linearize(jax.value_and_grad(total), theta)
         _, hessian = jax.vmap(jvp)(eye)
         return cost, gradient, (hessian + hessian.T) / 2
@@ -202,21 +202,20 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         best, local, damping, _, k = carry
         cost, gradient, hessian = local
         size = jnp.trace(jnp.abs(hessian)) / len(start)
-        # Levenberg's damping, in units of the mean curvature: theta has no scale.
+        # Levenberg's damping, relative to the mean curvature.
         damped = hessian + damping * jnp.where(size > 0, size, 1) * eye
         change = solve(damped, -gradient[:, None])[:, 0]
         change = jnp.where(k > 0, change, 0)
-        # The decrease that the quadratic model predicts, of the undamped model.
+        # The decrease that the undamped quadratic model predicts.
         predicted = -(gradient @ change + change @ hessian @ change / 2)
-        # Cost and derivatives in one pass: a trial that succeeds needs them next.
+        # Cost and derivatives in one pass, because a successful trial needs both.
         tried = derivatives(best + change)
-        # NaN is not below: a trial that diverges is refused, and the next one damped
-        # more.
+        # A trial that diverges has a cost of NaN, which is not below, and is refused.
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
         left = predicted / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
-        # A predicted decrease below zero is rounding.
+        # A negative predicted decrease is rounding.
         left = jnp.where((k > 0) & (predicted >= 0), left, jnp.inf)
-        # With less damping, rounding would move what the cost does not depend on.
+        # With less damping, rounding would move weights without an effect on the cost.
         damping = pick(jnp.maximum(damping / 10, least), damping * 10)
         local = jax.tree.map(pick, tried, local)
         return pick(best + change, best), local, damping, left, k + 1
@@ -227,7 +226,7 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
 
     eye = jnp.eye(len(start), dtype=start.dtype)
     least = jnp.finfo(start.dtype).eps ** 0.75
-    # The first step stays where it is, and is better than this.
+    # The first step does not move, and only computes the cost and derivatives.
     infinite = jnp.asarray(jnp.inf, start.dtype)
     unknown = infinite, jnp.zeros_like(start), 0 * eye
     carry = start, unknown, 100 * least, infinite, 0

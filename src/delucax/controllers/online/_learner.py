@@ -1,4 +1,4 @@
-"""Online learners of a policy that is added to a base controller."""
+"""Online learners of a policy whose control is added to that of a base controller."""
 
 import functools
 from collections.abc import Callable
@@ -27,23 +27,23 @@ from ._policy import AbstractPolicy, FixedPolicy, LinearPolicy
 
 
 DEFAULT_STEP = 0.15
-"""The step of a learner, in units of the control that undoes what it has observed."""
+"""The step of a learner, in units of the control that undoes a unit of observation."""
 DEFAULT_RADIUS = 50.0
 """The largest policy, in the same units."""
 _PRIOR_OF_OUTPUTS = 4.0
-"""The prior of what is learned from nature's outputs, in steps."""
+"""The prior of a learner from nature's outputs, in steps."""
 
 
 class LearnerState(NamedTuple):
     """The state of an online learner.
 
-    - `loop`: of the plant and the base controller.
-    - `features`: of this step and those of the roll-out before it, newest first.
+    - `loop`: the state of the plant and the base controller.
+    - `features`: the features of this step and of the roll-out before it, newest first.
     - `theta`: what has been learned.
     - `optimiser`: the state of the optimiser.
-    - `weighted`: the response weighted by the root of the curvature of the cost, where
-      it is the same at all times.
-    - `refused`: how many updates were not finite, and so were not made.
+    - `weighted`: the response times the root of the curvature of the cost, if it is the
+        same at all times.
+    - `refused`: the number of updates that were refused, because they were not finite.
     """
 
     loop: ClosedLoopState
@@ -55,40 +55,44 @@ class LearnerState(NamedTuple):
 
 
 class OnlineLearner(AbstractLearner):
-    """A base controller, and what is learned online to add to it,
+    r"""A base controller plus a policy that is learned online, during the run.
 
-    `u_t = base(y_t) + policy(theta_t, features_t)`,
+    $$u_t = \mathrm{base}(y_t) + \mathrm{policy}(\theta_t, \phi_t)$$
 
-    where the features are filters of a signal that does not depend on what was added:
-    the past disturbances, or nature's output. Before it acts, theta takes a step
-    against the gradient of a counterfactual loss, the cost of this step had theta been
-    held during a roll-out,
+    The features $\phi_t$ are filters of a signal that does not depend on the added
+    control: the past disturbances, or nature's output. Before each control, $\theta$
+    takes a step against the gradient of a counterfactual loss: the cost of this step if
+    $\theta$ had been used in the last $h$ steps too, where $h$ is the `horizon`.
 
-    `loss_t(theta) = c(t, y_t(theta), u_t(theta))`,
-    `y_t(theta) = y_t + sum_{j < horizon} G_j (v_{t-1-j}(theta) - v_{t-1-j})`,
+    $$\begin{aligned}
+    \ell_t(\theta) &= c(t, y_t(\theta), u_t(\theta)) \\
+    y_t(\theta) &= y_t + \sum_{j < h} G_j\, (v_{t-1-j}(\theta) - v_{t-1-j})
+    \end{aligned}$$
 
-    with `G_j` the closed loop's response to an impulse j steps ago, `v_s(theta)` what
-    theta would have added at step s and `v_s` what was added, saturation included; and
-    likewise for the control. The responses are those of linear dynamics, or of any
-    dynamics linearised along the way.
+    Here $G_j$ is the response of the closed loop to an impulse $j$ steps ago,
+    $v_s(\theta)$ the control that $\theta$ would have added at step $s$, and $v_s$ the
+    control that was added, after clipping. $u_t(\theta)$ is computed in the same way.
+    Nonlinear dynamics are linearised along the run.
 
     [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
-    [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make it.
+    [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make such
+    learners.
 
     **Attributes:**
 
-    - `loop`: the model with its base controller: `loop.base`; `loop.horizon`, the
-        length of the roll-out; `loop.response`, the G_j, if they are always the same;
-        `loop.memory` and `loop.filters`, what the features are.
+    - `loop`: the model with its base controller. `loop.base` is the base,
+        `loop.horizon` the length of the roll-out, `loop.response` the $G_j$ if they are
+        the same at all times. `loop.memory` and `loop.filters` define the features.
     - `cost`: the stage cost.
-    - `policy`: the family of policies; `policy.start`, the first theta, is trainable.
-    - `learning_rate`: an array that scales the optimiser's step; it can be
-        differentiated.
-    - `optimiser`: an Optax transformation. It is given, as extra arguments, the
-        `learning_rate` and a function that returns the `curvature` of the loss.
+    - `policy`: the family of policies. `policy.start`, the initial $\theta$, is
+        trainable.
+    - `learning_rate`: the scale of the optimiser's step, an array. You can
+        differentiate with respect to it.
+    - `optimiser`: an Optax transformation. It gets the extra arguments `learning_rate`
+        and `curvature`, a function that returns a root of the curvature of the loss.
 
-    The state that `init` makes and a run carries along has `theta`, what has been
-    learned, and `loop.signal`, the last values of the signal, newest first.
+    The state of the controller has `theta`, what has been learned, and `loop.signal`,
+    the last values of the signal, newest first.
 
     !!! example
 
@@ -121,7 +125,7 @@ class OnlineLearner(AbstractLearner):
         if got != (m,):
             raise ValueError(
                 f"{where}: policy must take {size} features and give {m} controls, got "
-                f"{type(policy).__name__} that does not."
+                f"a {type(policy).__name__} that does not."
             )
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
@@ -148,8 +152,8 @@ class OnlineLearner(AbstractLearner):
         gradient = jax.grad(self._loss)(state.theta, state)
         curvature = lambda: self._curvature(state)
         after = projected_step(self, gradient, state, curvature=curvature)
-        # By the new theta: the loss of this step needs y_t alone, which is known before
-        # the control is chosen.
+        # With the new theta, because the loss of this step needs only y_t, which is
+        # known before the control.
         v = self.policy(after.theta, features)
         return (loop.u_base + v).astype(y.dtype), after
 
@@ -166,21 +170,20 @@ class OnlineLearner(AbstractLearner):
         return state._replace(theta=theta, optimiser=self.optimiser.init(theta))
 
     def fixed(self, theta: Any = None) -> FixedPolicy:
-        """The same controller, no longer learning.
+        """The same controller without learning.
 
-        **Arguments:** `theta`: what it has learned, from its state; by default what it
-        starts with.
+        **Arguments:** `theta`: what has been learned, from the state of the controller;
+        the initial theta by default.
 
-        **Returns:** a controller, `u_t = base(y_t) + policy(theta, features_t)`. Its
-        `policy.start` is theta, trainable; its `loop` is the learner's.
+        **Returns:** a controller. Its `policy.start` is theta, trainable. Its `loop` is
+        that of the learner.
         """
         policy = self.policy if theta is None else self.policy.at(theta)
         return FixedPolicy(self.loop, policy)
 
     def _outcome(self, theta, state):
-        # Theta is held constant during the roll-out. As it moves slowly, regret in
-        # these losses bounds that of the run (Anava, Hazan and Mannor, 2015; Agarwal et
-        # al., 2019).
+        # Theta is constant during the roll-out. It moves slowly, so the regret in these
+        # losses bounds the regret of the run (Anava, Hazan and Mannor, 2015).
         v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
         return self.loop.counterfactual(v[0], v[1:], state.loop)
 
@@ -188,8 +191,11 @@ class OnlineLearner(AbstractLearner):
         return self.cost(state.loop.t, *self._outcome(theta, state))
 
     def _curvature(self, state):
-        """`J' L`, with J the derivative of observation and control by theta, and `L L'`
-        the curvature of the cost."""
+        """The matrix `J' L`, which is a root of the curvature of the loss by theta.
+
+        `J` is the derivative of observation and control by theta, and `L L'` the
+        curvature of the cost.
+        """
         weighted = state.weighted
         if weighted is None:
             z = jnp.concatenate(self._outcome(state.theta, state))
@@ -197,11 +203,14 @@ class OnlineLearner(AbstractLearner):
         return self.policy.pull_back(state.theta, weighted, state.features).T
 
     def _weighted(self, root, loop):
-        """`L'` times the response of observation and control to what is added now and
-        at each step of the roll-out, newest first, shape (horizon + 1, p + m, m)."""
+        """The response to a control added at each step of the roll-out, times `L'`.
+
+        The response is that of observation and control. The newest step comes first,
+        shape `(horizon + 1, p + m, m)`.
+        """
         past = self.loop.past(loop)
         p, m = loop.y.shape[0], past.shape[2]
-        # What is added now changes the control of this step, and no observation yet.
+        # A control added now changes the control of this step, but not its observation.
         direct = jnp.eye(p + m, m, -p, past.dtype)
         response = jnp.concatenate([direct[None], past])
         return jnp.einsum("ok,hom->hkm", root, response)
@@ -209,12 +218,11 @@ class OnlineLearner(AbstractLearner):
     def _root(self, t, z):
         p = self.loop.dynamics.observation_size
         cost = lambda z: self.cost(t, z[:p], z[p:])  # noqa: E731
-        # Gauss and Newton: the curvature by theta is J' H J, as outcomes are linear in
-        # theta.
+        # Gauss-Newton: for outcomes that are linear in theta, its curvature is J' H J.
         return positive_root(jax.hessian(cost)(z))
 
     def _constant_root(self):
-        """`None` if it depends on where or when it is taken."""
+        """The root of the curvature, or `None` if it depends on time or place."""
         dynamics, dtype = self.loop.dynamics, self.loop.dtype
         size = dynamics.observation_size + dynamics.control_size
         here = jnp.zeros((), dtype), jnp.zeros(size, dtype)
@@ -232,8 +240,10 @@ def linear_learner(
     radius: ArrayLike | None,
     **signal: Any,
 ) -> OnlineLearner:
-    """A learner of a linear map from features to control; `signal` says what the
-    features are, as to a `ClosedLoop`."""
+    """A learner of a linear map from features to controls.
+
+    `signal` holds arguments of `ClosedLoop` that define the features.
+    """
     base = base_for(dynamics, cost, base, where)
     loop = ClosedLoop(dynamics, base, horizon, where, **signal)
     start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
@@ -241,8 +251,8 @@ def linear_learner(
     ball = scale(radius, "radius", DEFAULT_RADIUS)
     rate = scale(learning_rate, "learning_rate", DEFAULT_STEP)
     if optimiser is None:
-        # Newton's step where gradients alone are slow: nature's outputs are much alike
-        # from step to step, and gradients by a response that varies change direction.
+        # Newton's method if gradient steps are slow: nature's outputs are similar from
+        # step to step, and a response that varies turns the gradients.
         if loop.nature:
             optimiser = online_newton(_PRIOR_OF_OUTPUTS)
         else:
@@ -256,12 +266,12 @@ def base_for(
     base: AbstractController | None,
     where: str,
 ) -> AbstractController:
-    """The base of a learner with this model and cost, which are checked: as given, or
-    by default the regulator for the curvature of the cost at the operating point.
+    """The base of a learner, by default the regulator for the curvature of the cost.
 
-    For each time of time-varying dynamics it is the one that would be best if they
-    stayed as they are; where not the state but `C x` is observed, it acts on the
-    estimate of a Kalman filter for disturbances and sensor noise of unit covariance.
+    The curvature is taken at the operating point. For time-varying dynamics, the
+    regulator of each time is the one for dynamics that stay as they are at that time.
+    If `C x` is observed and not the state, the regulator acts on the estimate of a
+    Kalman filter, for disturbances and sensor noise of unit covariance.
     """
     hint = (
         ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
@@ -276,8 +286,8 @@ def base_for(
         x, u = dynamics.equilibrium()
     except ValueError as error:
         raise ValueError(
-            f"{where}: base must be given, for dynamics that define no equilibrium to "
-            "design one at."
+            f"{where}: base must be given, because dynamics define no equilibrium at "
+            "which to design one."
         ) from error
     Q, R, S = _weights(dynamics, cost, x, u, where)
     if not isinstance(dynamics, LinearDynamics):
@@ -295,14 +305,14 @@ def base_for(
 
 
 def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
-    """Raise unless a cost of what `dynamics` show is a scalar."""
+    """Raise unless the cost of an observation and a control is a scalar."""
     y, u = (dynamics.observation_size,), (dynamics.control_size,)
     try:
         value = output_of(cost, (), y, u)
     except ValueError as error:
         raise ValueError(
-            f"{where}: cost must take the observation, of shape {y}, where a state is "
-            f"asked for, and a control of shape {u}: {error}"
+            f"{where}: cost must take the observation, of shape {y}, in place of the "
+            f"state, and a control of shape {u}: {error}"
         ) from error
     got = getattr(value, "shape", None)
     if got != ():
@@ -312,32 +322,31 @@ def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None
 
 @eqx.filter_jit
 def _curvature(dynamics, cost, x, u):
-    """Half of the second derivatives of the cost, and its blocks `Q`, `R` and `S`."""
+    """Half of the second derivatives of the cost, and their blocks `Q`, `R` and `S`."""
     t, n = jnp.zeros((), x.dtype), x.shape[0]
     y = dynamics.observe(t, x)
 
     def charged(z):
-        # Gauss and Newton in the observation: the curvature of the sensor, which could
-        # make the cost concave, is left out.
+        # Gauss-Newton: without the curvature of the sensor, which could make the cost
+        # concave.
         y_here = y + jax.jvp(lambda x: dynamics.observe(t, x), (x,), (z[:n],))[1]
         return cost(t, y_here, u + z[n:])
 
-    # c = dx'Q dx + ...
     H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
     return H, (H[:n, :n], H[n:, n:], H[:n, n:])
 
 
 def _weights(dynamics, cost, x, u, where):
-    """The curvature of the cost as weights of a regulator, if it has one."""
+    """The curvature of the cost as weights of a regulator, or an error."""
     H, (Q, R, S) = _curvature(dynamics, cost, x, u)
     if is_concrete(H):
         H = np.asarray(H, float)
-        # Above the rounding of a Hessian in float32.
+        # The rounding of a Hessian in float32.
         slack = 1e-6 * np.max(np.abs(H), initial=0)
         curved = np.all(np.linalg.eigvalsh(H) >= -slack)
         if not (curved and np.all(np.linalg.eigvalsh(np.asarray(R)) > slack)):
             raise ValueError(
-                f"{where}: base must be given, for a cost that is not convex, and "
-                "strictly so in u, at the operating point."
+                f"{where}: base must be given, because the cost is not convex, and "
+                "strictly convex in u, at the operating point."
             )
     return Q, R, S
