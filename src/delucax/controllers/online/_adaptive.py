@@ -92,7 +92,8 @@ class Adaptive(AbstractController):
         import delucax as dlx
         import jax
 
-        env = dlx.make("lds", key=jax.random.key(0))
+        push = dlx.disturbances.Constant([0.5, 0.5])
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         learner = dlx.controllers.gpc(env.dynamics, env.cost)
         adaptive = dlx.controllers.Adaptive(learner)
         dlx.rollout(env, adaptive, key=jax.random.key(0)).total_cost

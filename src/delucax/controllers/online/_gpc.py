@@ -255,7 +255,8 @@ def sfc(
         import delucax as dlx
         import jax
 
-        env = dlx.make("lds", key=jax.random.key(0))
+        push = dlx.disturbances.Constant([0.5, 0.5])
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         learner = dlx.controllers.sfc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
@@ -337,7 +338,8 @@ def neural_gpc(
         import delucax as dlx
         import jax
 
-        env = dlx.make("lds", key=jax.random.key(0))
+        push = dlx.disturbances.Constant([0.5, 0.5])
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         key, run_key = jax.random.split(jax.random.key(0))
         learner = dlx.controllers.neural_gpc(env.dynamics, env.cost, key=key)
         dlx.rollout(env, learner, key=run_key).total_cost

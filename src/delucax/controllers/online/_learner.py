@@ -100,7 +100,8 @@ class OnlineLearner(AbstractLearner):
         import delucax as dlx
         import jax
 
-        env = dlx.make("lds", key=jax.random.key(0))
+        push = dlx.disturbances.Constant([0.5, 0.5])
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         learner = dlx.controllers.gpc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```

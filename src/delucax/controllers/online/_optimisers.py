@@ -196,7 +196,8 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
         import delucax as dlx
         import jax
 
-        env = dlx.make("lds", key=jax.random.key(0))
+        push = dlx.disturbances.Constant([0.5, 0.5])
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         optimiser = dlx.controllers.online_newton(prior=20.0)
         learner = dlx.controllers.gpc(env.dynamics, env.cost, optimiser=optimiser)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
