@@ -1,5 +1,4 @@
-"""The protocols of controllers, the counter of incidents, and functions that call
-them."""
+"""The base classes of controllers, a counter of incidents, and helpers."""
 
 import abc
 from collections.abc import Callable
@@ -113,8 +112,9 @@ class AbstractController(eqx.Module):
         """
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
-        """The state after a step, given the control that was applied and its cost; by
-        default the state unchanged.
+        """The state after a step, given the control that was applied and its cost.
+
+        By default the state does not change.
 
         **Arguments:**
 
@@ -129,17 +129,21 @@ class AbstractController(eqx.Module):
 
     @property
     def learns_from_cost(self) -> bool:
-        """Whether `applied` learns from the cost; by default, whether a controller
-        among the fields does. [`delucax.simulate`][] has no cost and refuses such a
-        controller."""
+        """Whether `applied` learns from the cost.
+
+        By default it does if a controller among the fields does. [`delucax.simulate`][]
+        has no cost, and refuses such a controller.
+        """
         return any(p.learns_from_cost for p in parts_of(self, AbstractController))
 
 
 class AbstractLearner(AbstractController):
     """A controller that learns online, with a counterfactual loss of its policy.
 
-    Meta-controllers such as [`delucax.controllers.Adaptive`][] call `loss` and `fresh`;
-    [`delucax.rollout`][] does not.
+    A counterfactual loss is the cost that the policy of now would have had, if it had
+    acted in the past steps too. Meta-controllers such as
+    [`delucax.controllers.Adaptive`][] call `loss` and `fresh`. [`delucax.rollout`][]
+    does not.
 
     !!! example
 
@@ -179,7 +183,7 @@ class AbstractLearner(AbstractController):
 
     @abc.abstractmethod
     def fresh(self, state: PyTree, key: PRNGKey | None) -> PyTree:
-        """A state with the observations of `state`, which has learned nothing yet.
+        """A state that has seen the same observations, but has learned nothing yet.
 
         **Arguments:** `state`: the learner's state. `key`: a random key, or `None`.
 
@@ -259,12 +263,11 @@ class AbstractStochasticPolicy(AbstractController):
 
 
 class Tally(eqx.Module):
-    """A counter of incidents in a controller, such as failed plans. Keep it in the
-    controller's state.
+    """A counter of incidents in a controller, such as failed plans.
 
-    After each step, [`delucax.rollout`][] looks for all tallies in the state. The steps
-    at which a count rose are in `trajectory.incidents`. Wrappers of controllers need
-    not forward tallies.
+    Keep it in the controller's state. After each step, [`delucax.rollout`][] finds all
+    tallies in the state, so wrappers of controllers need not forward them.
+    `trajectory.incidents` tells at which steps a count rose.
 
     **Arguments:**
 
