@@ -225,7 +225,7 @@ def test_the_margin_by_hand():
         (lambda: limited().held(0.1, ([0.0], [1.0])), "states must have shape"),
         (lambda: limited().held(0.1, BOX[::-1]), "states must have low <= high"),
         (lambda: limited().held(0.1, 3.0), "states must be a pair"),
-        (lambda: limited().held(0.1, ([0, 5], [1, 6])), "a point at which all barriers"),
+        (lambda: limited().held(0.1, ([0, 5], [1, 6])), "point at which all barriers"),
     ],
 )
 def test_words_for_the_hold(call, match):
