@@ -24,12 +24,11 @@ Signal = Callable[[Any], Array]
 
 
 class KnownSignals(eqx.Module):
-    """The state and control to follow and the disturbance, known at every time.
+    """A state and a control to follow, and a disturbance, known at every time.
 
-    Relative to these signals the linear dynamics are $e_{k+1} = A e_k + B v_k + d_k$,
-    with the state error $e = $ `difference(x, r)` and the control error $v = u - u_r$.
-    The residual $d_k$ is the difference between the state that follows $r_k$ under
-    $u_r$ and the disturbance, and the next reference $r_{k+1}$.
+    Relative to these signals the linear dynamics are `e_next = A e + B v + d`, with the
+    errors `e = difference(x, r)` and `v = u - u_r`. The residual `d` is the error after
+    one step of the dynamics from the reference, under `u_r` and the disturbance.
     """
 
     dynamics: LinearDynamics

@@ -49,11 +49,11 @@ class LQR(AbstractController):
     $$u_k = u_{r,k} - K\, \mathrm{difference}(x_k, r_k) -
     (R + B^\top P B)^{-1} B^\top \sum_{j \ge 0} ((A - B K)^\top)^j P\, d_{k+j}$$
 
-    Here $d_k$ is the difference between the state that follows $r_k$ under $u_{r,k}$
-    and $w_k$, and $r_{k+1}$. The feed-forward is optimal if the signals are known
-    `preview` steps ahead and are constant after that. The state reaches a constant $r$
-    exactly only if $u_r$ holds it there, because the cost charges any other control.
-    [`delucax.controllers.LQI`][] reaches it without knowing $u_r$.
+    Here $d_k = F(r_k, u_{r,k}, w_k) - r_{k+1}$ is the error after one step $F$ of the
+    linear dynamics from the reference. The feed-forward is optimal if the signals are
+    known `preview` steps ahead and are constant after that. The state reaches a
+    constant $r$ exactly only if $u_r$ holds it there, because the cost charges any
+    other control. [`delucax.controllers.LQI`][] reaches it without knowing $u_r$.
 
     **Arguments:**
 

@@ -108,14 +108,19 @@ class LQG(AbstractController):
     $$x_{k+1} = A x_k + B u_k + E w_k, \qquad y_k = C x_k + v_k, \qquad
     w_k \sim N(0, W), \quad v_k \sim N(0, V)$$
 
-    no other controller of the observations has a lower average of the cost $\delta
-    x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u + \delta u^\top R\, \delta u$
-    per step. This average is
+    no other controller that acts on the observations has a lower average cost, where
+    the cost per step is
+
+    $$\delta x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u +
+    \delta u^\top R\, \delta u$$
+
+    and $\delta x$ and $\delta u$ are the deviations from the operating point. The
+    average is
 
     $$\operatorname{tr}(P E W E^\top) +
     \operatorname{tr}(K^\top (R + B^\top P B) K \Sigma)$$
 
-    with $P$ the solution of the regulator's Riccati equation and $\Sigma$ the
+    Here $P$ is the solution of the regulator's Riccati equation, and $\Sigma$ is the
     covariance of the filtered estimate.
 
     **Arguments:**

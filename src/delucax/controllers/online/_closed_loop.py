@@ -274,8 +274,8 @@ class ClosedLoop(eqx.Module):
 
         These are `v` at this step, and `v_past` at the previous steps, newest first.
         """
-        # Superposition about the true run, with its noise and clipping. It is exact for a
-        # linear loop, and otherwise to first order.
+        # Superposition about the true run, with its noise and clipping. This is exact
+        # for a linear loop, and otherwise to first order.
         change = jnp.einsum("hom,hm->o", self.past(state), v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
