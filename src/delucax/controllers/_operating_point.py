@@ -69,10 +69,9 @@ def check_linear_state_feedback(
 def operating_state(
     dynamics: LinearDynamics, difference: Difference | None, where: str
 ) -> Float[Array, "*T n"]:
-    """The state of the operating point, once the dynamics are known to rest there.
+    """The state of the operating point, or an error unless the dynamics rest there.
 
-    Time-varying dynamics may have a state for each time. They must go from each to the
-    next.
+    Time-varying dynamics must go from the operating point of each step to the next one.
     """
     x_ref, x_next = dynamics.x_ref, dynamics.x_next
     A, B, u_ref = dynamics.A, dynamics.B, dynamics.u_ref

@@ -24,7 +24,7 @@ class Residual(AbstractController):
     - `correction`: the controller whose control is added.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, to which the control of
         `base` is clipped before the correction is added; none by default. Without them
-        a large control of `base` could leave the correction no effect.
+        the environment may clip a sum that the correction cannot bring within bounds.
 
     **Raises:** `ValueError` if one of the two is not a controller, or low bounds are
     above high ones; at run time, if the two controls differ in size.

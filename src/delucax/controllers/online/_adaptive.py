@@ -29,7 +29,7 @@ class AdaptiveState(NamedTuple):
     - `weights`: the weight of each expert, 0 for an empty slot. Their sum is 1.
     - `ends`: the step at which each expert expires.
     - `step`: the number of steps so far. `t`: the time of the current one.
-    - `mean`, `variance`: those of the recent losses.
+    - `mean`, `variance`: the mean and the variance of the recent losses.
     - `chosen`: the slot that is followed. `key`: the random key of the next choice.
         Both are `None` if the experts are mixed.
     """
@@ -65,9 +65,9 @@ class Adaptive(AbstractController):
     so that any of them can rise quickly.
 
     With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` it is
-    the control of one expert, which seldom changes: a new one is drawn only with the
-    probability by which its weight has fallen. With [`delucax.controllers.gpc`][] as
-    base, this is AdaGPC.
+    the control of one expert. Another one is drawn only with the probability by which
+    the weight of this expert has fallen, so the expert seldom changes. With
+    [`delucax.controllers.gpc`][] as base, this is AdaGPC.
 
     **Arguments:**
 

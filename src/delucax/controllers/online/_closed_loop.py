@@ -205,8 +205,7 @@ class ClosedLoop(eqx.Module):
         state: ClosedLoopState,
         policy: Callable[[Array], Array],
     ) -> tuple[Float[Array, " f"], Float[Array, " m"], ClosedLoopState]:
-        """The features of this step, the control that `policy` adds, and the new
-        state."""
+        """The features of this step, the control that `policy` adds, and the state."""
         if y.shape != state.y.shape:
             raise wrong_observation(owner, state.y.shape[0], y)
         t, y, before = jnp.asarray(t, self.dtype), y.astype(self.dtype), state.base
@@ -281,8 +280,7 @@ class ClosedLoop(eqx.Module):
         return state.y + change[:p], state.u_base + change[p:] + v
 
     def past(self, state: ClosedLoopState) -> Float[Array, "h o m"]:
-        """The response of observation and base control to a control added at each past
-        step."""
+        """The response of observation and base control to an impulse at each past step."""
         if self.response is not None:
             return self.response
         assert state.now is not None and state.impulses is not None
@@ -339,8 +337,7 @@ def _check_control(
 
 
 def _vector(state: Any) -> tuple[Array, Any]:
-    """The floating-point part of a controller's state as a vector, and the inverse
-    map."""
+    """The floating-point part of a state as a vector, and the inverse map."""
     floats, rest = eqx.partition(state, eqx.is_inexact_array)
     vector, unravel = ravel_pytree(floats)
     return vector, lambda z: eqx.combine(unravel(z.astype(vector.dtype)), rest)
@@ -400,8 +397,8 @@ def _tangents_along(dynamics, base, x, u) -> Tangents:
 def _responses(tangents, horizon, p):
     """The response to an impulse, and the size of its first nonzero row.
 
-    The rows count in their first `p` entries. If the response depends on time, it is
-    that at the first step.
+    Only the first `p` entries of a row, the observation, count. If the response depends
+    on time, it is the one at the first step.
     """
     transition, now, output = (M if M.ndim == 2 else M[0] for M in tangents)
     # Row j, a Markov parameter, is the response to an impulse j + 1 steps ago.

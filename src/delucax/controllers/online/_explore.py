@@ -170,7 +170,7 @@ class Explore(AbstractController):
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
         gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
         closed_loop = solve(gram, before @ after.T).T
-        # A = (A - B K) + B K.
+        # The identified closed loop is A - B K.
         model = LinearDynamics(closed_loop + N[0] @ self.K, N[0], dt=self.dt)
         arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)

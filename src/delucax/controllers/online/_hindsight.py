@@ -53,7 +53,7 @@ def best_in_hindsight(
 
     - `gpc(...).fixed()`: the best disturbance-action policy.
     - `drc(...).fixed()`: the best disturbance-response policy.
-    - `Linear(K)` or `LQR(...)`: the best gain near the given one.
+    - `Linear(K)` or `LQR(...)`: the best gain, with a search from the given one.
     - `OpenLoop(controls)`: the best open loop, for short horizons.
 
     **Arguments:**
