@@ -21,9 +21,9 @@ class Scheduled(AbstractController):
     r"""A controller for each time step, $u_k = \pi_k(t_k, y_k)$.
 
     At time `t`, the controller with index `round(t / dt)` acts. After the end of the
-    sequence, the last controller acts. Before the start the control is NaN, which a rollout
-    reports. All controllers share one state, so it must have the same structure and
-    meaning for each of them.
+    sequence, the last controller acts. Before the start the control is NaN, which a
+    rollout reports. All controllers share one state, so it must have the same structure
+    and meaning for each of them.
 
     **Arguments:**
 

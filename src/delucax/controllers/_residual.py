@@ -23,8 +23,8 @@ class Residual(AbstractController):
     - `base`: the controller without the correction.
     - `correction`: the controller whose control is added.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, to which the control of
-        `base` is clipped before the correction is added; none by default. Without them
-        the environment may clip a sum that the correction cannot bring within bounds.
+        `base` is clipped before the correction is added; none by default. Without
+        them, the correction must undo a control far beyond the environment's bounds.
 
     **Raises:** `ValueError` if one of the two is not a controller, or low bounds are
     above high ones; at run time, if the two controls differ in size.

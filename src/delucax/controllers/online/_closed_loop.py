@@ -280,7 +280,7 @@ class ClosedLoop(eqx.Module):
         return state.y + change[:p], state.u_base + change[p:] + v
 
     def past(self, state: ClosedLoopState) -> Float[Array, "h o m"]:
-        """The response of observation and base control to an impulse at each past step."""
+        """The response of observation and control to an impulse at each past step."""
         if self.response is not None:
             return self.response
         assert state.now is not None and state.impulses is not None
