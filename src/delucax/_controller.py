@@ -298,6 +298,11 @@ class Tally(eqx.Module):
         trajectory = dlx.rollout(env, Cautious(), key=jax.random.key(0), x0=[0.1, 0.0])
         trajectory.incident_counts
         ```
+
+        ```text
+        {'clipped_control': Array(23, dtype=int32),
+         'large_angle': Array(185, dtype=int32)}
+        ```
     """
 
     name: str = eqx.field(static=True)

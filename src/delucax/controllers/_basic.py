@@ -37,6 +37,10 @@ class Zero(AbstractController):
         env = dlx.make("pendulum")
         dlx.rollout(env, zero, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
+
+        ```text
+        Array(519.5, dtype=float32)
+        ```
     """
 
     control_size: int = eqx.field(static=True)
@@ -65,6 +69,10 @@ class Constant(AbstractController):
         push = dlx.controllers.Constant(jnp.array([0.5]))
         env = dlx.make("pendulum")
         dlx.rollout(env, push, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+
+        ```text
+        Array(1192., dtype=float32)
         ```
     """
 
@@ -100,6 +108,10 @@ class Random(AbstractController):
         explore = dlx.controllers.Random(jnp.array([1.0]))
         env = dlx.make("pendulum")
         dlx.rollout(env, explore, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+
+        ```text
+        Array(841., dtype=float32)
         ```
     """
 
@@ -139,6 +151,10 @@ class Linear(AbstractController):
         env = dlx.make("pendulum")
         dlx.rollout(env, feedback, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
+
+        ```text
+        Array(0.0736, dtype=float32)
+        ```
     """
 
     K: Array = weight()
@@ -172,6 +188,10 @@ class OpenLoop(AbstractController):
         replay = dlx.controllers.OpenLoop(0.5 * jnp.ones((20, 1)))
         env = dlx.make("pendulum")
         dlx.rollout(env, replay, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+
+        ```text
+        Array(1192., dtype=float32)
         ```
     """
 

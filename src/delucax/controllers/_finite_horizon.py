@@ -82,6 +82,10 @@ class FiniteHorizonLQR(AbstractController):
         )
         regulator.K[0]
         ```
+
+        ```text
+        Array([[0.422, 1.244]], dtype=float32)
+        ```
     """
 
     K: Float[Array, "T m n"] = weight()

@@ -77,6 +77,12 @@ class HInfinity(AbstractController):
         calm = dlx.controllers.HInfinity(dynamics, weight, jnp.eye(1), gamma=10.0)
         best.gamma, best.K, calm.K
         ```
+
+        ```text
+        (Array(2.956, dtype=float32),
+         Array([[0.713, 1.713]], dtype=float32),
+         Array([[0.439, 1.273]], dtype=float32))
+        ```
     """
 
     K: Float[Array, "*T m n"] = weight()

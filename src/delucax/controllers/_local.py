@@ -143,6 +143,10 @@ def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
         env = dlx.make("quadrotor")
         dlx.controllers.local_lqr(env).K.shape
         ```
+
+        ```text
+        (4, 13)
+        ```
     """
     model = _local_model(environment, regularisation, "local_lqr")
     return LQR(*model, difference=environment.dynamics.difference)

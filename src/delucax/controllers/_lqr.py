@@ -102,6 +102,10 @@ class LQR(AbstractController):
         x0 = jnp.array([0.1, 0.0])
         dlx.rollout(env, regulator, key=jax.random.key(0), x0=x0).total_cost
         ```
+
+        ```text
+        Array(0.0881, dtype=float32)
+        ```
     """
 
     K: Float[Array, "m n"] = weight()
@@ -244,6 +248,10 @@ class LQI(AbstractController):
             reference=jnp.array([2.0]),
         )
         controller.K, controller.Ki
+        ```
+
+        ```text
+        (Array([[2.275, 2.364]], dtype=float32), Array([[-0.886]], dtype=float32))
         ```
     """
 

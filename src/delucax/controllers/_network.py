@@ -71,6 +71,10 @@ class MLP(AbstractController):
         )
         dlx.rollout(env, policy, key=jax.random.key(1), x0=[0.1, 0.0]).total_cost
         ```
+
+        ```text
+        Array(1077., dtype=float32)
+        ```
     """
 
     network: eqx.nn.MLP = weight()
@@ -180,6 +184,10 @@ def mlp_policy(
         policy = dlx.controllers.mlp_policy(env, width=32, key=jax.random.key(0))
         dlx.rollout(env, policy, key=jax.random.key(1), x0=[0.1, 0.0]).total_cost
         ```
+
+        ```text
+        Array(1123., dtype=float32)
+        ```
     """
     where = "mlp_policy"
     check_instance(environment, Environment, "environment", where)
@@ -238,6 +246,10 @@ class GRU(AbstractController):
         dlx.rollout(
             env, policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
         ).total_cost
+        ```
+
+        ```text
+        Array(0.097, dtype=float32)
         ```
     """
 
@@ -318,6 +330,10 @@ class Standardise(eqx.Module):
         dlx.rollout(
             env, policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
         ).total_cost
+        ```
+
+        ```text
+        Array(0.903, dtype=float32)
         ```
     """
 

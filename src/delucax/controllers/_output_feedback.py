@@ -62,6 +62,10 @@ class OutputFeedback(AbstractController):
         controller = dlx.controllers.OutputFeedback(regulator, ekf)
         dlx.rollout(env, controller, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
+
+        ```text
+        Array(0.502, dtype=float32)
+        ```
     """
 
     controller: AbstractController
@@ -173,6 +177,10 @@ class LQG(AbstractController):
         )
         trajectory = dlx.rollout(env, lqg, key=jax.random.key(0))
         trajectory.total_cost / 200, lqg.average_cost
+        ```
+
+        ```text
+        (Array(0.662, dtype=float32), Array(0.704, dtype=float32))
         ```
     """
 

@@ -218,6 +218,10 @@ class PID(_AbstractPID):
         )
         dlx.rollout(env, pid, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
         ```
+
+        ```text
+        Array(0.093, dtype=float32)
+        ```
     """
 
     kp: Real = weight()
@@ -328,6 +332,10 @@ class LeakyPID(_AbstractPID):
         env = dlx.make("pendulum")
         pid = dlx.controllers.LeakyPID(20.0, 5.0, 50.0, dt=env.dt, output=0)
         dlx.rollout(env, pid, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+
+        ```text
+        Array(7.03, dtype=float32)
         ```
     """
 

@@ -142,6 +142,10 @@ def lqrd(
         regulator = dlx.controllers.lqrd(pendulum, jnp.eye(2), jnp.eye(1), dt=0.05)
         regulator.K
         ```
+
+        ```text
+        Array([[9.146, 2.489]], dtype=float32)
+        ```
     """
     hint = " (for dynamics in discrete time use `delucax.controllers.LQR`)"
     check_instance(system, AbstractSystem, "system", "lqrd", hint)

@@ -97,6 +97,10 @@ class Gaussian(_AroundBase):
         trajectory = dlx.rollout(env, policy, key=jax.random.key(0), x0=[0.1, 0.0])
         policy.total_log_prob(trajectory)
         ```
+
+        ```text
+        Array(-91., dtype=float32)
+        ```
     """
 
     base: AbstractController
@@ -241,9 +245,14 @@ class Categorical(_AroundBase):
         env = dlx.make("pendulum")
         logits = dlx.controllers.MLP(2, 3, width=8, depth=1, key=jax.random.key(0))
         policy = dlx.controllers.Categorical(logits, [[-2.0], [0.0], [2.0]])
-        dlx.rollout(
+        run = dlx.rollout(
             env, policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
-        ).controls
+        )
+        run.controls[:, 0]
+        ```
+
+        ```text
+        Array([ 2.,  2.,  0.,  2.,  2., -2.,  0., -2.,  0., -2.], dtype=float32)
         ```
     """
 

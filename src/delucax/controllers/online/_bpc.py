@@ -95,6 +95,10 @@ class BPC(AbstractController):
         learner = dlx.controllers.BPC(env.dynamics, base)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
         ```
+
+        ```text
+        Array(230., dtype=float32)
+        ```
     """
 
     loop: ClosedLoop

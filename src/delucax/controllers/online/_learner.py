@@ -105,6 +105,10 @@ class OnlineLearner(AbstractLearner):
         learner = dlx.controllers.gpc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
+
+        ```text
+        Array(9.56, dtype=float32)
+        ```
     """
 
     loop: ClosedLoop

@@ -79,6 +79,10 @@ def adagrad_norm() -> optax.GradientTransformation:
         step, state = optimiser.update(jnp.array([3.0, 4.0]), state)
         optax.apply_updates(jnp.zeros(2), step)
         ```
+
+        ```text
+        Array([-0.6, -0.8], dtype=float32)
+        ```
     """
     return _ADAGRAD_NORM
 
@@ -201,6 +205,10 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
         optimiser = dlx.controllers.online_newton(prior=20.0)
         learner = dlx.controllers.gpc(env.dynamics, env.cost, optimiser=optimiser)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
+        ```
+
+        ```text
+        Array(9.72, dtype=float32)
         ```
     """
     check_positive(prior, "prior", "online_newton")
