@@ -39,7 +39,7 @@ class Zero(AbstractController):
         ```
 
         ```text
-        Array(519.5, dtype=float32)
+        Array(519., dtype=float32)
         ```
     """
 

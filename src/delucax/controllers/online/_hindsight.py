@@ -155,10 +155,6 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... 
         best = dlx.controllers.best_in_hindsight(env, lqr, run)
         dlx.controllers.regret(run, best.trajectory)[-1]
         ```
-
-        ```text
-        Array(23.89, dtype=float32)
-        ```
     """
     costs, others = trajectory.costs, comparator.costs
     if costs is None or others is None or costs.shape != others.shape:
