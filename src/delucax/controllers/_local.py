@@ -131,7 +131,7 @@ def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if the state is not observed, or for the reasons of
+    **Raises:** `ValueError` if the state is not observed, or for the same reasons as
     [`delucax.controllers.local_model`][]; an error at run time if there is no
     stabilising gain.
 
@@ -180,7 +180,7 @@ def local_mpc(
     **Returns:** a [`delucax.controllers.MPC`][].
 
     **Raises:** `ValueError` if the size of the observation is not that of the state, or
-    for the reasons of [`delucax.controllers.MPC`][].
+    for the same reasons as [`delucax.controllers.MPC`][].
 
     !!! example
 

@@ -252,8 +252,8 @@ def sfc(
     `memory + 1` values of the signal in `loop.signal`, or `2 memory` with `double`, and
     the matrices $M$ side by side in `theta`.
 
-    **Raises:** `ValueError` for the reasons of [`delucax.controllers.drc`][], or if
-    `filters` is larger than `memory`, or `margin` is not between 0 and 1.
+    **Raises:** `ValueError` for the same reasons as [`delucax.controllers.drc`][], or
+    if `filters` is larger than `memory`, or `margin` is not between 0 and 1.
 
     Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (spectral control).
 
@@ -339,8 +339,8 @@ def neural_gpc(
     **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` is the weights
     of the network.
 
-    **Raises:** `ValueError` for the reasons of [`delucax.controllers.gpc`][], or if
-    there is no random key.
+    **Raises:** `ValueError` for the same reasons as [`delucax.controllers.gpc`][], or
+    if there is no random key.
 
     Source: Chen, Minasyan, Lee and Hazan, 2022.
 
