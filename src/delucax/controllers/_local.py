@@ -169,7 +169,7 @@ def local_mpc(
     **Arguments:**
 
     - `environment`: the environment. Its observation must be its state.
-    - `lqr`: the regulator whose cost to go is the final cost, such as that of
+    - `lqr`: the regulator whose cost to go is the final cost, for example from
         [`delucax.controllers.local_lqr`][]. By default plans end with the final cost of
         the environment.
     - `horizon`: the number of steps of a plan, 30 by default.
@@ -179,7 +179,7 @@ def local_mpc(
 
     **Returns:** a [`delucax.controllers.MPC`][].
 
-    **Raises:** `ValueError` if the size of the observation is not that of the state, or
+    **Raises:** `ValueError` if the observation and the state differ in size, or
     for the same reasons as [`delucax.controllers.MPC`][].
 
     !!! example

@@ -95,10 +95,10 @@ class MPC(AbstractController):
     `start`, so give a converged plan there if you have one. If a program cannot be
     solved, the next program is about the same plan, shifted by one more step.
 
-    **Derivatives.** The derivatives are those of the planner.
+    **Derivatives.** They are the derivatives of the planner.
     [`delucax.planning.ILQR`][] uses the implicit function theorem, and gives NaN if a
-    plan did not converge. Through a planner that samples, the derivatives are those of
-    the chosen start. The choice itself has no derivative.
+    plan did not converge. If the planner samples, only the chosen start is
+    differentiated. The choice itself has no derivative.
 
     **Arguments:**
 
@@ -120,7 +120,7 @@ class MPC(AbstractController):
     - `throw`: whether to raise at run time if there is no usable plan; true by default.
         If false, the controller uses the last plan for one more step, under its gains,
         and then discards it. If there is no usable plan in the next step either, it
-        applies the first trajectory of `start`, by default that of the LQR. With
+        applies the first trajectory of `start`, by default the LQR's. With
         `real_time`, it keeps following the last plan.
     - `fallback`: a controller that acts in the steps without a usable plan, instead of
         raising. It is called at every step, so its state is up to date. None by

@@ -187,9 +187,8 @@ class PID(_AbstractPID):
 
     - `kp`, `ki`, `kd`: the gains $k_p$, $k_i$ and $k_d$, each a number or a vector with
         an entry for each loop; trainable. `ki` and `kd` are 0 by default. Their units
-        are those of the control over those of the error, its integral and its
-        derivative.
-    - `dt`: the control interval $\Delta t$, the same as that of the environment.
+        are units of the control per unit of the error, its integral and its derivative.
+    - `dt`: the control interval $\Delta t$, equal to the environment's `dt`.
     - `reference`: $r$, a function of time, a vector or a number; 0 by default.
     - `output`: $h$, what the loops follow: an index into the observation, a tuple of
         indices, a matrix, or a function of the observation. By default the whole

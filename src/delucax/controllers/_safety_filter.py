@@ -115,10 +115,9 @@ class SafetyFilter(AbstractController):
 
     **Derivatives.** You can train a policy through the filter. The derivatives are
     exact, in discrete time by the implicit function theorem if the filter converged.
-    The control is not smooth in states where a condition becomes active. There the
-    derivative is that of one side, or NaN if [`delucax.qp.solve`][] found the control.
-    It does so if several conditions are active. One active condition is solved in
-    closed form.
+    One active condition is solved in closed form, several by [`delucax.qp.solve`][].
+    The control is not smooth at states where a condition becomes active. There the
+    derivative belongs to one side, or is NaN if a quadratic program was solved.
 
     **Arguments:**
 

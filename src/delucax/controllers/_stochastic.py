@@ -66,7 +66,7 @@ class Gaussian(_AroundBase):
     `gaussian.base`. The draw is differentiable: analytic gradients pass through it,
     with the noise $e$ held fixed.
 
-    The log-probability is that of the clipped control. Between the bounds it is the log
+    The log-probability belongs to the clipped control. Between the bounds it is the log
     of the normal density. At a bound it is the log of the probability of all draws that
     are clipped to it. If you pass the bounds of the environment, it is thus the
     log-probability of the controls that a [`delucax.Trajectory`][] records.
@@ -185,7 +185,7 @@ class Gaussian(_AroundBase):
 
         **Arguments:** `trajectory`: one run of this controller, with its observations,
         controls and costs. Use `jax.vmap` for a batch. The bounds of this controller
-        must be within those of the environment, otherwise the recorded controls are not
+        must be within the environment's bounds, otherwise the recorded controls are not
         the drawn ones.
 
         **Returns:** a scalar.

@@ -27,7 +27,7 @@ class ExploreState(NamedTuple):
     - `excitations`: the last random controls, newest first.
     - `moments`: sums of the products of the state and the random control `j + 1` steps
         before, shape `(order + 1, n, m)`.
-    - `model`: the identified dynamics. `arrays`: those of the controller for them.
+    - `model`: the identified dynamics. `arrays`: the arrays of its controller.
         `inner`: the state of that controller.
     - `key`: the random key of the next control.
     """

@@ -133,7 +133,7 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... 
     **Arguments:**
 
     - `trajectory`: a run with its costs.
-    - `comparator`: another run under the same disturbances, such as that of
+    - `comparator`: another run under the same disturbances, for example from
         [`delucax.controllers.best_in_hindsight`][].
 
     **Returns:** shape `(T,)`.

@@ -1,4 +1,4 @@
-"""Online learners of a policy whose control is added to that of a base controller."""
+"""Online learners of a policy that adds to the control of a base controller."""
 
 import functools
 from collections.abc import Callable
@@ -210,8 +210,8 @@ class OnlineLearner(AbstractLearner):
     def _weighted(self, root, loop):
         """The response to a control added at each step of the roll-out, times `L'`.
 
-        The response is that of observation and control. The newest step comes first,
-        shape `(horizon + 1, p + m, m)`.
+        **Returns:** the weighted response of observation and control, newest step
+        first, shape `(horizon + 1, p + m, m)`.
         """
         past = self.loop.past(loop)
         p, m = loop.y.shape[0], past.shape[2]

@@ -35,7 +35,7 @@ class AbstractPolicy(eqx.Module):
     def __call__(
         self, theta: PyTree, features: Float[Array, " f"]
     ) -> Float[Array, " m"]:
-        """The control that is added to that of the base."""
+        """The control that is added to the control of the base."""
 
     @abc.abstractmethod
     def project(self, theta: PyTree) -> PyTree:
