@@ -59,8 +59,8 @@ _TITLES = {
         "The Silverbox is an electronic oscillator with a cubic spring. The data are "
         "those of [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) (Wigren "
         "and Schoukens, 2013). The file is `SNLS80mV.csv` of its archive with the "
-        "columns `V1` and `V2`, compressed as `silverbox/SNLS80mV.csv.gz`. There are three tests: the last quarter of the "
-        "multisine, the whole arrow, and the part of the arrow whose amplitudes occur"
+        "columns `V1` and `V2`, compressed as `silverbox/SNLS80mV.csv.gz`. There "
+        "are three tests: the last quarter of the multisine, the whole arrow, and the part of the arrow whose amplitudes occur"
         " in the estimation half. The error is in mV. Our models are fitted to the "
         "first 16,000 of the 65,062 samples.",
     ),
@@ -133,8 +133,8 @@ def _summary(stored: dict[str, Any]) -> str:
         f"{median['tanks', 'test']:.3f} V on the cascaded tanks, "
         f"{median['silverbox', 'multisine']:.3f} mV on the multisine of the Silverbox "
         f"and {median['silverbox', 'arrow']:.3f} mV on its arrow, and "
-        f"{median['bouc_wen', 'multisine']:.1f} um on the multisine of Bouc-Wen. On the "
-        f"sweep of Bouc-Wen its error is {median['bouc_wen', 'sweep']:.1f} um, "
+        f"{median['bouc_wen', 'multisine']:.1f} um on the multisine of Bouc-Wen. On "
+        f"the sweep of Bouc-Wen its error is {median['bouc_wen', 'sweep']:.1f} um, "
         f"{median['bouc_wen', 'sweep'] / _BEST_SWEEP:.1f} times that of the published "
         "fit that knows the equation of the hysteresis."
     )
