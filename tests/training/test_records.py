@@ -207,8 +207,8 @@ def test_bootstrap():
     assert_close(again.std, std, rtol=0.2)
     assert_close(again.low, fitted.low, atol=float(std))
     assert_close(again.high, fitted.high, atol=float(std))
-    with user_error(match="block must be at most the 120 of a record, got 121"):
+    with user_error(match="block must be at most the 120 samples of the shortest .*, got 121"):
         drawn(block=121, key=jax.random.key(0))
     linear = sysid.linear(record)
-    with user_error(match="fitted must be of sysid.physical"):
+    with user_error(match="fitted must be a result of sysid.physical"):
         sysid.bootstrap(linear, record, key=jax.random.key(0))

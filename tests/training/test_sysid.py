@@ -323,9 +323,9 @@ def test_intervals_of_a_reactor_cover_the_truth():
 def test_bad_input():
     states, controls = np.random.default_rng(0).normal(size=(11, 2)), np.zeros((10, 1))
     run = record(states, controls)
-    with user_error(match="steps must be at most the 10 of a record, got 11"):
+    with user_error(match="steps must be at most the 10 of the shortest record, got"):
         sysid.windows(run, 11)
-    with user_error(match="more than the 12 steps that are looked back on"):
+    with user_error(match="at least 12 steps, as many as the model looks back"):
         sysid.arx(run, outputs_back=12, controls_back=1)
     with user_error(match="2 outputs and 1 controls, as the dynamics have, got 1"):
         sysid.physical(GUESS, record(states[:, :1], controls), "system.mass")

@@ -1,4 +1,4 @@
-"""Intervals by resampling the residuals."""
+"""Confidence intervals by a bootstrap of the residuals."""
 
 from typing import Any, NamedTuple
 
@@ -24,20 +24,22 @@ from ._windows import cut_into_windows
 
 
 _WHERE = "sysid.bootstrap"
-# Fits that run side by side.
+# This many fits run in one batch.
 _AT_ONCE = 20
 
 
 class Bootstrap(NamedTuple):
-    """Estimates from resampled records.
+    """The estimates from resampled records, and their confidence intervals.
 
     **Attributes:**
 
-    - `names`: of the p parameters.
-    - `estimates`: shape `(draws, p)`, NaN for a fit that failed.
-    - `std`: their standard deviations, shape `(p,)`.
-    - `low`, `high`: the ends of their intervals, shape `(p,)`.
-    - `failures`: how many of the fits failed; those do not count.
+    - `names`: the names of the p parameters.
+    - `estimates`: the estimates of each draw, shape `(draws, p)`; NaN if its fit
+        failed.
+    - `std`: the standard deviations of the estimates, shape `(p,)`.
+    - `low`, `high`: the ends of the confidence intervals, shape `(p,)`.
+    - `failures`: the number of fits that failed. They do not count in `std`, `low` and
+        `high`.
 
     !!! example
 
@@ -72,32 +74,40 @@ def bootstrap(
     max_steps: int = 20,
     key: PRNGKey,
 ) -> Bootstrap:
-    """Intervals of a fit by [`delucax.training.sysid.physical`][], from fits to records
-    whose residuals are drawn anew.
+    """Confidence intervals of physical parameters by a bootstrap of the residuals.
 
-    Each draw adds to the outputs of the fitted model residuals that are taken at random
-    from those of the fit, and fits once more from there. These intervals need neither a
-    model that is linear over them, nor normal noise; with `block` above 1 not white
-    noise either, because blocks of neighbouring residuals are drawn together. They take
-    as many fits as there are draws.
+    Each draw makes a new record: it adds residuals, drawn at random from those of the
+    fit, to the outputs of the fitted model. The parameters are then fitted to this
+    record, starting at `fitted`. The spread of these estimates gives the intervals.
+
+    The intervals of [`delucax.training.sysid.physical`][] assume white normal noise and
+    a model that is nearly linear in the parameters across the interval. The bootstrap
+    does not assume that the noise is normal or the model linear. If the noise is not
+    white, draw blocks of neighbouring residuals together with `block`. The cost is one
+    fit for each draw.
 
     **Arguments:**
 
-    - `fitted`: the fit.
-    - `record`: that it was fitted to, a [`delucax.training.sysid.Record`][] or a list
-        of them.
-    - `parameters`: those of the fit; by default what `fitted` names.
-    - `draws`: how many, 100 by default.
-    - `block`: neighbouring residuals that are drawn together, 1 by default; some times
-        as many as the noise is correlated over.
-    - `window`: that of the fit, 20 by default.
-    - `level`: of the intervals, 0.95 by default.
-    - `max_steps`: of each fit, 20 by default.
+    - `fitted`: the result of [`delucax.training.sysid.physical`][].
+    - `record`: the data of that fit, a [`delucax.training.sysid.Record`][] or a list of
+        them.
+    - `parameters`: the parameters of the fit, in the form that `physical` takes; by
+        default the names in `fitted`. Give them again if they were a dictionary with
+        constraints.
+    - `draws`: the number of draws, at least 2; 100 by default.
+    - `block`: the number of neighbouring residuals that are drawn together, 1 by
+        default. Take several times the number of samples over which the noise is
+        correlated.
+    - `window`: the window of the fit in steps, 20 by default; `None` takes each record
+        as one window.
+    - `level`: the confidence level, 0.95 by default.
+    - `max_steps`: the maximum number of iterations of each fit, 20 by default.
     - `key`: a random key.
 
     **Returns:** a [`delucax.training.sysid.Bootstrap`][].
 
-    **Raises:** `ValueError` on arguments of the wrong kind.
+    **Raises:** `ValueError` on arguments of the wrong kind, if `fitted` does not come
+    from `physical`, or if `block` is longer than the shortest record.
 
     Source: Efron and Tibshirani, 1993; Künsch, 1989 (blocks).
 
@@ -124,13 +134,14 @@ def bootstrap(
     draws = check_count(draws, "draws", _WHERE, least=2)
     shortest = min(map(len, records))
     block = check_count(block, "block", _WHERE)
-    check_at_most(block, shortest, "block", _WHERE, "of a record")
+    of = "samples of the shortest record"
+    check_at_most(block, shortest, "block", _WHERE, of)
     check_range(level, "level", _WHERE, 0, 1)
     key = check_key(key, _WHERE)
     if fitted.x0 is None:
         raise ValueError(
-            f"{_WHERE}: fitted must be of sysid.physical, which estimates where the "
-            "record starts."
+            f"{_WHERE}: fitted must be a result of sysid.physical, which estimates the "
+            "first state; got a fit whose x0 is None."
         )
     if parameters is None:
         parameters = sorted({name.split("[")[0] for name in fitted.names})
@@ -143,7 +154,8 @@ def bootstrap(
     firsts = guessed_starts(model, firsts, groups, _WHERE)
     given = model, sampling, firsts, groups, rows, window
     outputs, residuals = _residuals(*given)
-    # The fit has used some degrees of freedom up.
+    # The fit made the residuals smaller than the noise; scale them up by the degrees
+    # of freedom that it used.
     unknown = len(fitted.names) + x0.size
     total = sum(map(len, records)) * outputs[0].shape[1]
     residuals = residuals * np.sqrt(total / max(total - unknown, 1))
@@ -178,7 +190,7 @@ def _residuals(
     rows: list[Float[Array, "_ _ row"]],
     window: int,
 ) -> tuple[list[Float[Array, "_ y"]], Float[Array, "all y"]]:
-    """The outputs of the model along each record, and what remains of all."""
+    """The outputs of the model along each record, and the residuals of all records."""
     guesses = simulated_records(model, sampling, firsts, groups, rows)
     starts, data = cut_into_windows(guesses, groups, rows, window, 0, None)
     starts = estimated_starts(model, sampling, starts, data).starts

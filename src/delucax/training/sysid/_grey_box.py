@@ -1,4 +1,4 @@
-"""Physics with a network for what it leaves out."""
+"""Grey-box models: physics, and a network for what the equations leave out."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -33,24 +33,26 @@ from ._windows import begins_of, cut_into_windows
 
 
 _WHERE = "sysid.grey_box"
-# That of weights which correct next to nothing: the physics alone.
+# With this spread the weights stay so small that only the physics counts.
 _NONE = 1e-6
-# A network is worth it from this gain on, a share of the error.
+# The network must reduce the error by this share to be kept.
 _WORTH = 0.01
 
 
 class GreyBox(NamedTuple):
-    """Physics with a network, as [`delucax.training.sysid.grey_box`][] fits it.
+    """The result of [`delucax.training.sysid.grey_box`][].
 
     **Attributes:**
 
-    - `model`: the dynamics, a [`delucax.Discretized`][]
-        [`delucax.systems.Corrected`][]; those of the physics alone where no network is
+    - `model`: the dynamics, [`delucax.Discretized`][] of a
+        [`delucax.systems.Corrected`][] system; the physics alone if no network is
         better.
-    - `physics`: the fit without the network, an `Identified`.
-    - `errors`: from each tried `spread` to the root of the mean squared relative error
-        on what was kept for the choice, and from 0 to that of the physics.
-    - `spread`: the one that was chosen; 0 for the physics alone.
+    - `physics`: the fit without the network, a
+        [`delucax.training.sysid.Identified`][].
+    - `errors`: a dictionary from each `spread` that was tried to the relative
+        root-mean-square error of a free run over the last part of the records. The
+        entry of 0 is the physics alone.
+    - `spread`: the spread that was chosen; 0 for the physics alone.
 
     !!! example
 
@@ -84,40 +86,50 @@ def grey_box(
     max_steps: int = 50,
     key: PRNGKey,
 ) -> GreyBox:
-    r"""Physical parameters, and a network for what the equations leave out,
+    r"""Fit physical parameters, and a network for what the equations leave out.
 
-    `min over theta, phi, z of sum_k |(y_k - h(x_k)) / noise|^2 + |(phi - phi_0) / s|^2`
-    with `dx/dt = f(t, x, u; theta) + size * network(x, u; phi)`.
+    $$\min_{\theta, \phi, z} \sum_k \left|\frac{y_k - h(x_k)}{\mathrm{noise}}\right|^2
+    + \left|\frac{\phi - \phi_0}{s}\right|^2, \qquad
+    \dot x = f(t, x, u; \theta) + \mathrm{size} \cdot \mathrm{network}(x, u; \phi)$$
 
-    First the physics is fitted alone, by [`delucax.training.sysid.physical`][], which
-    also gives the noise. Then the network, whose last layer begins at zero, is fitted
-    with it, by the same method of Levenberg and Marquardt. Its weights have a normal
-    prior: of deviation 1 around their random beginning in the inner layers, of
-    deviation `spread` around zero in the last one. The spread is chosen by the free
-    run over the last part of the records, which those fits do not use; with it, all is
-    fitted once more to the whole. Where no network is better by 1%, the physics alone
-    is returned.
+    Here $z$ are the states at which the windows begin. The fit has three stages:
+
+    1. [`delucax.training.sysid.physical`][] fits the physics alone, and estimates the
+       noise.
+    2. The physics and the network are fitted together to the first part of each record,
+       once for each of `spreads`, by the Levenberg-Marquardt method. The last layer of
+       the network starts at zero. The weights have a normal prior, with standard
+       deviation $s$: 1 about the random initial weights in the inner layers, and the
+       spread about zero in the last layer.
+    3. The spread with the least error in a free run over the last part of the records
+       is chosen, and the model is fitted once more to the whole records. If no network
+       reduces this error by 1%, the physics alone is returned.
 
     **Arguments:**
 
-    - `dynamics`: a [`delucax.Discretized`][] system with parameters at a first guess.
+    - `dynamics`: a [`delucax.Discretized`][] system whose parameters are a first guess.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
-    - `parameters`: what is estimated, as in [`delucax.training.sysid.physical`][].
-    - `width`, `depth`: of the network, 8 and 1 by default.
-    - `corrected`: the names of the states whose derivatives are corrected, each by the
-        size of its deviation along the record; all by default. Leave out those that
-        are known, such as that of a position.
-    - `spreads`: that are tried, 0.01, 0.03, 0.1 and 0.3 by default.
-    - `x0`, `window`: as in `physical`; `None` takes each record as one window.
-    - `share`: of each record, for the fits by which the spread is chosen; 0.75 by
-        default.
-    - `max_steps`: of each fit, 50 by default.
-    - `key`: a random key, for the first weights.
+    - `parameters`: the parameters to estimate, as in
+        [`delucax.training.sysid.physical`][].
+    - `width`, `depth`: units in each hidden layer and number of hidden layers of the
+        network, 8 and 1 by default.
+    - `corrected`: the names of the states whose derivatives the network corrects; all
+        by default. Leave out derivatives that are known exactly, such as that of a
+        position. The size of each correction is the standard deviation of the
+        derivative along the record.
+    - `spreads`: the spreads to try; 0.01, 0.03, 0.1 and 0.3 by default.
+    - `x0`, `window`: as in `physical`; a `window` of `None` takes each record as one
+        window.
+    - `share`: the share of each record that is used to fit while the spread is chosen,
+        between 0 and 1; 0.75 by default.
+    - `max_steps`: the maximum number of iterations of each fit, 50 by default. The fit
+        of the physics alone gets at least 100.
+    - `key`: a random key for the initial weights.
 
     **Returns:** a [`delucax.training.sysid.GreyBox`][].
 
     **Raises:** `ValueError` on arguments of the wrong kind; an error at run time if
-    the physics alone cannot be fitted.
+    the fit of the physics alone fails.
 
     Source: Ljung, 1999 (regularised prediction errors); Forgione and Piga, 2021.
 
@@ -198,7 +210,7 @@ def grey_box(
 
 @eqx.filter_jit
 def _scales(guesses: list[Array], groups: list[Record]) -> dict[str, Array]:
-    """Of the network's inputs, and of the derivatives."""
+    """The mean and size of the inputs of the network, and the size of its outputs."""
     flat = lambda arrays: jnp.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays])
     x, u = flat(guesses), flat([group.controls for group in groups])
     slopes = flat(
@@ -218,7 +230,7 @@ def _scales(guesses: list[Array], groups: list[Record]) -> dict[str, Array]:
 
 
 def _paths(parameters: Any) -> dict[str, Any]:
-    """Where the parameters are behind the network, and the network."""
+    """The paths of the parameters in the corrected system, and of the network."""
     if isinstance(parameters, str):
         parameters = [parameters]
     limits = (
@@ -231,7 +243,7 @@ def _paths(parameters: Any) -> dict[str, Any]:
 
 
 def _prior(values: dict[str, Array], spread: float, depth: int) -> Prior:
-    """Of the weights around their beginnings."""
+    """The prior of the weights about their initial values."""
     network = "system.network.layers."
 
     def std(path):
@@ -245,7 +257,7 @@ def _prior(values: dict[str, Array], spread: float, depth: int) -> Prior:
 
 
 def _is_early(groups: list[Record], window: int, share: float) -> Array:
-    """Of each point of a window, whether it is in the first part of its record."""
+    """Whether each point of a window is in the first part of its record."""
     parts = []
     for group in groups:
         inside = begins_of(group, window)[:, None] + np.arange(window + 1)
@@ -264,7 +276,8 @@ def _late_error(
     window: int,
     share: float,
 ) -> Float[Array, ""]:
-    """Of a free run, on the last part of the records, relative to the outputs there."""
+    """The error of a free run over the last part of the records, relative to the
+    standard deviation of the outputs there."""
     model = assembly(solution.values)
     count, firsts = 0, []
     for group in groups:

@@ -1,4 +1,4 @@
-"""What the triangular factor of block Hankel matrices tells of a linear system."""
+"""A linear system from the triangular factor of block Hankel matrices."""
 
 from typing import NamedTuple
 
@@ -12,17 +12,18 @@ from ...riccati import filter_dare
 from ._record import Record
 
 
-# Columns of the Hankel matrices that are made at once.
+# This many columns of the Hankel matrices are built at a time.
 _CHUNK = 4096
-# Noise of this many units in the last place is rounding.
+# Noise below this many units in the last place counts as rounding.
 _ROUNDING = 1e3
-# The noise of each state, in parts of its size, against which first states are held.
-# About zero, and enough to forget in some hundred steps what an integrator has summed.
+# The noise of each state, relative to its size, that is assumed when the first states
+# are fitted. It is nearly zero, but lets the predictor of an integrator forget old
+# noise within some hundred steps.
 _SLIGHT = 1e-3
 
 
 class Units(NamedTuple):
-    """What is subtracted from each output and control, and what that is divided by."""
+    """The mean and the size by which each output and control is normalised."""
 
     outputs: tuple[Float[Array, " p"], Float[Array, " p"]]
     controls: tuple[Float[Array, " m"], Float[Array, " m"]]
@@ -34,7 +35,7 @@ class Units(NamedTuple):
 
 
 class Realised(NamedTuple):
-    """What the triangular factor tells, in the units of `Units`."""
+    """The matrices of the system that the factor gives, in the units of `Units`."""
 
     A: Float[Array, "n n"]
     C: Float[Array, "p n"]
@@ -48,27 +49,27 @@ class Realised(NamedTuple):
 def realised(
     groups: list[Record], order: int, horizon: int, affine: bool
 ) -> tuple[Units, Realised]:
-    """A, C and K, from the triangular factor of the block Hankel matrices."""
+    """The units, and A, C and K from the triangular factor of the Hankel matrices."""
     units = _units(groups, affine)
     signals = [units.of(group) for group in groups]
     p, m = (signal.shape[2] for signal in signals[0])
     L = _factor(signals, horizon, affine)
-    # Its rows: 1, all controls, past outputs, and those of the horizon.
+    # The rows of L: 1, all controls, the past outputs, the outputs of the horizon.
     controls, future = affine + 2 * horizon * m, affine + horizon * (2 * m + p)
     eps = float(np.finfo(L.dtype).eps)
     moves = xp.linalg.svd(L[affine:controls, affine:controls], compute_uv=False)
     rank = xp.sum(moves > 10 * len(moves) * eps * moves[0])
     excited = rank >= min(2 * horizon, horizon + order) * m
-    # What the past tells of the outputs, beside the controls of the horizon, is the
-    # observability matrix times the state.
+    # The outputs of the horizon, predicted from the past, less the effect of the
+    # controls of the horizon, are the observability matrix times the state.
     past = L[future:, affine + horizon * m : future]
     directions, values, _ = xp.linalg.svd(past, full_matrices=False)
     size = xp.sqrt(xp.maximum(values[:order], eps * values[0]))
     observed = directions[:, :order] * size
     back = xp.linalg.pinv(observed[:-p])
     A, C = back @ observed[p:], observed[:p]
-    # How the part of an output that nothing before tells moves those after it: by C K,
-    # C A K and so on.
+    # An innovation, the part of an output that the past does not predict, moves the
+    # later outputs by C K, C A K and so on.
     new, after = L[future : future + p, future:], L[future + p :, future:]
     new, after = new[:, :p], after[:, :p]
     tiny = (_ROUNDING * eps) ** 2
@@ -76,8 +77,8 @@ def realised(
     gain = back @ xp.linalg.solve(variance, new @ after.T).T
     unit, slight = xp.eye(p, dtype=L.dtype), xp.diag(_SLIGHT * size) ** 2
     start_gain = filter_dare(A, C, slight, unit, throw=False).K
-    # Of all predictors of which the errors have the same spectrum, the stable one:
-    # that with this gain itself, up to rounding, if it is.
+    # Several predictors have errors of the same spectrum. Take the stable one: it is
+    # the one with this gain, up to rounding, if that is stable.
     scale = xp.mean(xp.diag(variance))
     given = A - gain @ C, C, xp.diag(tiny * size**2) / scale, variance / scale
     more = filter_dare(*given, throw=False)
@@ -102,8 +103,8 @@ def _factor(
     """The lower triangular factor of the block Hankel matrices of all records."""
     p, m = (signal.shape[2] for signal in signals[0])
     width, dtype = affine + 2 * horizon * (m + p), signals[0][0].dtype
-    # The controls of the horizon come before those of the past, whose part beside
-    # them is looked for; its first step comes last.
+    # The controls of the horizon come first, so that the factor removes their effect;
+    # the first step of the horizon comes last of them.
     order = np.r_[horizon + 1 : 2 * horizon, horizon, :horizon]
     R, total = xp.zeros((width, width), dtype), 0
     for y, u in signals:
@@ -125,7 +126,7 @@ def _factor(
             parts = [xp.ones((size, 1), dtype)] * affine
             parts += [u[inside[:, order]].reshape(size, -1)]
             parts += [y[inside].reshape(size, -1)]
-            # Rows of zeros, where there is no stretch, change nothing.
+            # Rows of zeros, which fill up the last chunk, change nothing.
             rows = xp.concatenate(parts, axis=1) * counts[:, None]
             return xp.linalg.qr(xp.concatenate([R, rows]), mode="r"), None
 

@@ -1,4 +1,4 @@
-"""The result of an identification, with its uncertainty and identifiability."""
+"""The result of a fit, with its uncertainty and identifiability."""
 
 from typing import Any, NamedTuple
 
@@ -18,47 +18,48 @@ CORRELATED = 4.0
 """The threshold of the whiteness test, in standard deviations."""
 
 _LOADS = 0.02
-"""The share of an unknown direction in a parameter that makes the parameter unknown."""
+"""A parameter is unknown if its entry in an unknown direction exceeds this."""
 
 
 class Identified(eqx.Module):
-    """A model that was fitted to data, and how well the data determine it.
+    r"""A model that was fitted to data, and how well the data determine it.
 
-    The directions are singular vectors of the sensitivity of the data to relative
-    changes of the parameters (to changes in units of the regressors' size, in a linear
-    fit). Along each there is a spread, the standard deviation of the estimate; where it
-    is as large as the parameter itself, or the data do not depend on it at all, the
-    direction is not identifiable: the parameters can be moved along it together, and
-    the data do not change.
+    A direction is a combination of relative changes of the parameters (in a linear fit,
+    of changes in units of the size of the regressors). The directions are the singular
+    vectors of the sensitivity of the data to such changes. The spread of a direction is
+    the standard deviation of the estimate along it. A direction is not identifiable if
+    its spread is as large as the parameters themselves, or if the data do not depend on
+    it: the parameters can then move along it together, and the data hardly change.
+
+    Printing the object prints the table of `report`.
 
     **Attributes:**
 
-    - `model`: the fitted dynamics, like any other.
-    - `names`: of the p parameters.
-    - `estimate`: their values, shape `(p,)`; in a linear fit `(outputs, p)`.
-    - `std`: their standard deviations, of the same shape; infinite for what is not
-        identifiable, NaN where the fit did not converge.
-    - `low`, `high`: the ends of their confidence intervals, of the same shape; those of
-        all valid values, such as 0 and infinity, for what is not identifiable; NaN
-        where the fit did not converge.
+    - `model`: the fitted dynamics.
+    - `names`: the names of the p parameters.
+    - `estimate`: the values of the parameters, shape `(p,)`; `(outputs, p)` in a linear
+        fit.
+    - `std`: their standard deviations, same shape. Infinite if a parameter is not
+        identifiable, NaN if the fit did not converge.
+    - `low`, `high`: the ends of their confidence intervals, same shape. If a parameter
+        is not identifiable, they span all valid values, for example 0 to infinity. NaN
+        if the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
-    - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did
-        not converge.
-    - `identifiable`: of each direction, shape `(p,)`; false where the fit did not
-        converge.
+    - `spread`: the standard deviation along each direction, shape `(p,)`; NaN if the
+        fit did not converge.
+    - `identifiable`: whether each direction is identifiable, shape `(p,)`; false if the
+        fit did not converge.
     - `noise`: the standard deviation of the residuals of each output.
-    - `correlation`: of the residuals at lag one, `sqrt(N) r`, with r the correlation
-        coefficient over N steps, that of the output where it is largest;
-        `None` in linear fits. In white noise it is about normal with variance 1. Above
-        4 the model misses something or the noise is correlated; either way the
-        intervals are too narrow, and the report says so. 0 where what remains is less
-        than half of the `noise` that was given, or rounding.
-    - `x0`: the estimated state at the beginning, shape `(n,)`, or `(runs, n)`; `None`
-        where it is not estimated, in linear fits.
+    - `correlation`: a test of whether the residuals are white: $\sqrt N\, r$, where $r$
+        is their correlation coefficient at lag one over $N$ samples, for the output
+        where it is largest. In white noise it is approximately standard normal. Above
+        4, the model is wrong or the noise is correlated. In both cases the intervals
+        are too narrow, and the report says so. It is 0 if the residuals are rounding
+        errors, or less than half of the `noise` that was given; `None` in linear fits.
+    - `x0`: the estimated first state, shape `(n,)`, or `(runs, n)` for a list of
+        records; `None` in linear fits, which do not estimate it.
     - `result`: success; `RESULTS.unexciting` if a direction is not identifiable; or the
         failure of the solver.
-
-    Printed, it is the table of `report`.
 
     Source: Ljung, 1999 (section 16.6: the whiteness of residuals).
 
@@ -99,11 +100,13 @@ class Identified(eqx.Module):
         return super().__repr__()
 
     def report(self) -> str:
-        """A table of the parameters, with what is not identifiable in words, and
-        whether the residuals are correlated.
+        """A table of the parameters with their intervals.
 
-        **Returns:** text of several lines. Where the fit did not converge it says why,
-        and gives no intervals.
+        It also names the directions that are not identifiable, and warns if the
+        residuals are correlated.
+
+        **Returns:** a string of several lines. If the fit did not converge, it says
+        why, and gives no intervals.
         """
         lines = [f"{'parameter':<24}{'estimate':>12}{'low':>12}{'high':>12}"]
         for *output, index in np.ndindex(self.estimate.shape):
@@ -114,7 +117,7 @@ class Identified(eqx.Module):
         failed = self.result != RESULTS.successful
         if failed and self.result != RESULTS.unexciting:
             why = RESULTS[self.result]
-            lines.append(f"the fit failed, and has no intervals: {why}")
+            lines.append(f"the fit failed, so there are no intervals: {why}")
             return "\n".join(lines)
         for row in np.asarray(self.directions)[~np.asarray(self.identifiable)]:
             shares = zip(row, self.names, strict=True)
@@ -131,7 +134,7 @@ class Identified(eqx.Module):
 
 
 def checked(fit: Identified, throw: bool) -> Identified:
-    """`fit` with its final result, and without intervals where the solver failed."""
+    """`fit` with its final result, and without intervals if the solver failed."""
     intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]
     judged = lambda fit: [*intervals(fit), fit.identifiable, fit.result]
     given = fit.estimate, fit.identifiable, fit.result, intervals(fit)
@@ -142,7 +145,7 @@ def checked(fit: Identified, throw: bool) -> Identified:
 
 @eqx.filter_jit
 def _judged(estimate: Array, known: Array, result: Result, intervals: list) -> list:
-    """The intervals, what is identifiable, and the result, if the fit is judged."""
+    """The final intervals, identifiable directions and result of a fit."""
     finite = jnp.all(jnp.isfinite(estimate))
     diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     solver = first_failure(promote(result), diverged)
@@ -154,7 +157,7 @@ def _judged(estimate: Array, known: Array, result: Result, intervals: list) -> l
 
 
 class Certainty(NamedTuple):
-    """The uncertainty of an estimate, from the sensitivity of the data to it."""
+    """The uncertainty of an estimate, from the sensitivity of the data."""
 
     directions: Float[Array, "p p"]
     spread: Float[Array, " p"]
@@ -163,29 +166,29 @@ class Certainty(NamedTuple):
 
     @staticmethod
     def of(sensitivity: Array, sigma: Array, worst: Any) -> "Certainty":
-        """From scaled residuals with a standard deviation `sigma`.
+        """The certainty if the scaled residuals have the standard deviation `sigma`.
 
-        `worst` is the spread from which on a direction counts as unknown.
+        A direction is unknown if its spread is at least `worst`.
         """
         rows, p = sensitivity.shape
-        # With fewer rows than parameters the rest of the directions has no size.
+        # With fewer rows than parameters, the remaining directions have size zero.
         if rows < p:
             sensitivity = jnp.pad(sensitivity, ((0, p - rows), (0, 0)))
-        # S = U diag(size) V': along v_i the estimate has the standard deviation
-        # sigma / size_i, as its covariance is sigma^2 (S' S)^-1. A size below the
-        # rounding of S counts as zero.
+        # S = U diag(size) V' and the covariance is sigma^2 (S' S)^-1, so the standard
+        # deviation along v_i is sigma / size_i. A size below the rounding of S counts
+        # as zero.
         _, size, directions = jnp.linalg.svd(sensitivity, full_matrices=False)
         eps = jnp.finfo(sensitivity.dtype).eps
         sensitive = size > 10 * max(rows, p) * eps * size[0]
         spread = jnp.where(sensitive, sigma / jnp.where(sensitive, size, 1), jnp.inf)
         known = sensitive & (spread < worst)
         share = jnp.abs(directions)
-        # The variance of a parameter is the sum of what the directions add to it.
+        # The variance of a parameter is the sum of the shares of all directions.
         added = (share * jnp.where(known, spread, 0)[:, None]) ** 2
         unknown = jnp.where(share > _LOADS, jnp.inf, 0)
         variance = jnp.sum(jnp.where(known[:, None], added, unknown), axis=0)
-        # A sign for each direction, so that it is the same whatever the solver: the
-        # first of the entries that are about the largest is positive.
+        # Fix the sign of each direction, which the solver leaves open: among its
+        # largest entries, up to 10%, the first is positive.
         is_large = share > 0.9 * jnp.max(share, axis=1, keepdims=True)
         first = jnp.argmax(is_large, axis=1)[:, None]
         directions = directions * jnp.sign(jnp.take_along_axis(directions, first, 1))
@@ -194,7 +197,7 @@ class Certainty(NamedTuple):
 
 
 def quantile(level: Any, where: str) -> Array:
-    """The half-width of a confidence interval in standard deviations."""
+    """The half-width of a confidence interval, in standard deviations."""
     check_range(level, "level", where, 0, 1)
     return _two_sided(as_float_array(level))
 

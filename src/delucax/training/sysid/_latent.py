@@ -1,4 +1,4 @@
-"""Networks of a hidden state: its steps, what shows of it, and where it starts."""
+"""Networks with a hidden state: its dynamics, its outputs, and its encoder."""
 
 from typing import Any
 
@@ -24,28 +24,32 @@ from ...math import matvec
 
 
 class LatentDynamics(AbstractDynamics):
-    """Dynamics of a state that is not measured, and has no unit,
+    r"""Dynamics of a hidden state: a linear part plus fully connected networks.
 
-    `x_next = A x + B v + f(x, v)`, `y = y_mean + y_size (C x + h(x))`, with
-    `v = (u - u_mean) / u_size`,
+    $$x_{k+1} = A x_k + B v_k + f(x_k, v_k), \qquad
+    y_k = \bar y + \sigma_y\,(C x_k + h(x_k)), \qquad
+    v_k = \frac{u_k - \bar u}{\sigma_u}$$
 
-    where f and h are fully connected networks, all of whose layers but the last are
-    drawn: that is zero at first, so that they begin as linear dynamics.
-    [`delucax.training.sysid.state_space`][] fits them.
+    The state is not measured and has no unit. The last layers of the networks $f$ and
+    $h$ are initialised to zero, so the model starts as linear dynamics.
+    [`delucax.training.sysid.state_space`][] fits it.
 
     **Arguments:**
 
     - `A`, `B`, `C`: the linear part, shapes `(n, n)`, `(n, m)` and `(p, n)`.
-    - `width`, `depth`: units of a hidden layer, and hidden layers; 16 and 1 by default.
+    - `width`, `depth`: units in each hidden layer and number of hidden layers, 16 and 1
+        by default.
     - `dt`: the step, 1 by default.
-    - `u_mean`, `u_size`: shape `(m,)` or a number; 0 and 1 by default.
-    - `y_mean`, `y_size`: shape `(p,)` or a number; 0 and 1 by default.
-    - `key`: a random key, for the first weights.
+    - `u_mean`, `u_size`: $\bar u$ and $\sigma_u$, shape `(m,)` or a number; 0 and 1 by
+        default.
+    - `y_mean`, `y_size`: $\bar y$ and $\sigma_y$, shape `(p,)` or a number; 0 and 1 by
+        default.
+    - `key`: a random key for the initial weights.
 
-    **Attributes:** `transition` and `output`, each an `eqx.nn.MLP`; trainable, as A, B
-        and C are.
+    **Attributes:** `transition` and `output`, the networks $f$ and $h$, each an
+        `eqx.nn.MLP`. They are trainable, like `A`, `B` and `C`.
 
-    **Raises:** `ValueError` on other shapes, or a size that is not positive.
+    **Raises:** `ValueError` if a shape is wrong, or a size is not positive.
 
     !!! example
 
@@ -121,31 +125,35 @@ class LatentDynamics(AbstractDynamics):
 
 
 class Encoder(eqx.Module):
-    """The hidden state after the last outputs and controls,
+    r"""Computes the hidden state of a model from the last outputs and controls.
 
-    `x = E z + e(z)`, with z the outputs and controls of `past` samples, each less its
-    mean and in units of its size, and e a fully connected network, whose last layer is
-    zero at first.
+    $$x_k = E z + e(z)$$
 
-    A call `encoder(outputs, controls)` with `outputs` of shape `(past, p)` and
-    `controls` of shape `(past, m)`, those of samples `k - past` to `k - 1`, gives the
-    state at sample k, shape `(n,)`.
+    Here $z$ holds the outputs and controls of the samples `k - past` to `k - 1`,
+    normalised as $(y - \bar y) / \sigma_y$ and $(u - \bar u) / \sigma_u$. The last
+    layer of the fully connected network $e$ is initialised to zero.
+
+    A call `encoder(outputs, controls)` takes these outputs, shape `(past, p)`, and
+    controls, shape `(past, m)`, and returns the state $x_k$, shape `(n,)`.
 
     **Arguments:**
 
-    - `matrix`: E, shape `(n, past (p + m))`, for all outputs, earliest first, and then
-        all controls.
-    - `past`: how many samples.
+    - `matrix`: $E$, shape `(n, past (p + m))`. Its columns belong to all outputs,
+        earliest first, and then to all controls.
+    - `past`: the number of samples.
     - `outputs`: the number of outputs, p.
-    - `width`, `depth`: units of a hidden layer, and hidden layers; 16 and 1 by default.
-    - `u_mean`, `u_size`: shape `(m,)` or a number; 0 and 1 by default.
-    - `y_mean`, `y_size`: shape `(p,)` or a number; 0 and 1 by default.
-    - `key`: a random key, for the first weights.
+    - `width`, `depth`: units in each hidden layer and number of hidden layers, 16 and 1
+        by default.
+    - `u_mean`, `u_size`: $\bar u$ and $\sigma_u$, shape `(m,)` or a number; 0 and 1 by
+        default.
+    - `y_mean`, `y_size`: $\bar y$ and $\sigma_y$, shape `(p,)` or a number; 0 and 1 by
+        default.
+    - `key`: a random key for the initial weights.
 
-    **Attributes:** `matrix`, and `network`, an `eqx.nn.MLP`; trainable.
+    **Attributes:** `matrix`, and `network`, the `eqx.nn.MLP` $e$. Both are trainable.
 
-    **Raises:** `ValueError` on other shapes, when it is made and when it is called, or
-        a size that is not positive.
+    **Raises:** `ValueError` if a shape is wrong, at construction or in a call, or a
+        size is not positive.
 
     !!! example
 
@@ -238,7 +246,7 @@ def _checked_sizes(width: Any, depth: Any, where: str) -> tuple[int, int]:
 
 
 def _quiet(inputs: int, outputs: int, width: int, depth: int, key: PRNGKey) -> Any:
-    """A network whose last layer is zero."""
+    """A fully connected network whose last layer is zero."""
     network = mlp(inputs, outputs, width, depth, key=key)
     last = lambda network: (network.layers[-1].weight, network.layers[-1].bias)
     return eqx.tree_at(last, network, replace_fn=jnp.zeros_like)

@@ -25,28 +25,29 @@ def linear(
     level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
-    r"""Linear dynamics by least squares on the steps of a record of the state,
+    r"""Fit linear dynamics to a record of the state by least squares.
 
-    `min over A, B, c of sum_k |x_{k+1} - A x_k - B u_k - c|^2`.
+    $$\min_{A, B, c} \sum_k |x_{k+1} - A x_k - B u_k - c|^2$$
 
-    The recorded states are assumed to be free of noise, which would bias the estimate.
-    Intervals assume independent, identically distributed residuals.
+    Every state must be measured, without noise: noise in the states biases the
+    estimate. The confidence intervals assume independent, identically distributed
+    residuals.
 
     **Arguments:**
 
-    - `record`: a [`delucax.training.sysid.Record`][], whose outputs are the states, or
-        a list of them; uniform in time.
-    - `affine`: whether to estimate a constant c too; false by default.
-    - `level`: of the confidence intervals, 0.95 by default.
-    - `throw`: raise if the data do not tell all entries (default); if false, look at
-        `result`.
+    - `record`: a [`delucax.training.sysid.Record`][] whose outputs are the states, or a
+        list of them; uniform in time.
+    - `affine`: whether to estimate the constant $c$; false by default, for $c = 0$.
+    - `level`: the confidence level of the intervals, 0.95 by default.
+    - `throw`: raise an error if the data do not determine all entries; true by default.
+        If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Identified`][]; its `model` is a
-    [`delucax.LinearDynamics`][], and row i of its `estimate` holds the entries of A, B
-    and c for the state i.
+    **Returns:** [`delucax.training.sysid.Identified`][]. Its `model` is a
+    [`delucax.LinearDynamics`][]. Row i of its `estimate` holds the entries of $A$, $B$
+    and $c$ for state i.
 
-    **Raises:** `ValueError` if `record` is not one; an error at run time as `throw`
-    says.
+    **Raises:** `ValueError` if `record` is not a uniform record or a list of them; an
+    error at run time as `throw` says.
 
     !!! example
 
@@ -87,30 +88,32 @@ def arx(
     level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
-    r"""An autoregressive model with inputs (ARX) by least squares,
+    r"""Fit an autoregressive model with inputs (ARX) by least squares.
 
-    `y_k = sum_{i=1}^{a} A_i y_{k-i} + sum_{j=0}^{b-1} B_j u_{k-delay-j} + e_k`,
+    $$y_k = \sum_{i=1}^{a} A_i y_{k-i} + \sum_{j=0}^{b-1} B_j u_{k-\mathrm{delay}-j}
+    + e_k$$
 
-    as linear dynamics whose state is the past `(y_k, ..., y_{k-a+1}, u_{k-1}, ...)` and
-    whose observation is `y_k`.
+    The model is returned as linear dynamics. Their state at step k holds the past,
+    `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`, and they observe $y_k$.
 
     **Arguments:**
 
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
-        time; `outputs[k + 1]` is the first that `controls[k]` may move.
-    - `outputs_back`: a, the outputs looked back on.
-    - `controls_back`: b, the controls looked back on.
-    - `delay`: steps from a control to its first effect, 1 by default.
-    - `level`: of the confidence intervals, 0.95 by default.
-    - `throw`: raise if the data do not tell all entries (default); if false, look at
-        `result`.
+        time. `controls[k]` affects `outputs[k + 1]` at the earliest.
+    - `outputs_back`: $a$, the number of past outputs.
+    - `controls_back`: $b$, the number of past controls.
+    - `delay`: the number of steps from a control to its first effect, 1 by default.
+    - `level`: the confidence level of the intervals, 0.95 by default.
+    - `throw`: raise an error if the data do not determine all entries; true by default.
+        If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Identified`][]; row i of its `estimate` holds
-    the entries of `A_1, ..., A_a, B_0, ..., B_{b-1}` for the output i. The state of the
-    model at step k is `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`.
+    **Returns:** [`delucax.training.sysid.Identified`][]. Its `model` is a
+    [`delucax.LinearDynamics`][]. Row i of its `estimate` holds the entries of
+    $A_1, \dots, A_a, B_0, \dots, B_{b-1}$ for output i.
 
-    **Raises:** `ValueError` if `record` is not one, on counts below 1, or fewer steps
-    than are looked back on; an error at run time as `throw` says.
+    **Raises:** `ValueError` if `record` is not a uniform record or a list of them, a
+    count is below 1, or a record has fewer steps than the model looks back; an error at
+    run time as `throw` says.
 
     Source: Ljung, 1999.
 
@@ -136,13 +139,12 @@ def arx(
     delay = check_count(delay, "delay", where)
     reach = quantile(level, where)
     p, m = records[0].outputs.shape[1], records[0].controls.shape[1]
-    # Output k is made of outputs k - i and of controls k - delay - j.
     lags = range(1, a + 1), range(delay, delay + b)
     first = max(a, b + delay - 1)
     if (steps := min(map(len, records)) - 1) < first:
         raise ValueError(
-            f"{where}: record must have more than the {first} steps that are looked "
-            f"back on, got {steps}."
+            f"{where}: record must have at least {first} steps, as many as the model "
+            f"looks back, got {steps}."
         )
     names = [f"y{i}(k-{lag})" for lag in lags[0] for i in range(p)]
     names += [f"u{i}(k-{lag})" for lag in lags[1] for i in range(m)]
@@ -154,8 +156,8 @@ def arx(
 def _regressors(
     groups: list[Record], lags: tuple[Any, Any], affine: bool
 ) -> tuple[Float[Array, "rows p"], Float[Array, "rows outputs"]]:
-    """`(regressors, targets)`: for each output whose whole past is recorded, the
-    outputs and the controls at these lags."""
+    """The past outputs and controls at these lags, and the outputs to be explained, for
+    all steps whose whole past is recorded."""
     first = max(*lags[0], *lags[1])
 
     def of(record):
@@ -179,29 +181,29 @@ def _least_squares(
     targets: Float[Array, "rows outputs"],
     reach: Array,
 ) -> tuple[dict[str, Array], Certainty]:
-    """The estimate of each output with its interval, and what the data tell of the
-    output with the largest relative noise."""
+    """The estimate and interval of each output, and the certainty of the output with
+    the largest relative noise."""
     rows, p = regressors.shape
-    # In units of the regressors' size, so that the rank does not depend on units.
+    # The regressors are scaled to size 1, so that the rank does not depend on units.
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
     scaled = regressors / scale
     operator = lx.MatrixLinearOperator(scaled)
-    # The solution of least norm where the data do not tell all, by the same measure of
-    # rounding as `Certainty.of`.
+    # The solution of least norm if the data do not determine all entries, with the same
+    # threshold for the rank as in `Certainty.of`.
     solver = lx.SVD(rcond=10 * max(rows, p) * float(jnp.finfo(scaled.dtype).eps))
     one = lambda target: lx.linear_solve(operator, target, solver, throw=False).value
     estimate = jax.vmap(one, in_axes=1)(targets)
     rest = targets - scaled @ estimate.T
-    # Over rows - p degrees of freedom, not rows: p of them the fit has used up.
+    # The fit uses up p of the degrees of freedom.
     noise = jnp.sqrt(jnp.sum(rest**2, axis=0) / max(rows - p, 1))
-    # Unknown where its spread is the size of the outputs themselves.
+    # A direction is unknown if its spread is the size of the outputs themselves.
     typical = jnp.sqrt(jnp.mean(targets**2, axis=0))
     typical = jnp.where(typical > 0, typical, 1)
     worst = jnp.max(noise / typical)
     certainty = Certainty.of(scaled, worst, 1.0)
-    # The covariance of output i is noise_i^2 (R' R)^-1: all outputs share the
-    # regressors R, and differ in their noise alone.
+    # The covariance of output i is noise_i^2 (R' R)^-1: the outputs share the
+    # regressors R and differ only in their noise.
     unit = certainty.std / jnp.where(worst > 0, worst, 1)
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
@@ -222,7 +224,7 @@ def _fitted(
     reach: Array,
     throw: bool,
 ) -> Identified:
-    """The linear model of the outputs by outputs and controls at these lags."""
+    """Fit a linear model that predicts the outputs from the past at these lags."""
     lags = tuple(lags[0]), tuple(lags[1])
     rows = _regressors(grouped(records), lags, affine)
     of_outputs, certainty = _least_squares(*rows, reach)
@@ -240,14 +242,12 @@ def _fitted(
 
 
 def _realised(estimate, p, m, a, b, delay) -> dict[str, Any]:
-    """The matrices of dynamics whose state is the past that the estimate looks back
-    on."""
-    # u_{k-1}, ..., u_{k-held}; the control itself is the input.
+    """The matrices of dynamics whose state is the past that the ARX model needs."""
+    # The state holds the controls u_{k-1}, ..., u_{k-held}; u_k is the input.
     held = b + delay - 2
     n = a * p + held * m
-    # A is a block companion matrix: the first rows predict, the others move the past on
-    # by a step.
-    # The coefficients of u_{k-1}, u_{k-2}, ..., of which the first is not in the state.
+    # A is a block companion matrix: its first rows predict, and the others shift the
+    # past by a step. The columns of `of_controls` belong to u_k, u_{k-1}, ...
     of_controls = xp.pad(estimate[:, a * p :], ((0, 0), ((delay - 1) * m, 0)))
     rows = [
         xp.concatenate([estimate[:, : a * p], of_controls[:, m:]], axis=1),

@@ -1,5 +1,4 @@
-"""A linear state-space model, and the encoder of its states, for networks to start
-from."""
+"""A linear state-space model and its encoder, at which the training starts."""
 
 from typing import NamedTuple
 
@@ -10,17 +9,18 @@ from ._record import Record
 from ._subspace import subspace
 
 
-# A model that is not stable is shrunk to this spectral radius.
+# The A of a model that is not stable is scaled to this spectral radius.
 _STABLE = 0.999
-# Windows by which the size of the states is told.
+# About this many windows are used to estimate the size of the states.
 _WINDOWS = 2000
 
 
 class LinearStart(NamedTuple):
-    """A linear model in normalised units, `x_next = A x + B v`, `y = C x + level`, and
-    an encoder of its state, `x = matrix z + offset`.
+    """A linear model in normalised units, and an encoder of its state.
 
-    Zeros, and `is_good` false, where the data give none.
+    The model is `x_next = A x + B v`, `y = C x + level`, and the encoder is
+    `x = matrix z + offset`. If no model could be fitted, `is_good` is false and the
+    arrays are zero.
     """
 
     A: np.ndarray
@@ -34,7 +34,7 @@ class LinearStart(NamedTuple):
 
 
 def linear_start(records: list[Record], states: int, past: int) -> LinearStart:
-    """From the model of `subspace`; its states have size 1."""
+    """The start from a fit by `subspace`, scaled so that its states have size 1."""
     units = dict[str, np.ndarray]()
     for letter, name in (("y", "outputs"), ("u", "controls")):
         rows = np.concatenate([getattr(record, name) for record in records])
@@ -64,7 +64,7 @@ def linear_start(records: list[Record], states: int, past: int) -> LinearStart:
     )
     try:
         fit = subspace(scaled, states, affine=states >= p, throw=False)
-    except ValueError:  # too few samples, or outputs for so many states
+    except ValueError:  # too few samples or outputs for this many states
         return blank
     if fit.result != RESULTS.successful:
         return blank
@@ -97,13 +97,16 @@ def _encoder(
     noise: float,
     past: int,
 ) -> np.ndarray:
-    """The matrix from past outputs and controls to the mean of the state behind them,
-    where the first of the states has variances `spread`, and the outputs `noise`."""
+    """The matrix from past outputs and controls to the mean of the state after them.
+
+    The first state has the variances `spread`, and each output the variance `noise`.
+    """
     (n, m), p = B.shape, len(C)
     powers: list[np.ndarray] = [np.eye(n)]
     for _ in range(past):
         powers.append(A @ powers[-1])
-    # y = observed x_0 + moved u, and the state behind is powers[past] x_0 + reached u.
+    # The outputs are observed x_0 + moved u, and the state after them is
+    # powers[past] x_0 + reached u.
     observed = np.concatenate([C @ power for power in powers[:past]])
     reached = np.concatenate([power @ B for power in powers[past - 1 :: -1]], axis=1)
     moved = np.zeros((past * p, past * m))
@@ -116,7 +119,7 @@ def _encoder(
 
 
 def _windows(records: list[Record], past: int) -> np.ndarray:
-    """Windows of past outputs and controls, as the encoder takes them."""
+    """Windows of past outputs and controls, in the order that the encoder takes."""
     total = sum(len(record) - past + 1 for record in records)
     stride = max(1, total // _WINDOWS)
     rows = []

@@ -149,7 +149,8 @@ def windows(
     records = uniform_records(record, where)
     steps = check_count(steps, "steps", where)
     stride = check_count(stride, "stride", where)
-    check_at_most(steps, min(map(len, records)) - 1, "steps", where, "of a record")
+    of = "of the shortest record"
+    check_at_most(steps, min(map(len, records)) - 1, "steps", where, of)
     return _cut(grouped(records), steps, stride)
 
 
