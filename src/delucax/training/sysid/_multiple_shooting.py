@@ -1,4 +1,4 @@
-"""Nonlinear least squares over windows of recorded data: multiple shooting."""
+"""Multiple shooting: nonlinear least squares over windows of recorded data."""
 
 from typing import Any, NamedTuple
 
@@ -18,19 +18,20 @@ from ._windows import Windows
 
 
 _NEAR = 0.05
-"""The standard deviations from the minimum within which a fit has converged."""
+"""A fit has converged within this many standard deviations of the minimum."""
 
 
 class Prior(NamedTuple):
-    """A normal distribution of the unconstrained values, before anything is measured.
-    An infinite deviation says nothing."""
+    """A normal prior of the unconstrained values. An infinite standard deviation means
+    that nothing is known of a value."""
 
     mean: dict[str, Array]
     std: dict[str, Array]
 
 
 class _Point(NamedTuple):
-    """Residuals and sensitivities at values of the parameters and first states."""
+    """The parameters and first states of an iterate, its residuals and sensitivities.
+    """
 
     theta: Float[Array, " p"]
     starts: Float[Array, "windows n"]
@@ -41,7 +42,7 @@ class _Point(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """The least-squares estimate and its uncertainty."""
+    """The least-squares estimate, its uncertainty and its residuals."""
 
     values: dict[str, Array]
     starts: Float[Array, "windows n"]
@@ -63,8 +64,10 @@ def solve(
     prior: Prior | None = None,
     estimates_starts: bool = True,
 ) -> Solution:
-    """The parameters and the state at the beginning of each window that fit best, or
-    the parameters alone."""
+    """Fit the parameters and the first state of each window to the data.
+
+    With `estimates_starts` false, the first states are kept at their guesses.
+    """
     flat, unravel = jax.flatten_util.ravel_pytree(values)
     p = flat.size
     dtype = data.observations.dtype
@@ -86,7 +89,7 @@ def solve(
         residuals = jnp.where(counts[:, None], residuals, 0).ravel().astype(dtype)
         return residuals, residuals
 
-    # Its rows are residuals too, (theta - mean) / std.
+    # The prior adds the residuals (theta - mean) / std.
     pull, centre = jnp.zeros(p, dtype), flat
     if prior is not None:
         pull = 1 / jax.flatten_util.ravel_pytree(prior.std)[0]
@@ -94,7 +97,7 @@ def solve(
 
     *recorded, noise, floor = data
     noise = jnp.maximum(noise, floor)
-    # Forward, for parameters and states are few and residuals many.
+    # Forward mode, because there are few parameters and states and many residuals.
     slopes = jax.jacfwd(window, argnums=(0, 1), has_aux=True)
     sensitivity = jax.vmap(slopes, in_axes=(None, 0, 0))
 
@@ -113,19 +116,20 @@ def solve(
     windows, n = starts.shape
     zeros = lambda *shape: jnp.zeros(shape, dtype)
     slopes = zeros(windows, rows, p), zeros(windows, rows, n)
-    # Any point is better than the first, so that it is linearised in the loop too, and
-    # the sensitivities are compiled once.
+    # The first point has an infinite cost. So the loop linearises the guess too, and
+    # the sensitivities are compiled only once.
     start = _Point(flat, starts, *slopes, zeros(windows, rows), zeros() + jnp.inf)
     best, count = _levenberg_marquardt(linearised, prior_rows, start, max_steps)
 
     eps = jnp.finfo(dtype).eps
     theta, starts, cost = best.theta, best.starts, best.cost
     by_theta, by_start, _, units = _scaled(best, (zeros(p), zeros(*starts.shape)))
-    # What the states at the beginnings could explain as well tells nothing.
+    # Changes of the data that the first states could explain as well say nothing about
+    # the parameters, so the first states are eliminated here too.
     known = prior_rows(theta, units[0])
     _, on_starts, _, on_theta, by_theta = _projected(by_theta, by_start, known, eps)
     size = data.observations.shape[2]
-    # Degrees of freedom: what is observed less what is estimated.
+    # The degrees of freedom: the number of observations less that of the unknowns.
     unknown = p + (starts.size if estimates_starts else 0)
     free = jnp.maximum(jnp.sum(data.counts) * size - unknown, 1)
     sigma = jnp.sqrt(jnp.sum(best.residuals**2) / free)
@@ -137,10 +141,10 @@ def solve(
     correlation = jnp.sqrt(jnp.sum(data.counts)) * largest
     # The correlation of rounding errors has no meaning.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
-    # Of the degrees of freedom, which all outputs share, each has `free / size`.
+    # The outputs share the degrees of freedom equally: each has free / size.
     noise = noise * jnp.sqrt(each * size / free)
     values = unravel(theta)
-    # No more certain than the noise that was given, or than rounding lets it be.
+    # The estimate is not more certain than the given noise or rounding allows.
     sigma = jnp.maximum(sigma, 1)
     slope = by_theta[:, :p] * units[0] * per_relative_change(assembly, values)
     certainty = Certainty.of(slope, sigma, 1.0)
@@ -157,17 +161,15 @@ def solve(
 def _levenberg_marquardt(
     linearised: Any, prior_rows: Any, start: _Point, max_steps: Int[Array, ""]
 ) -> tuple[_Point, Array]:
-    """`(the best point, the number of points tried)`.
+    """The best point, and the number of points tried.
 
-    The state at the beginning of a window moves nothing but that window, so it is
-    eliminated there, and the cost of a step is linear in the number of windows; a
-    solver of dense least squares would pay its cube. Steps are measured by the largest
-    sensitivities so far (Moré, 1978), and so do not depend on units. It has converged
-    where no step of the linear model is longer than a small part of what the noise
-    makes the estimate differ by.
+    The first state of a window affects only that window, so it is eliminated there. The
+    work of an iteration is therefore linear in the number of windows, where dense least
+    squares would take its cube. Steps are scaled by the largest sensitivities so far
+    (Moré, 1978), so that they do not depend on units.
     """
     p, dtype = start.theta.size, start.residuals.dtype
-    # Shares of the cost, a sum of squares: about the rounding of it in float32.
+    # As a share of the cost; in float32 about the rounding of this sum of squares.
     small = 1e-9 if dtype == jnp.float64 else 1e-7
     rounding = 100 * jnp.finfo(dtype).eps ** 2 * start.residuals.size
 
@@ -176,8 +178,9 @@ def _levenberg_marquardt(
         here = linearised(*candidate)
         better = here.cost < best.cost
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-        # Less damping after a success than more after a failure: nearer to the steps
-        # of Gauss and Newton. A step at the minimum fails by rounding alone.
+        # Damping falls faster after a success than it grows after a failure, so that
+        # the steps come near to Gauss-Newton steps. At the minimum, a step fails by
+        # rounding alone.
         damping = jnp.where(better | at_minimum, damping / 8, damping * 4)
         damping = jnp.clip(damping, 1e-10, 1e10)
         by_theta, by_start, largest, units = _scaled(best, largest)
@@ -185,15 +188,13 @@ def _levenberg_marquardt(
         projected = _projected(by_theta, by_start, known, damping)
         R_x, on_starts, R, on_theta, _ = projected
         step = jsl.solve_triangular(R, on_theta)
-        # Back substitution: once the step of theta is known, each window has its own.
+        # Back substitution: the step of theta gives the step of each first state.
         right = on_starts[..., p] - on_starts[..., :p] @ step
         steps = jax.vmap(jsl.solve_triangular)(R_x, right)
-        # r + J z = 0, with J the derivative of the residuals themselves: the step is
-        # -z.
+        # The residuals are r + J z, so the step is -z.
         candidate = best.theta - step / units[0], best.starts - steps / units[1]
-        # The decrease of the cost that the linear model predicts. A damped step falls
-        # short of it, so it is a minimum only where a step that is hardly damped
-        # predicts none.
+        # The decrease of the cost that the linear model predicts. It is small for a
+        # strongly damped step too, so a minimum also needs little damping.
         predicted = jnp.sum(on_theta**2) + jnp.sum(on_starts[..., p] ** 2)
         at_minimum = predicted <= small * best.cost
         done = at_minimum & (damping <= 1e-5) | (damping >= 1e9)
@@ -206,8 +207,8 @@ def _levenberg_marquardt(
 
     none = jnp.zeros(p, dtype), jnp.zeros(start.starts.shape, dtype)
     no, first = jnp.array(False), (start.theta, start.starts)
-    # The guess counts as a success, of a cost below infinity: from it the first step
-    # goes with 1e-3.
+    # The guess counts as a success, because its cost is below infinity. So the first
+    # step has the damping 8e-3 / 8 = 1e-3.
     damping = jnp.zeros((), dtype) + 8e-3
     carry = first, start, none, damping, no, no, jnp.zeros((), int)
     _, best, *_, count = lax.while_loop(running, body, carry)
@@ -215,9 +216,9 @@ def _levenberg_marquardt(
 
 
 def _scaled(point: _Point, largest: Any) -> tuple[Array, Array, Any, Any]:
-    """Sensitivities as multiples of the largest so far, these, and their units.
+    """The sensitivities in units of the largest so far, the largest, and the units.
 
-    The residuals are a last column of those by the parameters.
+    The residuals are appended as the last column of the sensitivities to parameters.
     """
     by_theta, by_start = point.by_theta, point.by_start
     norms = jnp.linalg.norm(by_theta, axis=(0, 1)), jnp.linalg.norm(by_start, axis=1)
@@ -231,8 +232,8 @@ def _scaled(point: _Point, largest: Any) -> tuple[Array, Array, Any, Any]:
 def _projected(
     by_theta: Array, by_start: Array, known: Array, damping: Any
 ) -> tuple[Array, ...]:
-    """Eliminate the states at the beginnings of the windows, then the parameters, of
-    which something is `known`, a row for each."""
+    """Eliminate the first states of the windows, then the parameters. `known` are the
+    rows of the prior."""
     p = by_theta.shape[2] - 1
     eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
     R_x, on_starts, left = eliminate(by_start, by_theta, damping)
@@ -244,10 +245,11 @@ def _projected(
 def _eliminate(A: Array, B: Array, damping: Any) -> tuple[Array, Array, Array]:
     """Least squares `min |A z - b|^2 + damping |z|^2` for the columns b of B.
 
-    `(R, C, residual)`: `R z = C`, and the residual of B, one row longer per entry of z.
+    Returns `(R, C, residual)`. The solution is `R z = C`. The residual has a row more
+    than B for each entry of z.
     """
-    # By QR of [A; sqrt(damping) I], whose condition number is that of A, and not of
-    # the normal equations A' A.
+    # QR of [A; sqrt(damping) I] keeps the condition number of A, which the normal
+    # equations A' A would square.
     n = A.shape[1]
     A = jnp.concatenate([A, jnp.sqrt(damping) * jnp.eye(n, dtype=A.dtype)])
     B = jnp.concatenate([B, jnp.zeros((n, B.shape[1]), B.dtype)])
@@ -264,14 +266,15 @@ def flat_constrained(
 
 
 def relative_unit(estimate: Float[Array, " p"]) -> Float[Array, " p"]:
-    """The unit of a relative change of each constrained value: itself, or 1 for 0."""
+    """The unit of a relative change: the constrained value itself, or 1 if it is 0."""
     return jnp.where(estimate == 0, 1, estimate)
 
 
 def per_relative_change(
     assembly: Assembly, values: dict[str, Array]
 ) -> Float[Array, " p"]:
-    """The change of each unconstrained value that makes a relative change of 1."""
+    """The change of each unconstrained value for a relative change of 1 of the
+    constrained value."""
     tangent = jax.tree.map(jnp.ones_like, values)
     flat = lambda values: flat_constrained(assembly, values)
     estimate, rate = jax.jvp(flat, (values,), (tangent,))

@@ -1,4 +1,4 @@
-"""Neural models, fitted to one step or to several."""
+"""Neural dynamics, and the loss of their predictions over one or several steps."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,29 +26,32 @@ from ._record import grouped, Record, Records, uniform_records
 
 
 class NeuralDynamics(AbstractDynamics):
-    """A discrete-time map that is a fully connected network,
+    r"""Discrete-time dynamics given by a fully connected network.
 
-    `x_next = x + step_scale * network((x - x_mean) / x_scale, u / u_scale)`.
+    $$x_{k+1} = x_k + \sigma_\mathrm{step} \, \mathrm{network}\left(
+    \frac{x_k - \bar x}{\sigma_x}, \frac{u_k}{\sigma_u}\right)$$
 
-    A neural ODE is [`delucax.Discretized`][] of a
-    [`delucax.systems.NeuralSystem`][]; both are fitted by the same losses.
+    For a neural ODE, use [`delucax.Discretized`][] of a
+    [`delucax.systems.NeuralSystem`][]. The same losses fit both.
 
     **Arguments:**
 
-    - `states`, `controls`: their names, or how many there are.
-    - `width`: units in a hidden layer, 64 by default.
-    - `depth`: hidden layers, 2 by default.
+    - `states`, `controls`: the names of the states and controls, or their numbers.
+    - `width`: units in each hidden layer, 64 by default.
+    - `depth`: the number of hidden layers, 2 by default.
     - `dt`: the step, 1 by default.
-    - `x_mean`, `x_scale`: shape `(n,)` or a number; 0 and 1 by default.
-    - `u_scale`: shape `(m,)` or a number; 1 by default.
-    - `step_scale`: the size of a step, shape `(n,)` or a number; 1 by default.
-    - `activation`: of the hidden layers, `jnp.tanh` by default.
-    - `key`: a random key, for the first weights.
+    - `x_mean`, `x_scale`: $\bar x$ and $\sigma_x$, shape `(n,)` or a number; 0 and 1 by
+        default.
+    - `u_scale`: $\sigma_u$, shape `(m,)` or a number; 1 by default.
+    - `step_scale`: $\sigma_\mathrm{step}$, the typical change of the state in a step,
+        shape `(n,)` or a number; 1 by default.
+    - `activation`: the activation of the hidden layers, `jnp.tanh` by default.
+    - `key`: a random key for the initial weights.
 
     **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
 
-    **Raises:** `ValueError` if a size is below 1, a scale is not positive, or there is
-    no key.
+    **Raises:** `ValueError` if a size is below 1, a scale is not positive, or `key` is
+    not a random key.
 
     !!! example
 
@@ -109,7 +112,8 @@ class NeuralDynamics(AbstractDynamics):
         u: Float[Array, " m"],
         w: Float[Array, " n"] | None,
     ) -> tuple[Float[Array, " n"], Result]:
-        # The network learns the step and not the next state, which is nearly x itself.
+        # The network learns the change of the state, because the next state is nearly
+        # x itself.
         z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])
         x_next = x + self.step_scale * self.network(z)
         x_next = x_next if w is None else x_next + w
@@ -119,19 +123,21 @@ class NeuralDynamics(AbstractDynamics):
 def windows(
     record: Records, steps: int, *, stride: int = 1
 ) -> tuple[Array, Array, Array]:
-    """Stretches of records of the state: the data of a multi-step fit.
+    """Cut records of the state into windows, the data of a multi-step fit.
 
     **Arguments:**
 
-    - `record`: a [`delucax.training.sysid.Record`][], whose outputs are the states, or
-        a list of them; uniform in time.
-    - `steps`: of a stretch; 1 for a one-step fit.
-    - `stride`: steps between the beginnings of two stretches, 1 by default.
+    - `record`: a [`delucax.training.sysid.Record`][] whose outputs are the states, or a
+        list of them; uniform in time.
+    - `steps`: the number of steps of a window; 1 for a one-step fit.
+    - `stride`: the number of steps between the beginnings of two windows, 1 by default.
 
-    **Returns:** `(times, states, controls)` of shapes `(N,)`, `(N, steps + 1, n)` and
-    `(N, steps, m)`, for `data=` of [`delucax.training.fit`][].
+    **Returns:** the times at which the windows begin, their states and their controls,
+    `(times, states, controls)`, shapes `(N,)`, `(N, steps + 1, n)` and `(N, steps, m)`.
+    Pass them as `data` to [`delucax.training.fit`][].
 
-    **Raises:** `ValueError` if `record` is not one, or shorter than a stretch.
+    **Raises:** `ValueError` if `record` is not a uniform record or a list of them, or
+    is shorter than a window.
 
     !!! example
 
@@ -168,18 +174,23 @@ def _cut(groups: list[Record], steps: int, stride: int) -> tuple[Array, Array, A
 
 
 class PredictionError(eqx.Module):
-    r"""The loss of a model of the dynamics: how far its predictions are off,
+    r"""The mean squared error of the predictions of dynamics, a loss to train them.
 
-    `1 / (N steps) sum over stretches and steps of |(x_k - xhat_k) / scale|^2`,
+    $$\frac{1}{N K} \sum_{i=1}^N \sum_{k=1}^K
+    \left|\frac{x_{i,k} - \hat x_{i,k}}{\mathrm{scale}}\right|^2$$
 
-    with `xhat` what the recorded controls lead to from the first state of a stretch, by
-    the model alone. A stretch of one step is a one-step fit; longer ones penalise
-    errors that accumulate. Angles are compared by `model.difference`.
+    The sums run over the $N$ windows of a batch and their $K$ steps. The prediction
+    $\hat x_{i,k}$ is a simulation of the model with the recorded controls, from the
+    first state of window $i$. Windows of one step fit one-step predictions; longer
+    windows also penalise errors that accumulate. Angles are compared by
+    `model.difference`.
 
-    **Arguments:** `scale`: of each state, a number or shape `(n,)`; 1 by default.
+    **Arguments:** `scale`: the size of each state, a number or shape `(n,)`; 1 by
+    default.
 
-    **Returns:** from a call `loss(model, batch, key)`, with `model` any dynamics and
-    `batch` as [`delucax.training.sysid.windows`][] makes it: a scalar.
+    **Returns:** a call `loss(model, batch, key)` returns a scalar. `model` is any
+    dynamics, and `batch` has the form that [`delucax.training.sysid.windows`][]
+    returns.
 
     **Raises:** `ValueError` if `scale` is not positive.
 
@@ -221,21 +232,23 @@ class PredictionError(eqx.Module):
     ) -> Array:
         """The loss.
 
-        **Arguments:** `model`: the dynamics. `batch`: stretches. `key`: not used.
+        **Arguments:** `model`: the dynamics. `batch`: `(times, states, controls)` of
+        windows. `key`: not used.
 
         **Returns:** a scalar.
         """
         check_instance(model, AbstractDynamics, "model", "PredictionError")
 
-        def stretch(t, states, controls):
+        def window(t, states, controls):
             def step(x, inputs):
                 k, u, recorded = inputs
                 x_next, _ = model.advance(t + k * model.dt, x, u, None)
                 error = model.difference(x_next, recorded) / self.scale
                 return x_next.astype(x.dtype), jnp.sum(error**2)
 
-            # Recomputed in the backward pass, so that memory holds the states alone.
+            # Steps are recomputed in the backward pass, so that only the states are
+            # kept in memory.
             inputs = (jnp.arange(controls.shape[0]), controls, states[1:])
             return jnp.mean(lax.scan(jax.checkpoint(step), states[0], inputs)[1])
 
-        return jnp.mean(jax.vmap(stretch)(*batch))
+        return jnp.mean(jax.vmap(window)(*batch))

@@ -1,4 +1,4 @@
-"""Physical parameters, through the integrator."""
+"""Physical parameters by nonlinear least squares through the integrator."""
 
 from typing import Any
 
@@ -36,11 +36,11 @@ from ._windows import begins_of, cut_into_windows
 
 
 _PASSES, _LESS = 4, 0.8
-"""The most fits in units of the residuals of the one before, and the share that is no
-other noise."""
+"""The noise is estimated by at most `_PASSES` more fits, each in units of the residuals
+of the one before. They end when no residual falls below `_LESS` times its value."""
 _SHORT, _HIDDEN = 2, 8
-"""The first window of the second attempt, short to keep a bad guess from diverging:
-where the state is observed, and where it is not."""
+"""The first window of the second attempt if the state is measured, and if it is not.
+It is short to keep a bad guess from diverging."""
 
 
 def physical(
@@ -56,54 +56,58 @@ def physical(
     max_steps: int = 100,
     throw: bool = True,
 ) -> Identified:
-    r"""Parameters of dynamics, by nonlinear least squares through the integrator,
+    r"""Fit parameters of dynamics to a record, by multiple shooting.
 
-    `min over theta and all z_j of sum_k |(y_k - h(x_k; theta)) / noise|^2`, with `x_k`
-    the states that the recorded controls lead to from `z_j`, the state at the beginning
-    of window j.
+    $$\min_{\theta, z} \sum_k \left|\frac{y_k - h(x_k; \theta)}{\mathrm{noise}}
+    \right|^2$$
 
-    Levenberg and Marquardt's method. The states at the beginning of each window are
-    estimated with the parameters, so that measurement noise does not bias the estimate,
-    and windows are short, so that errors stay bounded within each. Steps are
-    scaled by the sensitivities, so that parameters of any size can be estimated
-    together. Constrained parameters are estimated in the unconstrained space, as in
-    [`delucax.training.fit`][], and their intervals are within the valid set.
+    The record is cut into short windows. Within window $j$, the states $x_k$ are
+    simulated with the recorded controls, from the state $z_j$ at its beginning. These
+    states are estimated together with the parameters, so that measurement noise does
+    not bias the estimate. Short windows keep a simulation with wrong parameters from
+    drifting far from the record.
 
-    Where the fit does not converge, or its residuals are correlated from step to step,
-    it starts once more, from a fit on shorter windows: of two steps, or of eight and
-    then some more where states are hidden. It has converged where no step of the linear
-    model is longer than a twentieth of what the noise makes the estimate vary; if it
-    has not, `result` says so, and there are no intervals. A better first guess, a
-    shorter window or smaller steps of the integrator may help then.
+    The method is Levenberg-Marquardt. Its steps are scaled by the sensitivities of the
+    data, so that parameters of very different size can be estimated together.
+    Constrained parameters are estimated in the unconstrained space, as in
+    [`delucax.training.fit`][], so their intervals stay within the valid set.
+
+    The fit has converged if no step of the linearised problem is longer than a
+    twentieth of the standard deviation that the noise causes. If it has not, or if its
+    residuals are correlated from step to step, a second attempt starts from fits on
+    shorter windows: of two steps if the state is measured, otherwise of eight steps and
+    then of a length in between. If that does not help either, `result` says so, and
+    there are no intervals. Then try a better first guess, a shorter window, or smaller
+    steps of the integrator.
 
     **Arguments:**
 
-    - `dynamics`: with the parameters at a first guess. Their own step and controls that
-        are held fit any dynamics; other steps, and controls that are interpolated, a
-        [`delucax.Discretized`][] system, whose step is then taken over each step of the
-        record.
+    - `dynamics`: the dynamics; their parameters are the first guess. If the step of the
+        record differs from that of the dynamics, or if the controls are interpolated,
+        they must be a [`delucax.Discretized`][] system. One step of its integrator is
+        then taken over each step of the record.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
-    - `parameters`: what is estimated: a path such as `"system.length"`, several, or a
-        dictionary from path to constraint, as `trainable` of
+    - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
+        of paths, or a dictionary from path to constraint, as `trainable` of
         [`delucax.training.fit`][].
-    - `x0`: a guess of the first state, shape `(n,)`, or one for each record, from which
-        those of the windows are simulated; by default the windows begin with what is
-        observed there, which must then be the state.
-    - `window`: steps of a window, 20 by default; all of the record if it has fewer or
-        for `None`, which is the output-error method.
-    - `burn_in`: samples at the beginning of each window that do not count. If there are
-        any then the states there are not estimated, but stay as they are guessed. 0
-        by default.
-    - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
-        default that of the residuals of a first fit.
-    - `level`: of the confidence intervals, 0.95 by default.
-    - `max_steps`: 100 by default.
-    - `throw`: raise if it does not converge or some parameters are not identifiable
-        (default); if false, look at `result`.
+    - `x0`: a guess of the first state, shape `(n,)`, or one for each record. A
+        simulation from it gives the first guess of the states at which the windows
+        begin. By default these are the measurements, which must then be the state.
+    - `window`: the number of steps of a window, 20 by default. `None` takes each record
+        as one window, which is the output-error method.
+    - `burn_in`: the number of samples at the beginning of each window that do not
+        count, 0 by default. If it is positive, the states at which the windows begin
+        are not estimated, but keep their guesses.
+    - `noise`: the standard deviation of the noise of each output, a number or shape
+        `(p,)`; by default it is estimated from the residuals of a first fit.
+    - `level`: the confidence level of the intervals, 0.95 by default.
+    - `max_steps`: the maximum number of iterations, 100 by default.
+    - `throw`: raise an error if the fit does not converge or some parameters are not
+        identifiable; true by default. If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Identified`][]; its `model` is the dynamics
-    with the estimated parameters, its directions are those of relative changes, and its
-    `x0` is the estimated state at the beginning of the record, or of each.
+    **Returns:** [`delucax.training.sysid.Identified`][]. Its `model` is the dynamics
+    with the estimated parameters. Its `x0` is the estimated first state of the record,
+    or of each record.
 
     **Raises:** `ValueError` on arguments of the wrong shape or kind, or if there is no
     such parameter; an error at run time as `throw` says.
@@ -135,14 +139,14 @@ def physical(
     if sizes != (size, dynamics.control_size):
         raise ValueError(
             f"{where}: record must have {size} outputs and {dynamics.control_size} "
-            f"controls, as the dynamics have, got {sizes[0]} and {sizes[1]}."
+            f"controls, as the dynamics do, got {sizes[0]} and {sizes[1]}."
         )
     longest = max(len(record) for record in records) - 1
     whole = longest if window is None else check_count(window, "window", where)
     window = min(whole, longest)
     burn_in = check_count(burn_in, "burn_in", where, least=0)
-    check_at_most(burn_in, window, "burn_in", where, "of a window")
-    # An array, so that another limit does not compile again.
+    check_at_most(burn_in, window, "burn_in", where, "steps of a window")
+    # An array, so that another limit does not cause a recompilation.
     most: Any = np.asarray(check_count(max_steps, "max_steps", where))
     reach = quantile(level, where)
     check_bool(throw, "throw", where)
@@ -168,35 +172,35 @@ def physical(
         given = guesses, groups, rows
         starts, data = cut_into_windows(*given, window, burn_in, noise)
         options: Any = dict(estimates_starts=estimates_starts)
-        # First in units of the spread of each output; then from there in units of the
-        # residuals that are left, which weighs outputs of unlike noise as they deserve.
+        # The first fit weights each output by its spread, the next ones by its
+        # residuals, which estimate its noise.
         solution = solve(assembly, values, starts, data, sampling, most, **options)
         for _ in range(_PASSES if noise is None else 0):
             before, data = solution, data._replace(noise=solution.noise)
             given = solution.values, solution.starts, data, sampling, most
             solution = solve(assembly, *given, **options)
-            # The minimum may be another one in these units, with other residuals.
+            # The new weights may lead to another minimum, with smaller residuals.
             known = is_concrete(solution.noise)
             if not known or np.all(solution.noise > _LESS * before.noise):
                 break
         return solution
 
-    # Where the windows of each record are among all of them.
+    # The index of the first window of each record among all windows.
     counts = [len(begins_of(g, window)) for g in groups for _ in g.outputs]
     at = np.cumsum([0, *counts])
     unknown = len(names) + n * at[-1] * estimates_starts
     few = bool(size * sum(map(len, records)) <= unknown)
     solution = fit(values, guesses, window)
-    # A second attempt, if it is known now that the first did not converge, or that its
-    # residuals are correlated from step to step, as the noise is not.
+    # A second attempt, unless the values are traced, if the first did not converge or
+    # its residuals are correlated, which white noise is not.
     is_observed = size == n
-    # A guess of a state that is observed is asked for, and windows begin there.
+    # If the state is measured but x0 is given, the windows start as the caller asked.
     has_rungs = estimates_starts and not few and (x0 is None or not is_observed)
     rungs = _rungs(window, is_observed) if has_rungs else []
     if rungs and is_concrete(solution.correlation):
         failed = solution.result != RESULTS.successful
-        # On short windows nothing grows, so that a worse guess does, and there are
-        # fewer minima that are not the least.
+        # On short windows errors do not grow, so a worse guess suffices, and there are
+        # fewer local minima.
         if failed or float(solution.correlation) > CORRELATED:
             again, states = values, guesses
             for rung in rungs:
@@ -222,7 +226,7 @@ def physical(
         noise=solution.noise,
         correlation=solution.correlation,
         x0=starts[0] if isinstance(record, Record) else starts,
-        # With too few data the iteration need not converge: `checked` then reports that
+        # With too few data the iteration may not converge. `checked` then reports that
         # the parameters are not identifiable.
         result=RESULTS.successful if few else solution.result,
     )
@@ -230,10 +234,11 @@ def physical(
 
 
 def _rungs(window: int, is_observed: bool) -> list[int]:
-    """The windows of the second attempt before the last one."""
+    """The shorter windows of the second attempt, in steps."""
     if is_observed:
         return [_SHORT] if window > _SHORT else []
-    # Hidden states are carried from each to the next, which may be some times as long.
+    # Hidden states come from the fit on the shorter window before. So that they are
+    # good enough, the length of the window grows by a limited factor.
     between = round(np.sqrt(_HIDDEN * window))
     return [rung for rung in (_HIDDEN, between) if 2 * rung <= window]
 
@@ -242,8 +247,8 @@ def _rungs(window: int, is_observed: bool) -> list[int]:
 def _intervals(
     assembly: Assembly, solution: Solution, reach: Array, few: bool, firsts: Any
 ) -> tuple[Array, Array, Certainty, Array]:
-    """The ends of the intervals, the certainty of the estimate, and the states at the
-    beginnings of these windows."""
+    """The ends of the intervals, the certainty of the estimate, and the first states of
+    the windows `firsts`."""
     certainty = solution.certainty
     std = certainty.std
     known = certainty._replace(
@@ -260,11 +265,12 @@ def _intervals(
 def _ends(
     assembly: Assembly, values: dict[str, Array], reach: Float[Array, " p"]
 ) -> Float[Array, " p"]:
-    """The valid values at distance `reach` from the estimate, in relative changes."""
+    """The constrained values at a relative distance `reach` from the estimate."""
     flat, unravel = jax.flatten_util.ravel_pytree(values)
     step = reach * per_relative_change(assembly, values)
     end = flat_constrained(assembly, unravel(flat + step))
-    # A constraint keeps numbers off the ends of its set; an interval may reach them.
+    # A constraint keeps values away from the ends of its set, but an interval may reach
+    # them.
     edge, size = jnp.finfo(end.dtype), jnp.abs(end)
     end = jnp.where(size >= edge.max, jnp.sign(end) * jnp.inf, end)
     return jnp.where(size <= edge.tiny, 0, end)

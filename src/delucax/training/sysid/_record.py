@@ -1,4 +1,4 @@
-"""Measured data: outputs and controls over time, of one experiment or several."""
+"""Records of measured outputs and controls over time."""
 
 import itertools
 from collections.abc import Sequence
@@ -19,30 +19,31 @@ from ..._module import as_float_array, shown
 Hold = Literal["zero", "linear", "cubic"]
 _WHERE = "Record"
 _HOLDS = {"zero": 0, "linear": 1, "cubic": 3}
-# Times whose steps differ by less than this share are those of one step.
+# Times are uniform if their steps differ by less than this share.
 _UNEVEN = 1e-4
 
 
 class Record(eqx.Module):
-    """What was measured in one experiment: outputs and controls at N times.
+    """The measurements of one experiment: outputs and controls at N times.
 
-    Between two samples the control is what `hold` says: the one of the first of them
-    (`"zero"`, as a digital controller holds it), the straight line between both
-    (`"linear"`), or the natural cubic spline through all (`"cubic"`, for smooth and
-    band-limited signals). A slice is a record of these samples, and `len` is N.
+    A slice of a record is a record of these samples, and `len` is N.
 
     **Arguments:**
 
     - `outputs`: shape `(N, p)`, or `(N,)` for one output.
-    - `controls`: shape `(N, m)` or `(N,)`; or one row less, as a simulation gives
-        them, if the hold is zero.
-    - `dt`: the time from one sample to the next; or
-    - `times`: of the samples, shape `(N,)`, increasing, in any steps.
-    - `hold`: `"zero"` by default.
+    - `controls`: shape `(N, m)`, or `(N,)` for one control. If `hold` is `"zero"`, they
+        may have one row less, as in a simulation.
+    - `dt`: the time between two samples, for uniform samples; or
+    - `times`: the times of the samples, shape `(N,)`, increasing. Steps may differ.
+    - `hold`: the control between two samples, `"zero"` by default:
+        - `"zero"`: the control of the sample before, as a digital controller holds it;
+        - `"linear"`: the straight line between the two samples;
+        - `"cubic"`: the natural cubic spline through all samples, for smooth and
+            band-limited signals.
 
-    **Raises:** `ValueError` on arrays of the wrong shape, on samples that are not
-    finite, on times that do not increase, and on a column that never changes among
-    several of its kind; each with its row and column.
+    **Raises:** `ValueError` if an array has the wrong shape, a sample is not finite,
+    the times do not increase, or one of several outputs or controls never changes. The
+    message names the row and the column.
 
     !!! example
 
@@ -80,10 +81,10 @@ class Record(eqx.Module):
         outputs, controls = _table(outputs, "outputs"), _table(controls, "controls")
         if len(outputs) < 2:
             raise ValueError(
-                f"{_WHERE}: outputs must have 2 samples or more, got {len(outputs)}."
+                f"{_WHERE}: outputs must have at least 2 samples, got {len(outputs)}."
             )
         if len(controls) == len(outputs) - 1 and hold == "zero":
-            # No sample comes after the last, so that nothing depends on its control.
+            # Nothing depends on the last control, because no sample comes after it.
             joined = np if isinstance(controls, np.ndarray) else jnp
             controls = joined.concatenate([controls, controls[-1:]])
         if len(controls) != len(outputs):
@@ -93,7 +94,8 @@ class Record(eqx.Module):
                 f"shapes {controls.shape} and {outputs.shape}."
             )
         if (dt is None) == (times is None):
-            raise ValueError(f"{_WHERE}: give one of dt and times.")
+            got = "neither" if dt is None else "both"
+            raise ValueError(f"{_WHERE}: give either dt or times, got {got}.")
         if times is None:
             check_step(dt, _WHERE)
             dt = as_float_array(dt)
@@ -101,7 +103,7 @@ class Record(eqx.Module):
             self.is_uniform = True
         else:
             times = _checked_times(times, len(outputs))
-            # Before they are rounded to a lower precision.
+            # Differences are taken before the times are rounded to a lower precision.
             steps = times[1:] - times[:-1]
             self.is_uniform = is_concrete(times) and _has_one_step(steps)
         dtype = jnp.result_type(outputs, controls)
@@ -122,8 +124,8 @@ class Record(eqx.Module):
         start, stop, _ = index.indices(len(self))
         if stop - start < 2:
             raise ValueError(
-                f"{_WHERE}: a slice must leave 2 samples or more of {len(self)}, got "
-                f"{shortened(index)}."
+                f"{_WHERE}: a slice must leave at least 2 of the {len(self)} samples, "
+                f"got {shortened(index)}."
             )
         samples = lambda record: (record.outputs, record.controls, record.times)
         cut = eqx.tree_at(samples, self, replace_fn=lambda array: array[start:stop])
@@ -131,26 +133,27 @@ class Record(eqx.Module):
 
     @property
     def dt(self) -> Float[Array, ""]:
-        """The time between samples; the mean where they are not uniform."""
-        # On the host where it can be, which compiles nothing.
+        """The time between samples; its mean if the samples are not uniform."""
+        # On the host if possible, which compiles nothing.
         mean = np.mean if is_concrete(self.steps) else jnp.mean
         return jnp.asarray(mean(self.steps), self.steps.dtype)
 
     def split(self, share: float = 0.5) -> tuple["Record", "Record"]:
-        """The record in two, for estimation and validation.
+        """Split the record in two, for estimation and validation.
 
-        **Arguments:** `share`: of the samples that are in the first, 0.5 by default.
+        **Arguments:** `share`: the share of the samples in the first part, 0.5 by
+        default.
 
         **Returns:** two records.
 
-        **Raises:** `ValueError` if one has fewer than 2 samples.
+        **Raises:** `ValueError` if a part has fewer than 2 samples.
         """
         at = round(float(share) * len(self))
         return self[:at], self[at:]
 
     def coefficients(self) -> Float[Array, "steps powers m"]:
-        """The control between two samples, as a polynomial of the share of the step
-        that is over; lowest power first."""
+        """The control between two samples, as the coefficients of a polynomial in the
+        share of the step that has passed, lowest power first."""
         u = self.controls
         if self.hold == "zero":
             return u[:-1, None]
@@ -159,7 +162,7 @@ class Record(eqx.Module):
         h = self.steps[:, None]
         bend = _second_derivatives(u, h)
         second, third = bend[:-1] / 2, jnp.diff(bend, axis=0) / 6
-        # Of s = (t - t_k) / h: u_k + h b s + h^2 c s^2 + h^2 d s^3.
+        # u_k + first s + h^2 second s^2 + h^2 third s^3, with s = (t - t_k) / h.
         first = jnp.diff(u, axis=0) - h**2 * (second + third)
         return jnp.stack([u[:-1], first, h**2 * second, h**2 * third], axis=1)
 
@@ -171,7 +174,7 @@ else:
 
 
 def records_of(records: Any, where: str) -> list[Record]:
-    """One record or several as a list; raises if they do not fit together."""
+    """One or several records as a list. Raise if they do not fit together."""
     listed = [records] if isinstance(records, Record) else records
     if not isinstance(listed, Sequence) or not listed:
         raise ValueError(
@@ -185,20 +188,20 @@ def records_of(records: Any, where: str) -> list[Record]:
             size, other = (getattr(r, what).shape[1] for r in (first, record))
             if size != other:
                 raise ValueError(
-                    f"{where}: all records must have the same {what}, got {size} and, "
-                    f"in record[{index}], {other} columns."
+                    f"{where}: all records must have the same number of {what}, got "
+                    f"{size} in record[0] and {other} in record[{index}]."
                 )
         if record.hold != first.hold:
             raise ValueError(
-                f"{where}: all records must have one hold, got {first.hold!r} and "
-                f"{record.hold!r}."
+                f"{where}: all records must have the same hold, got {first.hold!r} in "
+                f"record[0] and {record.hold!r} in record[{index}]."
             )
     return list(listed)
 
 
 def grouped(records: list[Record]) -> list[Record]:
-    """Neighbours of one length stacked, so that many records make no larger program
-    than one."""
+    """Stack neighbouring records of the same length, so that many records compile to
+    the same program as one."""
     alike = lambda record: (len(record), record.is_uniform)
     groups = [list(group) for _, group in itertools.groupby(records, alike)]
     return [jax.tree.map(_stacked, *group) for group in groups]
@@ -211,27 +214,28 @@ def _stacked(*arrays: Any) -> Array:
 
 
 def uniform_records(records: Any, where: str) -> list[Record]:
-    """As `records_of`, of records that all have one and the same step."""
+    """As `records_of`, and raise unless all records have the same uniform step."""
     listed = records_of(records, where)
     for index, record in enumerate(listed):
         if not record.is_uniform:
             raise ValueError(
-                f"{where}: the samples must be uniform in time, those of "
-                f"record[{index}] are not: fit a model in continuous time to them, or "
-                "resample them."
+                f"{where}: the samples must be uniform in time, but those of "
+                f"record[{index}] are not. Resample them, or fit a model in continuous "
+                "time with sysid.physical."
             )
         steps = record.dt, listed[0].dt
         known = all(map(is_concrete, steps))
         if known and not np.allclose(*map(float, steps), rtol=_UNEVEN):
             raise ValueError(
-                f"{where}: all records must have one dt, got {float(listed[0].dt):g} "
-                f"and, in record[{index}], {float(record.dt):g}."
+                f"{where}: all records must have the same dt, got "
+                f"{float(listed[0].dt):g} in record[0] and {float(record.dt):g} in "
+                f"record[{index}]."
             )
     return listed
 
 
 def _table(value: Any, name: str) -> Any:
-    """Real finite columns."""
+    """`value` as an array of real finite columns, or an error."""
     array = value if isinstance(value, np.ndarray) else as_float_array(value)
     rule = f"{_WHERE}: {name} must be real numbers of shape (samples, size), got "
     if not eqx.is_array_like(array) or isinstance(array, float):
@@ -250,17 +254,17 @@ def _table(value: Any, name: str) -> Any:
         row, column = np.argwhere(~finite)[0]
         raise ValueError(
             f"{_WHERE}: {name} must be finite, got {array[row, column]} in row {row}, "
-            f"column {column}; {np.sum(~finite)} such entries in all. Split the record "
-            "where samples are missing."
+            f"column {column}, and {np.sum(~finite)} such entries in all. Split the "
+            "record where samples are missing."
         )
     still = np.ptp(array, axis=0) == 0
-    # A single control may be held for a whole experiment; a column among several that
-    # never moves is a wrong one, or a channel that was not connected.
+    # A single control may be constant for a whole experiment. One constant column among
+    # several is the wrong column, or a channel that was not connected.
     if still.any() and not still.all():
         column = int(np.argmax(still))
         raise ValueError(
             f"{_WHERE}: column {column} of {name} is {array[0, column]:g} in all "
-            f"{len(array)} rows; leave it out."
+            f"{len(array)} rows. Leave it out."
         )
     return array
 
@@ -274,7 +278,7 @@ def _checked_times(times: Any, count: int) -> Any:
         )
     if not is_concrete(array):
         return array
-    # In the precision that was given: far from zero float32 rounds steps away.
+    # In the given precision, because float32 rounds the steps away if times are large.
     array = np.asarray(times, float)
     finite = np.isfinite(array)
     if not finite.all():
@@ -298,7 +302,7 @@ def _has_one_step(steps: Any) -> bool:
 
 
 def _second_derivatives(u: Array, h: Array) -> Array:
-    """Of the natural cubic spline: a tridiagonal system, zero at both ends."""
+    """The second derivatives of the natural cubic spline at the samples."""
     if len(u) == 2:
         return jnp.zeros_like(u)
     slopes = jnp.diff(u, axis=0) / h
