@@ -102,7 +102,7 @@ def test_tables(tmp_path):
         (LINES.replace("2,4,a", "x,4,a"), "got 'x' in line 3, column 'level'"),
         (LINES.replace("4,5,a", "4"), "got '' in line 4, column 'pump'"),
         (LINES, "times must increase, but 0 in row 3 is before 1 in row 2"),
-        ("", "must be text with a line of names"),
+        ("", "must be a text file whose first line names the columns"),
     ],
 )
 def test_bad_tables(tmp_path, text, match):
@@ -110,7 +110,7 @@ def test_bad_tables(tmp_path, text, match):
     path.write_text(text)
     with user_error(match=match):
         sysid.read_csv(path, **NAMES)
-    with user_error(match="frame must be a table, got 3"):
+    with user_error(match="frame must be a data frame or a dictionary of .*got 3"):
         sysid.from_frame(3, **NAMES)
     with user_error(match="must have numbers in column 'level'"):
         sysid.from_frame({"level": ["a"], "pump": [1], "t": [0]}, **NAMES)

@@ -106,7 +106,7 @@ def test_bad_input():
         (lambda: fit(learning_rate=0.0), "learning_rate must be positive"),
         (lambda: fit(validation=1.0), "validation must be between 0 and 1, got 1.0"),
         (lambda: fit(key=0), "key must be one random key"),
-        (lambda: fit(horizon=36), r"record\[0\] must have 41 samples .* got 40"),
+        (lambda: fit(horizon=36), r"record\[0\] must have at least 41 .* got 40"),
     ):
         with user_error(match=match):
             call()

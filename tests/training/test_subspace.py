@@ -119,8 +119,8 @@ def test_bad_input_and_data_that_tell_too_little():
         (lambda: sysid.subspace(given, 0), "order must be a whole number of at least"),
         (lambda: sysid.subspace(given, 2, horizon=0), "horizon must be a whole number"),
         (lambda: sysid.subspace(given, 7, horizon=4), "at most the 6 outputs of horiz"),
-        (lambda: sysid.subspace(given, 3, horizon=30), "must have 240 stretches of 60"),
-        (lambda: sysid.subspace(given[:9], 3), "24 stretches of 6 .*got 4 from 9"),
+        (lambda: sysid.subspace(given, 3, horizon=30), "at least 240 windows of 60"),
+        (lambda: sysid.subspace(given[:9], 3), "24 windows of 6 .*got 4 in 9"),
         (lambda: sysid.subspace(given, 1, affine=True), "at most the 1 states, if aff"),
     ):
         with user_error(match=match):

@@ -84,8 +84,8 @@ def physical(
 
     - `dynamics`: the dynamics; their parameters are the first guess. If the step of the
         record differs from that of the dynamics, or if the controls are interpolated,
-        they must be a [`delucax.Discretized`][] system. One step of its integrator is
-        then taken over each step of the record.
+        they must be a [`delucax.Discretized`][] system. Its step, with the same solver
+        and substeps, is then stretched to each step of the record.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
         of paths, or a dictionary from path to constraint, as `trainable` of
@@ -139,7 +139,7 @@ def physical(
     if sizes != (size, dynamics.control_size):
         raise ValueError(
             f"{where}: record must have {size} outputs and {dynamics.control_size} "
-            f"controls, as the dynamics do, got {sizes[0]} and {sizes[1]}."
+            f"controls, as the dynamics have, got {sizes[0]} and {sizes[1]}."
         )
     longest = max(len(record) for record in records) - 1
     whole = longest if window is None else check_count(window, "window", where)

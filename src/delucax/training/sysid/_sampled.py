@@ -1,4 +1,4 @@
-"""Systems driven by what lies between the samples of a record."""
+"""Dynamics driven by the samples of a record, at any times and with any hold."""
 
 import dataclasses
 from typing import Any
@@ -16,17 +16,19 @@ from ...systems import AbstractHybridSystem, AbstractSystem, AbstractSystemWrapp
 from ._record import grouped, Record
 
 
-# A step of the dynamics that differs by less than this share from that of the record.
+# The step of the dynamics fits the record if it differs by less than this share.
 _UNEVEN = 1e-4
 
 
 class Sampled(AbstractSystemWrapper):
-    """A system over one step of a record, of any length h,
+    r"""A system whose time is scaled, so that a step of length $h$ takes the time `dt`.
 
-    `dx/ds = (h / dt) f(t + h s / dt, x, u(s / dt), w)` for s in [0, dt],
+    $$\frac{dx}{ds} = \frac{h}{dt} f\left(t + \frac{h s}{dt}, x,
+    u\left(\frac{s}{dt}\right), w\right), \quad s \in [0, dt], \qquad
+    u(r) = \sum_j c_j r^j$$
 
-    whose control is a row `(t, h, c_0, ..., c_d)`, with `u(r) = sum_j c_j r^j`. So one
-    integrator of a fixed step takes samples at any times and controls of any hold.
+    The control is a row `(t, h, c_0, ..., c_d)`. An integrator with a fixed step can
+    therefore handle samples at any times, and controls with any hold.
     """
 
     system: AbstractSystem
@@ -34,7 +36,7 @@ class Sampled(AbstractSystemWrapper):
 
     @property
     def control_names(self) -> tuple[str, ...]:
-        """One row."""
+        """The control is one row."""
         return ("row",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
@@ -46,26 +48,26 @@ class Sampled(AbstractSystemWrapper):
 
 
 class Sampling(eqx.Module):
-    """How the rows of a record drive dynamics."""
+    """How the rows of a record drive dynamics: as controls, or as in `Sampled`."""
 
     is_plain: bool = eqx.field(static=True)
 
     def __call__(self, dynamics: AbstractDynamics) -> Any:
-        """`(t, x, row) -> x_next`."""
+        """The step of the dynamics, a function `(t, x, row) -> x_next`."""
         if self.is_plain:
             return lambda t, x, row: dynamics.advance(t, x, row, None)[0]
         assert isinstance(dynamics, Discretized)
         sampled = Sampled(dynamics.system, dynamics.dt)
         driven = dataclasses.replace(dynamics, system=sampled)
-        # A row knows its own time.
+        # A row holds its own time.
         return lambda t, x, row: driven.advance(0.0, x, row, None)[0]
 
 
 def sampling_of(
     dynamics: AbstractDynamics, records: list[Record], where: str
 ) -> tuple[Sampling, list[Record], list[Float[Array, "_ _ row"]]]:
-    """How these dynamics are driven; stacked records, and the rows of each. Raises if
-    the dynamics cannot be driven by them."""
+    """The sampling of these dynamics, the stacked records, and the rows of each. Raise
+    if the records cannot drive the dynamics."""
     groups = grouped(records)
     plain = [r.is_uniform and r.hold == "zero" and _fits(dynamics, r) for r in records]
     if all(plain):
@@ -80,7 +82,7 @@ def sampling_of(
             got = f"dt={float(record.dt):g} and hold={record.hold!r}"
         raise ValueError(
             f"{where}: dynamics must be a delucax.Discretized system without events, "
-            "unless the record has their own dt and hold='zero'; got "
+            "unless the record has the dt of the dynamics and hold='zero'. Got "
             f"{type(dynamics).__name__} with dt={float(dynamics.dt):g}, and {got}."
         )
     return Sampling(False), groups, _rows(groups, False)
@@ -99,7 +101,8 @@ def _rows(groups: list[Record], is_plain: bool) -> list[Float[Array, "_ _ row"]]
 
 
 def _fits(dynamics: AbstractDynamics, record: Record) -> bool:
-    """Whether the step of the dynamics is that of the record, as far as is known."""
+    """Whether the dynamics and the record have the same step. Traced steps count as
+    the same."""
     own, dt = dynamics.dt, record.dt
     if not is_concrete(own) or not is_concrete(dt):
         return True

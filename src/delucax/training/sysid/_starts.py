@@ -1,4 +1,4 @@
-"""The states from which a model runs along measurements."""
+"""The first states of simulations along records: guessed, simulated, estimated."""
 
 from typing import Any
 
@@ -19,27 +19,28 @@ from ._sampled import Sampling
 from ._windows import begins_of, Windows
 
 
-# Enough for a handful of numbers; a start that needs more is far off.
+# Iterations to estimate a state. A start that needs more is far from the solution.
 _MAX_STEPS = 30
 
 
 def guessed_starts(
     dynamics: AbstractDynamics, x0: Any, groups: list[Record], where: str
 ) -> list[Float[Array, "_ n"]]:
-    """A guess of the first state of each record: what is given, or observed."""
+    """A guess of the first state of each record: `x0`, or else the first measurement.
+    """
     n, sizes = dynamics.state_size, [len(group.outputs) for group in groups]
     if x0 is None:
         if groups[0].outputs.shape[2] == n:
             return [group.outputs[:, 0] for group in groups]
         raise ValueError(
-            f"{where}: x0 must be given where the state (of size {n}) is not what is "
-            f"observed (of size {groups[0].outputs.shape[2]})."
+            f"{where}: x0 must be given, because the state (of size {n}) is not "
+            f"measured: the record has {groups[0].outputs.shape[2]} outputs."
         )
     x0, count = as_float_array(x0), sum(sizes)
     if x0.shape not in ((n,), (count, n)):
         raise ValueError(
-            f"{where}: x0 must have shape ({n},), or ({count}, {n}) with one for each "
-            f"record, got {x0.shape}."
+            f"{where}: x0 must have shape ({n},), or ({count}, {n}) with a row for "
+            f"each record, got {x0.shape}."
         )
     check_finite(x0, "x0", where)
     x0 = jnp.broadcast_to(x0, (count, n)).astype(groups[0].outputs.dtype)
@@ -49,7 +50,8 @@ def guessed_starts(
 def simulated(
     dynamics: AbstractDynamics, sampling: Sampling, x0: Array, times: Array, rows: Array
 ) -> Float[Array, "samples n"]:
-    """The states that the rows lead to; held where they run away."""
+    """The states of a simulation driven by the rows. If the next state is not finite,
+    the state is held."""
     advance = sampling(dynamics)
 
     def step(x, inputs):
@@ -69,7 +71,7 @@ def simulated_records(
     groups: list[Record],
     rows: list[Float[Array, "_ _ row"]],
 ) -> list[Float[Array, "_ _ n"]]:
-    """The states of each record, from its first."""
+    """The states of a simulation along each record, from its first state."""
     run = lambda x0, times, rows: simulated(dynamics, sampling, x0, times, rows)
     times = [group.times for group in groups]
     return [jax.vmap(run)(*one) for one in zip(firsts, times, rows, strict=True)]
@@ -84,7 +86,7 @@ def stitched(
     rows: list[Float[Array, "_ _ row"]],
     window: int,
 ) -> list[Float[Array, "_ _ n"]]:
-    """The states of each record, window by window from their estimated starts."""
+    """The states along each record, simulated from the first state of each window."""
     run = lambda x0, times, rows: simulated(dynamics, sampling, x0, times, rows)
     parts, count = [], 0
     for group, own in zip(groups, rows, strict=True):
@@ -110,7 +112,7 @@ def estimated_starts(
     guesses: Float[Array, "windows n"],
     data: Windows,
 ) -> Solution:
-    """The states at which windows begin, by least squares on their outputs."""
+    """The first states of windows, by least squares on the outputs in each window."""
     nothing = {"": jnp.zeros(1, data.observations.dtype)}
     most: Any = np.asarray(_MAX_STEPS)
     leaves, structure = jax.tree.flatten(dynamics)
@@ -119,7 +121,7 @@ def estimated_starts(
 
 
 def whole_windows(times: Array, rows: Array, outputs: Array) -> Windows:
-    """Windows whose points all count, in units of the spread of the outputs, so that
+    """Windows whose points all count. Each output is weighed by its spread, so that
     none outweighs the others."""
     spread = jnp.std(outputs, axis=(0, 1))
     spread = jnp.where(spread > 0, spread, 1).astype(outputs.dtype)

@@ -1,4 +1,4 @@
-"""Neural state-space models of outputs and controls, started by an encoder."""
+"""Neural state-space models of outputs and controls, with an encoder of the state."""
 
 from typing import Any, NamedTuple
 
@@ -24,27 +24,26 @@ from ._record import Record, Records, uniform_records
 
 
 _WHERE = "sysid.state_space"
-# The last learning rate, in parts of the first.
+# The last learning rate as a share of the first.
 _LAST_RATE = 0.01
-# Stretches that run away have gradients that say little.
+# The gradients of windows whose simulation diverges are clipped to this norm.
 _LARGEST_GRADIENT = 1.0
 
 
 class StateSpace(NamedTuple):
-    """A neural state-space model, as [`delucax.training.sysid.state_space`][] returns
-    it.
+    """The result of [`delucax.training.sysid.state_space`][].
 
     **Attributes:**
 
-    - `model`: the dynamics, [`delucax.training.sysid.LatentDynamics`][].
-    - `encoder`: from past outputs and controls to the state,
+    - `model`: the dynamics, a [`delucax.training.sysid.LatentDynamics`][].
+    - `encoder`: computes the state from past outputs and controls, a
         [`delucax.training.sysid.Encoder`][].
-    - `error`: the root mean square error of each output in a free run over the
+    - `error`: the root-mean-square error of each output in a free run over the
         validation part, shape `(p,)`.
-    - `start_error`: that before training.
-    - `history`: the record of the training, a [`delucax.training.History`][]; its
-        metric `"validation"` is the error of the outputs in units of their spread.
-    - `result`: success, or `RESULTS.diverged` if the training ended early, or no free
+    - `start_error`: the same error before training.
+    - `history`: the record of the training, a [`delucax.training.History`][]. Its
+        metric `"validation"` is the error relative to the spread of the outputs.
+    - `result`: success, or `RESULTS.diverged` if the training ended early or no free
         run was finite.
 
     !!! example
@@ -88,49 +87,54 @@ def state_space(
     progress: bool = True,
     key: PRNGKey,
 ) -> StateSpace:
-    r"""A neural state-space model of outputs and controls,
+    r"""Train a neural state-space model of outputs and controls, with its encoder.
 
-    `x_{k+1} = A x_k + B u_k + f(x_k, u_k)`, `y_k = C x_k + h(x_k)`,
+    $$x_{k+1} = A x_k + B u_k + f(x_k, u_k), \qquad y_k = C x_k + h(x_k)$$
 
-    whose state at the beginning of a stretch is that of an encoder, a network of the
-    last `past` outputs and controls; all in normalised units.
+    The signals are normalised. The encoder is a network that computes the state from
+    the last `past` outputs and controls.
 
-    The networks f, h and the encoder, and the matrices, minimise the mean square of the
-    prediction error over stretches of `horizon` steps that begin anywhere in the
-    records, drawn anew at each step of Adam, whose rate falls as a cosine. They begin
-    as the linear model of [`delucax.training.sysid.subspace`][], with f = h = 0, where
-    the data give one, and from random numbers otherwise. The last part of each record
-    is kept for validation: the weights that are returned are those with the least error
-    of a free run over all of it, from a state that the encoder gives.
+    The networks $f$ and $h$, the matrices and the encoder are trained together. The
+    loss is the mean squared error of predictions over windows of `horizon` steps, which
+    begin anywhere in the records, at a state from the encoder. Each step of Adam draws
+    new windows, and the learning rate decays as a cosine. Training starts at the linear
+    model of [`delucax.training.sysid.subspace`][] with $f = h = 0$, or at random
+    weights if the data do not give such a model.
 
-    As in `subspace`, a control moves no output before the next sample. A free run of an
-    unstable plant tells nothing, so that its records are not for this function. The
-    state has no unit, and another training gives another one; what shows of it is
-    `model.observe`.
+    The last part of each record is kept for validation. From time to time, a free run
+    over this part is simulated, from a state of the encoder. The weights with the least
+    error in these free runs are returned.
+
+    The state has no unit, and another training gives another state; `model.observe`
+    gives the outputs. As in `subspace`, a control affects the outputs from the next
+    sample on. The plant must be stable, because errors in a free run of an unstable
+    plant grow whatever the model.
 
     **Arguments:**
 
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
         time.
-    - `states`: their number, n.
-    - `past`: the samples that the encoder sees; a few times n.
-    - `horizon`: the steps of a stretch, 50 by default. About as long as the plant
-        remembers.
-    - `width`, `depth`: units of a hidden layer, and hidden layers, of each network; 16
-        and 1 by default.
-    - `steps`: of the training, 2000 by default.
-    - `batch_size`: stretches in a step, 64 by default.
-    - `learning_rate`: the first, 0.01 by default.
-    - `validation`: the share of each record that is kept, its last; 0.2 by default.
-    - `validate_every`: steps between two free runs, 100 by default.
-    - `progress`: whether to show a bar with the loss; true by default.
+    - `states`: n, the number of states.
+    - `past`: the number of samples that the encoder takes; a few times n.
+    - `horizon`: the number of steps of a window, 50 by default. Take about the time
+        after which the plant has forgotten its state.
+    - `width`, `depth`: units in each hidden layer and number of hidden layers of each
+        network, 16 and 1 by default.
+    - `steps`: the number of training steps, 2000 by default.
+    - `batch_size`: the number of windows in a training step, 64 by default.
+    - `learning_rate`: the initial learning rate, 0.01 by default.
+    - `validation`: the share of each record that is kept for validation, 0.2 by
+        default.
+    - `validate_every`: the number of training steps between two free runs, 100 by
+        default.
+    - `progress`: whether to show a progress bar with the loss; true by default.
     - `key`: a random key.
 
     **Returns:** [`delucax.training.sysid.StateSpace`][].
 
-    **Raises:** `ValueError` on counts below 1, a rate that is not positive, a share
-    that is not between 0 and 1, or if a record has fewer than `past + horizon` samples
-    before its validation part.
+    **Raises:** `ValueError` if a count is below 1, the learning rate is not positive,
+    `validation` is not between 0 and 1, or a record has fewer than `past + horizon`
+    samples before its validation part.
 
     Source: Beintema, Toth and Schoukens, 2021 and 2023 (SUBNET).
 
@@ -167,8 +171,9 @@ def state_space(
     for index, length in enumerate(lengths):
         if length < past + horizon:
             raise ValueError(
-                f"{_WHERE}: record[{index}] must have {past + horizon} samples (past + "
-                f"horizon) or more before its validation part, got {length}."
+                f"{_WHERE}: record[{index}] must have at least {past + horizon} "
+                "samples (past + horizon) before its validation part, got "
+                f"{length}."
             )
     estimation = [one[:n] for one, n in zip(records, lengths, strict=True)]
     model = _start(estimation, states, past, width, depth, of_start)
@@ -184,7 +189,8 @@ def state_space(
     clip = optax.clip_by_global_norm(_LARGEST_GRADIENT)
     optimiser = optax.chain(clip, optax.adam(rate))
     given: Any = dict(key=of_steps, progress=progress, throw=False)
-    # One more, before which the last weights are judged, and which is left out.
+    # An update judges the weights before its step. So one more step judges the last
+    # weights, and its own weights are not used.
     fitted = fit(loss, model, optimiser, steps + 1, **given)
     (dynamics, encoder), error, start_error = fitted.model
     result = fitted.result
@@ -194,7 +200,7 @@ def state_space(
 
 
 class _FreeRuns(NamedTuple):
-    """The validation parts of all records, and what comes before each."""
+    """The validation parts of all records, and the past samples before each."""
 
     past_outputs: Float[Array, "records past p"]
     past_controls: Float[Array, "records past m"]
@@ -203,17 +209,17 @@ class _FreeRuns(NamedTuple):
     counts: Bool[Array, "records steps"]
 
     def error(self, model: tuple[LatentDynamics, Encoder]) -> Float[Array, " p"]:
-        """Of each output, the root mean square error of a free run."""
+        """The root-mean-square error of each output in the free runs."""
         given = self.past_outputs, self.past_controls
         rest = _predicted(model, *given, self.controls) - self.outputs
         square = jnp.mean(rest**2, axis=(0, 1), where=self.counts[..., None])
-        # Not NaN, which is in no order.
+        # Infinity instead of NaN, because it compares as larger than any error.
         return jnp.where(jnp.isfinite(square), jnp.sqrt(square), jnp.inf)
 
 
 class _Stretches(AbstractSurrogate):
-    """The prediction error over stretches that begin anywhere; it remembers the best
-    weights."""
+    """The prediction error over windows that begin anywhere. It remembers the weights
+    that did best in the free runs."""
 
     outputs: Float[Array, "rows p"]
     controls: Float[Array, "rows m"]
@@ -272,13 +278,13 @@ def _predicted(
     past_controls: Float[Array, "runs past m"],
     controls: Float[Array, "runs steps m"],
 ) -> Float[Array, "runs steps p"]:
-    """The outputs of free runs, from the states that the encoder gives."""
+    """The outputs of free runs from the states that the encoder computes."""
     dynamics, encoder = model
     advance = lambda x, u: dynamics.advance(0.0, x, u, None)[0]
     step = lambda x, u: (jax.vmap(advance)(x, u), x)
     starts = jax.vmap(encoder)(past_outputs, past_controls)
     _, states = lax.scan(step, starts, jnp.swapaxes(controls, 0, 1))
-    # Of all states at once, which is faster than one by one.
+    # Observing all states at once is faster than one by one.
     observe = jax.vmap(jax.vmap(lambda x: dynamics.observe(0.0, x)))
     return observe(jnp.swapaxes(states, 0, 1))
 
@@ -291,7 +297,7 @@ def _start(
     depth: int,
     key: PRNGKey,
 ) -> tuple[LatentDynamics, Encoder]:
-    """The linear model as one of networks, or random networks where there is none."""
+    """The initial model and encoder: the linear start, or else random networks."""
     start = linear_start(estimation, states, past)
     of_dynamics, of_encoder, *rest = jr.split(key, 5)
     p, m = (getattr(estimation[0], k).shape[1] for k in ("outputs", "controls"))
@@ -316,7 +322,8 @@ def _start(
 
 
 def _stretches_of(records: list[Record], past: int, horizon: int) -> dict[str, Array]:
-    """All rows of the records one after the other, and where stretches may begin."""
+    """All rows of the records one after the other, and the rows at which a window may
+    begin."""
     ends = np.cumsum([len(record) for record in records])
     begins = [
         np.arange(end - len(record) + past, end - horizon + 1)
@@ -328,7 +335,7 @@ def _stretches_of(records: list[Record], past: int, horizon: int) -> dict[str, A
 
 
 def _free_runs_of(records: list[Record], lengths: list[int], past: int) -> _FreeRuns:
-    """The parts of the records behind these lengths, filled up to one length."""
+    """The validation parts of the records after `lengths`, padded to one length."""
     longest = max(len(r) - n for r, n in zip(records, lengths, strict=True))
     runs = []
     for record, n in zip(records, lengths, strict=True):

@@ -1,4 +1,4 @@
-"""Linear state-space models of outputs and controls, by subspaces."""
+"""Subspace identification of linear state-space models."""
 
 from typing import Any
 
@@ -21,23 +21,24 @@ _LEAST_HORIZON = 10
 
 
 class Subspace(eqx.Module):
-    """A linear model of outputs and controls, as [`delucax.training.sysid.subspace`][]
-    returns it.
+    r"""The result of [`delucax.training.sysid.subspace`][].
 
     **Attributes:**
 
-    - `model`: a [`delucax.LinearDynamics`][], `x_next = A x + B u`, `y = C x`; about an
-        operating point, where the fit was affine.
-    - `singular_values`: shape `(horizon p,)`, in falling order. The order is their
-        number before the largest gap, if there is one. 1 is the spread of the outputs.
-    - `x0`: the first state, shape `(n,)`, or one for each record, `(records, n)`.
-    - `gain`: K of the Kalman predictor, `x_next = A x + B u + K (y - C x)`, shape
-        `(n, p)`.
-    - `start_gain`: that of the predictor by which B and the first states were fitted.
-        About zero for a stable model, so that its prediction is a free run; for
-        another, one that makes it stable. Shape `(n, p)`.
-    - `error`: the root mean square of `y - C x` in the latter, shape `(p,)`.
-    - `result`: success; `RESULTS.unexciting` if the controls do not move the system
+    - `model`: a [`delucax.LinearDynamics`][], $x_{k+1} = A x_k + B u_k$, $y_k = C x_k$;
+        about an operating point if the fit was affine.
+    - `singular_values`: shape `(horizon p,)`, in descending order, in units of the
+        spread of the outputs. If there is a clear gap, the number of values before it
+        is the order that the model needs.
+    - `x0`: the first state, shape `(n,)`, or `(records, n)` for a list of records.
+    - `gain`: $K$ of the Kalman predictor $x_{k+1} = A x_k + B u_k + K (y_k - C x_k)$,
+        shape `(n, p)`.
+    - `start_gain`: the gain of the predictor with which $B$ and the first states were
+        fitted, shape `(n, p)`. For a stable model it is nearly zero, so that the
+        predictor is a free run. For an unstable model it makes the predictor stable.
+    - `error`: the root-mean-square error `y - C x` of the predictor with `start_gain`,
+        shape `(p,)`.
+    - `result`: success; `RESULTS.unexciting` if the controls do not excite the system
         enough; `RESULTS.diverged` if the model is not finite.
 
     !!! example
@@ -67,16 +68,18 @@ class Subspace(eqx.Module):
     __repr__ = shown
 
     def start(self, record: Records) -> Float[Array, "*records n"]:
-        """The first state of other records, from all of their samples: that from which
-        a free run (for a model that is not stable, the predictor with `start_gain`)
-        errs least, in the sum of squares.
+        """Estimate the first state of another record from all of its samples.
+
+        It is the state from which the predictor with `start_gain` has the least sum of
+        squared errors. For a stable model this predictor is a free run.
 
         **Arguments:** `record`: a [`delucax.training.sysid.Record`][] or a list of
         them; uniform in time.
 
         **Returns:** shape `(n,)`, or `(records, n)` for a list.
 
-        **Raises:** `ValueError` if `record` is none, or has other outputs or controls.
+        **Raises:** `ValueError` if `record` is not a uniform record or a list of them,
+        or has another number of outputs or controls than the model.
         """
         where = "Subspace.start"
         records = uniform_records(record, where)
@@ -99,47 +102,47 @@ def subspace(
     affine: bool = False,
     throw: bool = True,
 ) -> Subspace:
-    r"""A linear state-space model of outputs and controls, without a first guess and
-    without iterations,
+    r"""Fit a linear state-space model of outputs and controls by a subspace method.
 
-    `x_{k+1} = A x_k + B u_k + K e_k`, `y_k = C x_k + e_k`, with e white.
+    $$x_{k+1} = A x_k + B u_k + K e_k, \qquad y_k = C x_k + e_k, \qquad
+    e \text{ white noise}$$
 
-    What the past tells of the outputs of the next `horizon` steps, beside what the
-    controls of these steps do, has as many directions as there are states. They are
-    the singular vectors of a block of the triangular factor of all stretches of
-    `2 horizon` samples, and give A, C and K. B, the first states and the operating
-    point then follow by linear least squares on the errors of a free run. The factor is
-    updated by some thousand stretches at a time, so that time and memory are linear in
-    the number of samples.
+    The method needs no first guess and no iterations. It predicts the outputs of the
+    next `horizon` steps from the past, and removes the effect of the controls of these
+    steps. What remains has as many directions as the system has states. These
+    directions are the singular vectors of a block of a triangular factor of the
+    Hankel matrices, and they give $A$, $C$ and $K$. Then $B$, the first states and the
+    operating point follow by linear least squares on the errors of a free run. Time and
+    memory are linear in the number of samples.
 
-    The model is strictly proper: a control moves no output before the next sample, as
-    in all dynamics here. Where it does, as a measured input between two samples may,
-    `Record(outputs[:-1], controls[1:], dt=dt)` is the record of such a model. Controls
-    that depend on the noise, as those of a feedback do, bias the estimate. The model is
-    not forced to be stable; too high an order may give a mode that is not.
+    The model is strictly proper: a control affects the outputs from the next sample on,
+    as in all dynamics of this library. If your control affects the output of the same
+    sample, fit `Record(outputs[:-1], controls[1:], dt=dt)`. Controls that depend on the
+    noise, like those of a feedback, bias the estimate. The model is not forced to be
+    stable: if the order is too high, it may have an unstable mode.
 
     **Arguments:**
 
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
         time, with any number of outputs and controls.
-    - `order`: the number of states, n. `singular_values`, which do not depend on it,
-        tell how many are needed.
-    - `horizon`: the steps that are predicted, and as many that are looked back on. More
-        average over more noise. By default the larger of 10 and twice the order, or
-        what the records have samples for.
-    - `affine`: whether to estimate an operating point too, about which the model is
-        linear, for outputs and controls that are not measured from an equilibrium;
-        false by default.
-    - `throw`: raise if the controls tell too little (default); if false, look at
-        `result`.
+    - `order`: n, the number of states. `singular_values` of the result show how many
+        are needed; they do not depend on `order` if you give `horizon`.
+    - `horizon`: the number of steps that are predicted, and of steps of the past. A
+        longer horizon averages over more noise. By default it is the larger of 10 and
+        twice the order, or shorter if the records have too few samples.
+    - `affine`: whether to estimate an operating point too, for outputs and controls
+        that are not measured from an equilibrium; false by default.
+    - `throw`: raise an error if the controls do not excite the system enough; true by
+        default. If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Subspace`][]. Its states are balanced: they
-    are in the order of what they contribute.
+    **Returns:** [`delucax.training.sysid.Subspace`][]. Its states are balanced, and
+    ordered by how much they contribute.
 
-    **Raises:** `ValueError` if `record` is none, on counts below 1, if `order` exceeds
-    `(horizon - 1)` times the outputs, or if there are too few samples for the
-    horizon; an error at run time as `throw` says, if the controls are not persistently
-    exciting: if they are constant, say, or fewer sines than `(horizon + order) / 2`.
+    **Raises:** `ValueError` if `record` is not a uniform record or a list of them, a
+    count is below 1, `order` exceeds `(horizon - 1)` times the number of outputs, or
+    there are too few samples for the horizon; an error at run time as `throw` says, if
+    the controls are not persistently exciting, for example constant or the sum of fewer
+    than `(horizon + order) / 2` sines.
 
     Source: Van Overschee and De Moor, 1994 and 1996 (N4SID); Verhaegen and Dewilde,
     1992 (the weights, MOESP); Ljung, 1999.
@@ -183,11 +186,12 @@ def subspace(
 def _checked_horizon(
     horizon: Any, order: int, p: int, m: int, affine: bool, records: list[Record]
 ) -> int:
-    """A horizon that the order fits, and for which there are samples."""
+    """The horizon, checked against the order and the number of samples."""
 
     rows = lambda h: affine + 2 * h * (m + p)
     columns = lambda h: sum(max(0, len(record) - 2 * h + 1) for record in records)
-    # A shifted by a step, the outputs of the horizon must still tell all states.
+    # A comes from the outputs of the horizon but one step; they must determine all
+    # states.
     least = -(-order // p) + 1
     if horizon is None:
         horizon = max(_LEAST_HORIZON, 2 * order)
@@ -198,9 +202,9 @@ def _checked_horizon(
     check_at_most(order, most, "order", _WHERE, "outputs of horizon - 1 steps")
     if columns(horizon) < rows(horizon):
         raise ValueError(
-            f"{_WHERE}: record must have {rows(horizon)} stretches of {2 * horizon} "
-            f"samples or more for a horizon of {horizon} steps, got "
-            f"{columns(horizon)} from {sum(map(len, records))} samples."
+            f"{_WHERE}: record must have at least {rows(horizon)} windows of "
+            f"{2 * horizon} samples for a horizon of {horizon} steps, got "
+            f"{columns(horizon)} in {sum(map(len, records))} samples."
         )
     return horizon
 
@@ -209,16 +213,19 @@ def _checked_horizon(
 def _regressed(
     known: Realised, units: Units, groups: list[Record], affine: bool
 ) -> tuple[dict[str, Array], dict[str, Any]]:
-    """B, an operating point and the first states by the errors of the predictor: the
-    matrices of the model, and all else, in the units of the records."""
+    """Fit B, the operating point and the first states to the errors of the predictor.
+
+    Returns the matrices of the model, and the other results, in the units of the
+    records.
+    """
     A, C, gain = known.A, known.C, known.start_gain
     (p, n), m = C.shape, groups[0].controls.shape[2]
     dtype = A.dtype
     predictor = A - gain @ C
 
     def of(y, u):
-        """For each output, what it owes to the first state, B and the offset, and what
-        they must explain."""
+        """The regressors of the outputs for the first state, B and the offset, and the
+        outputs that they must explain."""
 
         def step(Z, inputs):
             y, u = inputs
@@ -231,13 +238,13 @@ def _regressed(
         _, rows = lax.scan(step, Z, (y, u))
         rows = rows + jnp.eye(p, width + 1, n + n * m, dtype=dtype)
         table = rows[..., :width].reshape(-1, width)
-        # Without an offset its columns are left out.
+        # Without an offset, its columns are left out.
         table = table if affine else table[:, : n + n * m]
         return table, (y - rows[..., -1]).reshape(-1)
 
     tables = [jax.vmap(of)(*units.of(group)) for group in groups]
     factors = [jax.vmap(_triangle)(*pair) for pair in tables]
-    # Each record has a first state of its own; the rest is common to all.
+    # Each record has its own first state; B and the offset are common to all.
     common = jnp.concatenate(
         [f[:, n:, n:].reshape(-1, f.shape[2] - n) for f in factors]
     )
@@ -262,27 +269,28 @@ def _regressed(
     finite = jnp.all(jnp.isfinite(x0)) & jnp.all(jnp.isfinite(B))
     result = choose(known.excited, RESULTS.successful, RESULTS.unexciting)
     result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))
-    # A model holds finite numbers; the result says that these are none.
+    # A model must hold finite numbers. `result` says that the fit failed.
     matrices = jax.tree.map(lambda M: jnp.where(finite, M, 0), matrices)
     gains = dict(gain=known.gain / y_size, start_gain=known.start_gain / y_size)
     return matrices, dict(x0=x0, error=error, result=result, **gains)
 
 
 def _triangle(table: Float[Array, "rows q"], target: Float[Array, " rows"]) -> Array:
+    """The triangular factor of a table with its target as the last column."""
     joined = jnp.concatenate([table, target[:, None]], axis=1)
-    # As many rows as columns at least.
+    # Pad to at least as many rows as columns.
     lacking = max(0, joined.shape[1] - len(joined))
     return jnp.linalg.qr(jnp.pad(joined, ((0, lacking), (0, 0))), mode="r")
 
 
 def _solved(table: Array, target: Array) -> Array:
-    """The least squares, of the least norm where the table does not tell all."""
+    """The least-squares solution, with the least norm if it is not unique."""
     return jnp.linalg.lstsq(table, target)[0]
 
 
 @eqx.filter_jit
 def _starts(model: LinearDynamics, gain: Array, groups: list[Record]) -> Array:
-    """The first states for which the predictor errs least."""
+    """The first states from which the predictor has the least squared error."""
     n, C = model.state_size, model.C
     assert C is not None
     predictor = model.A - gain @ C

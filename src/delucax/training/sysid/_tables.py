@@ -1,4 +1,4 @@
-"""Records from files and from data frames."""
+"""Records from CSV files and from data frames."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -25,23 +25,25 @@ def read_csv(
     hold: Hold = "zero",
     delimiter: str = ",",
 ) -> Any:
-    """A record from a file of comma-separated values, whose first line names the
-    columns.
+    """Read a record from a CSV file whose first line names the columns.
 
     **Arguments:**
 
-    - `path`: of the file.
-    - `outputs`, `controls`: the name of a column, or several.
-    - `times`: the column of the times; or
+    - `path`: the path of the file.
+    - `outputs`, `controls`: the name of a column, or a list of names.
+    - `times`: the name of the column with the times; or
     - `dt`: the time from one row to the next.
-    - `by`: a column that tells experiments apart; neighbouring rows with the same entry
-        are one record. None by default.
-    - `hold`: of the control between samples, `"zero"` by default.
-    - `delimiter`: between columns, a comma by default.
+    - `by`: the name of a column that tells experiments apart. Neighbouring rows with
+        the same entry make one record. By default the file is one record.
+    - `hold`: the control between samples, as in [`delucax.training.sysid.Record`][];
+        `"zero"` by default.
+    - `delimiter`: the character between columns, a comma by default.
 
-    **Returns:** a [`delucax.training.sysid.Record`][], or a list of them with `by`.
+    **Returns:** a [`delucax.training.sysid.Record`][], or a list of them if `by` is
+    given.
 
-    **Raises:** `ValueError` if the file is not such a table, with line and column.
+    **Raises:** `ValueError` if a column is missing or an entry is not a number. The
+    message names the line and the column.
 
     !!! example
 
@@ -60,8 +62,9 @@ def read_csv(
         try:
             header, *lines = [row for row in csv.reader(file, delimiter=delimiter)]
         except (ValueError, UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{where} must be text with a line of names.") from error
-    # A delimiter at the end of each line makes an empty column.
+            raise ValueError(
+                f"{where} must be a text file whose first line names the columns."
+            ) from error
     names = [name.strip() for name in header]
     wanted = _wanted(outputs, controls, times)
     places = {name: _place(name, names, where) for name in wanted + _listed(by)}
@@ -88,17 +91,19 @@ def from_frame(
     by: str | None = None,
     hold: Hold = "zero",
 ) -> Any:
-    """A record from a data frame of pandas or Polars, or a dictionary of columns.
+    """Make a record from a data frame or a dictionary of columns.
 
     **Arguments:**
 
-    - `frame`: the table. Times may be dates, and are then counted in seconds.
+    - `frame`: a data frame of pandas or Polars, or a dictionary of columns. If the
+        times are dates, they are converted to seconds since the first row.
     - `outputs`, `controls`, `times`, `dt`, `by`, `hold`: as in
         [`delucax.training.sysid.read_csv`][].
 
-    **Returns:** a [`delucax.training.sysid.Record`][], or a list of them with `by`.
+    **Returns:** a [`delucax.training.sysid.Record`][], or a list of them if `by` is
+    given.
 
-    **Raises:** `ValueError` if there is no such column, or one is not of numbers.
+    **Raises:** `ValueError` if a column is missing or does not hold numbers.
 
     !!! example
 
@@ -113,7 +118,10 @@ def from_frame(
     """
     where = "sysid.from_frame: frame"
     if not hasattr(frame, "columns") and not isinstance(frame, Mapping):
-        raise ValueError(f"{where} must be a table, got {shortened(frame)}.")
+        raise ValueError(
+            f"{where} must be a data frame or a dictionary of columns, got "
+            f"{shortened(frame)}."
+        )
     names = [str(name) for name in getattr(frame, "columns", frame)]
     columns = {}
     for name in _wanted(outputs, controls, times) + _listed(by):

@@ -1,4 +1,4 @@
-"""How well a model predicts measurements that it was not fitted to."""
+"""Validation of a model on a record that it was not fitted to."""
 
 from typing import Any
 
@@ -17,33 +17,36 @@ from ._sampled import Sampling, sampling_of
 from ._starts import estimated_starts, guessed_starts, simulated, whole_windows
 
 
-# The most stretches on which predictions are judged.
+# Predictions begin at this many samples of each record at most.
 _STRETCHES = 200
-# The level of the bounds of the correlations, in standard deviations.
+# 95% of a standard normal distribution lie within this.
 _BOUND = 1.96
 
 
 class Validation(eqx.Module):
-    """Predictions of a model beside what was measured.
+    r"""How well the predictions of a model match a record.
+
+    Printing the object prints a table of the errors.
 
     **Attributes:**
 
-    - `simulated`: a tuple with the outputs of the free run of each record, shape
-        `(N, p)`: from its estimated start by the controls alone.
-    - `rmse`: the root of the mean squared error of the free run, shape `(p,)`, after
-        the samples that the start is estimated from.
-    - `fit`: in percent, `100 (1 - |y - yhat| / |y - mean(y)|)`, shape `(p,)`.
-    - `ahead`: the same root for predictions of 1, ..., k steps, shape `(k, p)`.
-    - `autocorrelation`: of the errors of the free run, at lags 1, 2, ..., shape
-        `(lags, p)`.
-    - `cross_correlation`: of the errors with the controls of 0, 1, ... steps before,
-        shape `(lags + 1, p, m)`.
-    - `bound`: 95% of the correlations of white errors with each other, and with
-        controls that are white, lie within it.
-    - `p_value`: of the hypothesis that the errors are white, by the test of Ljung and
-        Box, shape `(p,)`.
-
-    Printed, it is a table.
+    - `simulated`: a tuple with the outputs of a free run along each record, shape
+        `(N, p)`. A free run simulates the model with the controls alone, from an
+        estimated first state.
+    - `rmse`: the root-mean-square error of the free run, shape `(p,)`. The samples that
+        the first state is estimated from do not count.
+    - `fit`: the same in percent, $100\,(1 - |y - \hat y| / |y - \bar y|)$, shape
+        `(p,)`.
+    - `ahead`: the root-mean-square error of predictions over 1 to k steps, shape
+        `(k, p)`.
+    - `autocorrelation`: the correlation of the errors of the free run at lags 1, 2,
+        ..., shape `(lags, p)`.
+    - `cross_correlation`: the correlation of these errors with the controls 0, 1, ...
+        steps before, shape `(lags + 1, p, m)`.
+    - `bound`: if the errors and controls are white and independent, 95% of the
+        correlations are within `-bound` and `bound`.
+    - `p_value`: the p-value of the Ljung-Box test that the errors are white, shape
+        `(p,)`. A small value means that they are correlated in time.
 
     Source: Ljung, 1999 (chapter 16); Ljung and Box, 1978.
 
@@ -92,28 +95,30 @@ def validate(
     ahead: int = 0,
     lags: int = 20,
 ) -> Validation:
-    """The free run and the predictions of a model beside a record, which should not be
-    the one that it was fitted to.
+    """Compare a free run and predictions of a model with a record.
 
-    The state at the beginning is estimated from the first samples by least squares.
-    From there the model runs by the recorded controls alone. Predictions begin
-    anywhere in the record, from a state that is estimated in the same way.
+    Use a record that the model was not fitted to. The first state is estimated from the
+    first samples by least squares. From there, the free run simulates the model with
+    the recorded controls. With `ahead`, shorter predictions are compared too. They
+    begin throughout the record, each at a state that is estimated in the same way.
 
     **Arguments:**
 
     - `model`: the dynamics.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `x0`: a guess of the first state, shape `(n,)`, or one for each record; by default
-        what is observed, which must then be the state.
-    - `start`: samples from which a state is estimated, 10 by default; they do not
-        count in the errors.
-    - `ahead`: up to how many steps predictions are judged; 0, none, by default.
-    - `lags`: of the correlations, 20 by default.
+        the first measurement, which must then be the state.
+    - `start`: the number of samples from which a state is estimated, 10 by default.
+        They do not count in the errors.
+    - `ahead`: the largest number of steps of a prediction; 0 by default, for no
+        predictions.
+    - `lags`: the largest lag of the correlations, 20 by default.
 
     **Returns:** a [`delucax.training.sysid.Validation`][].
 
-    **Raises:** `ValueError` on arguments of the wrong kind, or a record that is too
-    short for them; an error at run time if no start is found.
+    **Raises:** `ValueError` on arguments of the wrong kind, or if a record is too short
+    for `start`, `ahead` and `lags`; an error at run time if the first state cannot be
+    estimated.
 
     !!! example
 
@@ -147,8 +152,8 @@ def validate(
     needed = start + max(ahead, lags)
     if needed >= shortest:
         raise ValueError(
-            f"{where}: record must have more than the {needed} samples of start and "
-            f"ahead or lags, got {shortest}."
+            f"{where}: record must have more than {needed} samples (start + the larger "
+            f"of ahead and lags), got {shortest}."
         )
     sampling, groups, rows = sampling_of(model, records, where)
     guesses = guessed_starts(model, x0, groups, where)
@@ -174,7 +179,7 @@ def _validated(
     observe = jax.vmap(jax.vmap(model.observe))
 
     def predicted(x0, times, rows, outputs):
-        """Outputs from a state that is estimated from the first of them."""
+        """The simulated outputs from a state estimated from the first outputs."""
         early = times[:, :start], rows[:, : start - 1], outputs[:, :start]
         begin = estimated_starts(model, sampling, x0, whole_windows(*early))
         run = lambda x, t, rows: simulated(model, sampling, x, t, rows)
@@ -193,7 +198,7 @@ def _validated(
             inside = begins[:, None] + np.arange(start + ahead)
             measured = _flat(group.outputs[:, inside])
             given = _flat(group.times[:, inside]), _flat(own[:, inside[:, :-1]])
-            # The free run is near, and knows the states that are not measured.
+            # The free run gives a good guess, also of the states that are not measured.
             y_ahead, *_ = predicted(_flat(states[:, begins]), *given, measured)
             stretches.append((measured - y_ahead)[:, start:])
     errors = [measured - y for measured, y, _ in pairs]
@@ -210,7 +215,7 @@ def _validated(
     steps = jnp.arange(lags + 1)
     auto = jax.vmap(lambda k: jnp.diag(of(k, 0)))(steps[1:])
     cross = jax.vmap(lambda k: of(k, 1))(steps)
-    # The test of Ljung and Box.
+    # The statistic of the Ljung-Box test.
     box = count * (count + 2) * jnp.sum(auto**2 / (count - steps[1:, None]), axis=0)
     summary = rmse, 100 * (1 - rmse / spread), far, auto, cross
     bound = jnp.asarray(_BOUND / np.sqrt(count), rmse.dtype)
@@ -218,18 +223,18 @@ def _validated(
 
 
 def _flat(a: Array) -> Array:
-    """Without the axis of records."""
+    """`a` with its first two axes joined: records and samples."""
     return a.reshape(-1, *a.shape[2:])
 
 
 def _unit(a: Array) -> Array:
-    """Of mean zero and variance one, or zero if it never moves."""
+    """`a` scaled to mean zero and variance one; zero if it is constant."""
     std = jnp.std(a, axis=(0, 1))
     return (a - jnp.mean(a, axis=(0, 1))) / jnp.where(std > 0, std, 1)
 
 
 def _product(a: Array, b: Array, lag: Array) -> Float[Array, "p m"]:
-    """The sum of products of what is now with what was `lag` steps before."""
+    """The sum of the products of `a` with `b` at `lag` steps before."""
     before = jnp.roll(b, lag, axis=1)
     is_known = jnp.arange(b.shape[1]) >= lag
     return jnp.einsum("rkp,rkm->pm", a, jnp.where(is_known[:, None], before, 0))

@@ -1,4 +1,4 @@
-"""Records cut into windows of one length."""
+"""Records cut into windows of equal length."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from ._record import Record
 
 
 class Windows(NamedTuple):
-    """Recorded data cut into windows, and the scale of each output."""
+    """Recorded data cut into windows, and the noise of each output with its floor."""
 
     times: Float[Array, "windows points"]
     rows: Float[Array, "windows steps row"]
@@ -35,16 +35,17 @@ def cut_into_windows(
     burn_in: int,
     noise: Float[Array, " y"] | None,
 ) -> tuple[Float[Array, "windows n"], Windows]:
-    """`(starts, windows)`, the noise of which is by default the spread of each
-    output, and may then be no less than the rounding of a whole window.
+    """The guesses of the first states, and the windows.
 
-    The last window of a record may be shorter; what fills it up does not count.
+    Without `noise`, each output is weighed by its spread at first, and its noise has a
+    floor at the rounding of a whole window. The last window of a record may be shorter;
+    it is padded with points that do not count.
     """
     parts = []
     for guess, group, own in zip(guesses, groups, rows, strict=True):
         begins, steps = begins_of(group, window), group.times.shape[1] - 1
         inside = begins[:, None] + np.arange(window + 1)
-        # The observation where a window ends and the next begins counts once.
+        # A sample at the end of one window and the start of the next counts once.
         counts = (inside <= steps) & (np.arange(window + 1) >= burn_in)
         counts[:-1, -1] = False
         counts = np.broadcast_to(counts, (len(guess), *counts.shape))
@@ -54,7 +55,7 @@ def cut_into_windows(
         parts.append([array.reshape(-1, *array.shape[2:]) for array in taken])
     joined = (jnp.concatenate(part) for part in zip(*parts, strict=True))
     starts, times, inputs, observed, counts = joined
-    # An output that never moves has a spread of rounding.
+    # The spread of a constant output is rounding: then take its size instead.
     weigh = counts[..., None]
     mean = jnp.mean(observed, axis=(0, 1), where=weigh)
     spread = jnp.sqrt(jnp.mean((observed - mean) ** 2, axis=(0, 1), where=weigh))
