@@ -308,6 +308,6 @@ def test_wrong_arguments(kind, arguments, message):
 def test_wrong_difference(kind):
     lifted = dlx.Discretized(Lifted(), dt=0.1)
     with user_error(
-        match=r"difference of the size of the state, \(1,\), got shape \(2"
+        match=r"difference must return a vector of shape \(1,\), .*, got shape \(2"
     ):
         kind(lifted, jnp.eye(1), jnp.eye(1))

@@ -1,4 +1,4 @@
-"""Estimates of the state from observations."""
+"""State estimators: Kalman filters, smoothers and moving-horizon estimation."""
 
 from ._base import AbstractEstimator as AbstractEstimator, Belief as Belief
 from ._kalman import (

@@ -13,12 +13,12 @@ from .._typing import BoolScalar, Control, Observation, PRNGKey, RealScalar
 
 
 class Belief(NamedTuple):
-    """A normal distribution of a state, `x ~ N(mean, covariance)`.
+    """A normal distribution of the state, given by its mean and covariance.
 
     **Arguments:**
 
-    - `mean`: shape `(n,)`; of a record, with a leading time axis.
-    - `covariance`: shape `(n, n)`, likewise.
+    - `mean`: shape `(n,)`; along a record it has a leading time axis.
+    - `covariance`: shape `(n, n)`; along a record it has a leading time axis.
 
     !!! example
 
@@ -28,6 +28,10 @@ class Belief(NamedTuple):
 
         dlx.estimators.Belief(jnp.zeros(2), jnp.eye(2)).mean
         ```
+
+        ```text
+        Array([0., 0.], dtype=float32)
+        ```
     """
 
     mean: Float[Array, "*T n"]
@@ -35,28 +39,30 @@ class Belief(NamedTuple):
 
     @property
     def is_finite(self) -> BoolScalar:
-        """Whether no entry is NaN or infinite."""
+        """Whether all entries are finite."""
         return jnp.all(jnp.isfinite(self.mean)) & jnp.all(jnp.isfinite(self.covariance))
 
 
 class AbstractEstimator(eqx.Module):
-    r"""Estimates the state of a plant, recursively, from controls and observations
+    r"""Estimates the state of a plant recursively, from its controls and observations.
 
-    `x_{k+1} = F(t_k, x_k, u_k, w_k)`, `y_k = h(t_k, x_k) + v_k`.
+    $$x_{k+1} = F(t_k, x_k, u_k, w_k), \qquad y_k = h(t_k, x_k) + v_k$$
 
-    At each step, in this order: `update` takes in the observation `y_k`; `predict`
-    moves on over the step from `t_k`, with the control `u_k` that was really applied.
-    Whatever the estimator carries from step to step is its state, a pytree of arrays.
-    `estimate` computes a belief from it, and `status` the status of the last step.
-    [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop. On a
-    record [`delucax.estimators.run_estimator`][] makes them, and of the Kalman filters
-    [`delucax.estimators.run_filter`][], which also computes their log-likelihood.
+    At each step, `update` is called first, with the observation $y_k$. Then `predict`
+    is called, with the control $u_k$ that was actually applied over the step from
+    $t_k$. What the estimator carries from step to step is its state, a pytree of
+    arrays. `estimate` returns the belief of a state, and `status` the status of the
+    last call.
 
-    To write an estimator, subclass this and give `init`, `update` and `predict`. The
-    state of a filter is a [`delucax.estimators.Belief`][], and needs no other methods.
-    One that carries something else also gives `estimate`: a
-    [`delucax.estimators.MHE`][] carries the observations and controls of its window and
-    the last solution. One that solves a problem gives `status`.
+    [`delucax.controllers.OutputFeedback`][] makes these calls in a closed loop, and
+    [`delucax.estimators.run_estimator`][] along a record. For Kalman filters,
+    [`delucax.estimators.run_filter`][] also computes the log-likelihood.
+
+    To write an estimator, subclass this class and write `init`, `update` and `predict`.
+    If its state is a [`delucax.estimators.Belief`][], as in a filter, that is all. If
+    its state is something else, write `estimate` too: a [`delucax.estimators.MHE`][],
+    for example, carries the observations and controls of its window and the last
+    solution. Override `status` if the estimator can fail in other ways.
 
     !!! example
 
@@ -83,6 +89,10 @@ class AbstractEstimator(eqx.Module):
         observer = Luenberger(dlx.make("pendulum").dynamics, 0.5 * jnp.eye(2))
         observer.update(0.0, jnp.array([0.1, 0.0]), observer.init()).mean
         ```
+
+        ```text
+        Array([0.05, 0.  ], dtype=float32)
+        ```
     """
 
     __repr__ = shown
@@ -92,9 +102,9 @@ class AbstractEstimator(eqx.Module):
 
     @abc.abstractmethod
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
-        """The state before the first observation.
+        """The state of the estimator before the first observation.
 
-        **Arguments:** `key`: a random key, for estimators that draw.
+        **Arguments:** `key`: a random key, for estimators that use random numbers.
 
         **Returns:** a pytree of arrays.
         """
@@ -107,9 +117,9 @@ class AbstractEstimator(eqx.Module):
 
         - `t`: time of the observation, a scalar.
         - `y`: the observation, shape `(p,)`.
-        - `state`: the estimator's state; its estimate is of the plant at `t`.
+        - `state`: the state of the estimator, which describes the plant at `t`.
 
-        **Returns:** the new state; its estimate is of the plant at `t`.
+        **Returns:** the new state, which describes the plant at `t`.
         """
 
     @abc.abstractmethod
@@ -120,15 +130,17 @@ class AbstractEstimator(eqx.Module):
 
         - `t`: time at the start of the step, a scalar.
         - `u`: the control that was applied over the step, shape `(m,)`.
-        - `state`: the estimator's state; its estimate is of the plant at `t`.
+        - `state`: the state of the estimator, which describes the plant at `t`.
 
-        **Returns:** the new state; its estimate is of the plant at the end of the step.
+        **Returns:** the new state, which describes the plant at the end of the step.
         """
 
     def estimate(self, state: PyTree) -> Belief:
-        """The mean and covariance of a state; by default the state itself, a belief.
+        """The estimated mean and covariance of the plant's state.
 
-        **Arguments:** `state`: the estimator's state.
+        By default the state of the estimator is this belief, and is returned.
+
+        **Arguments:** `state`: the state of the estimator.
 
         **Returns:** a [`delucax.estimators.Belief`][].
         """
@@ -137,10 +149,10 @@ class AbstractEstimator(eqx.Module):
     def status(self, state: PyTree) -> Result:
         """The status of the last `update` or `predict`.
 
-        **Arguments:** `state`: the estimator's state after it.
+        **Arguments:** `state`: the state of the estimator after the call.
 
-        **Returns:** one of `delucax.RESULTS`; by default `RESULTS.diverged` if the
-        estimate is not finite, and success otherwise.
+        **Returns:** one of `delucax.RESULTS`. By default it is `RESULTS.diverged` if
+        the estimate is not finite, and success otherwise.
         """
         finite = self.estimate(state).is_finite
         return choose(finite, RESULTS.successful, RESULTS.diverged)

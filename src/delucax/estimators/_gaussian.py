@@ -1,4 +1,4 @@
-"""The conditioning of normal distributions that all Kalman filters share."""
+"""The conditioning of normal distributions, which all Kalman filters share."""
 
 import abc
 import math
@@ -42,14 +42,15 @@ from ._base import AbstractEstimator, Belief
 
 
 class Joint(eqx.Module):
-    """The joint normal distribution of a state `x` and of `z`, its image plus noise,
+    r"""The joint distribution of a state `x` and of `z`, a function of it plus noise.
 
-    `x = E[x] + X e`, `z = mean + Z e + noise`, `e ~ (0, P)`.
+    $$x = E[x] + X e, \qquad z = \mathrm{mean} + Z e + \mathrm{noise}, \qquad
+    e \sim (0, P)$$
 
-    Of the linear `z = C x + noise`, `Z` is `C`, `P` the covariance of the state and `X`
-    the identity, which is left out. Of weighted points, `X` and `Z` have their
-    deviations as columns, and `P` their weights, the diagonal of a matrix. What is
-    known of a steady state need not be computed again.
+    For a linear function `C x`, `Z` is `C`, `P` is the covariance of `x`, and `X` is
+    the identity, which is left out. For weighted points, the columns of `X` and `Z` are
+    the deviations of the points, and the vector `P` holds their weights. In a steady
+    state, the `known_` fields hold results that need not be computed again.
     """
 
     mean: Array
@@ -63,7 +64,7 @@ class Joint(eqx.Module):
 
     def _form(self, A, B):
         """`A P B'`."""
-        # A vector P is the diagonal of the weights of points, and scales columns.
+        # A vector P, the weights of points, is a diagonal matrix: it scales columns.
         return (A @ self.P if self.P.ndim == 2 else A * self.P) @ B.T
 
     @property
@@ -72,22 +73,21 @@ class Joint(eqx.Module):
         """The covariance of `z`."""
         if self.known_covariance is not None:
             return self.known_covariance
-        # S = Z P Z' + noise: C Sigma C' + V of a sensor, A P A' + E W E' of a step.
+        # Z P Z' + noise is C Sigma C' + V for a sensor, and A P A' + E W E' for a step.
         return symmetric(self._form(self.Z, self.Z) + self.noise)
 
     @property
     @full_precision
     def cross(self):
         """The covariance of `x` with `z`, shape `(n, p)`."""
-        # X P Z', without the noise, which is independent of x.
+        # The noise does not appear, because it is independent of x.
         return self.P @ self.Z.T if self.X is None else self._form(self.X, self.Z)
 
     def gain(self):
-        """The `G` of `E[x | z] = E[x] + G (z - E[z])`."""
+        """The gain `G` in `E[x | z] = E[x] + G (z - E[z])`."""
         if self.known_gain is not None:
             return self.known_gain
-        # G = cov(x, z) S^-1, solved as S G' = cov(z, x): S is symmetric, and no inverse
-        # is formed.
+        # G = cov(x, z) S^-1 is solved as S G' = cov(z, x), without an inverse.
         S, _ = _regular(self.covariance)
         if S.shape[0] <= SMALL:
             return solve(S, self.cross.T).T
@@ -96,11 +96,12 @@ class Joint(eqx.Module):
 
     @full_precision
     def remainder(self, G):
-        """The covariance of `x - G z`: that of `x` given `z`, at the gain."""
+        """The covariance of `x - G z`. For the gain of `gain`, it is that of `x` given
+        `z`."""
         if self.known_remainder is not None:
             return self.known_remainder
-        # Joseph's form, a sum of congruences: it stays semidefinite in rounding, where
-        # the shorter P - G S G' may not, and it is stationary in G, so that an error of
+        # Joseph's form stays semidefinite under rounding, because it is a sum of
+        # congruences; P - G S G' may not. It is also stationary in G, so an error of
         # the gain counts to second order only.
         X = xp.eye(len(G), dtype=self.P.dtype) if self.X is None else self.X
         rest = X - G @ self.Z
@@ -114,16 +115,15 @@ def congruence(E: Float[Array, "n k"], W: Float[Array, "k k"]) -> Float[Array, "
 
 
 def noise_of_state(E: Array | None, W: Array) -> Array:
-    """The covariance of `E w`, `E` being the identity by default."""
+    """The covariance of `E w`. `E` is the identity if it is `None`."""
     return W if E is None else congruence(E, W)
 
 
 def _regular(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
-    """A covariance made definite, and which of its entries vary.
+    """A covariance made definite, and whether each of its entries varies.
 
-    What is added is of the size of rounding, in the units of each entry. An entry that
-    does not vary is given the variance 1: nothing is correlated with it, so its gain
-    is 0.
+    The variances grow by about the rounding of each. A variance of 0 becomes 1; nothing
+    is correlated with this entry, so its gain is still 0.
     """
     variances = xp.diagonal(S)
     varies = variances != 0
@@ -132,22 +132,23 @@ def _regular(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, "
 
 
 def square_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The lower triangular `L` of `P = L L'`; NaN if `P` is not semidefinite."""
+    """The lower triangular `L` in `P = L L'`; NaN if `P` is not semidefinite."""
     regular, varies = _regular(P)
     posed = is_definite(regular)
-    # An indefinite matrix is kept out of the derivative too: `where` alone would
-    # multiply a NaN cotangent by 0.
+    # An indefinite matrix must be replaced before it is factored: masking only the
+    # result would multiply NaN by 0 in the derivative.
     eye = jnp.eye(P.shape[0], dtype=P.dtype)
     L = jnp.linalg.cholesky(jnp.where(posed, regular, eye))
-    # A known entry was given the variance 1 only to be factored: its row of L is 0.
+    # An entry without variance was given the variance 1 only for the factorisation; its
+    # row of L is 0.
     return jnp.where(posed, jnp.where(varies[:, None], L, 0), jnp.nan)
 
 
 class AbstractGaussianFilter(AbstractEstimator):
-    """An estimator that takes the state to be normal, with linear updates.
+    """A Kalman filter: a normal belief, with updates that are linear in the innovation.
 
-    The filters differ in how they find the moments of what is observed and of the next
-    state.
+    Its subclasses differ in how they compute the moments of the observation and of the
+    next state.
     """
 
     dynamics: eqx.AbstractVar[AbstractDynamics]
@@ -159,17 +160,17 @@ class AbstractGaussianFilter(AbstractEstimator):
 
     @abc.abstractmethod
     def _observation(self, t: RealScalar, belief: Belief) -> Joint:
-        """The moments of what will be observed at `t`."""
+        """The joint moments of the state and of the observation at `t`."""
 
     @abc.abstractmethod
     def _transition(self, t: RealScalar, u: Control, belief: Belief) -> Joint:
-        """The moments of the next state."""
+        """The joint moments of the state and of the next state."""
 
     def __check_init__(self):
         self._model()
 
     def _model(self, default: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """As `checked_model`."""
+        """The fields checked by `checked_model`."""
         given = self.W, self.V, self.mean, self.covariance
         return checked_model(self.dynamics, *given, type(self).__name__, default)
 
@@ -181,28 +182,28 @@ class AbstractGaussianFilter(AbstractEstimator):
         return self._corrected(state, *self._innovation(t, y, state))
 
     def predict(self, t: RealScalar, u: Control, state: PyTree):
-        # A filter needs the marginal of the next state alone; the smoother its joint
-        # distribution with this one.
+        # A filter needs only the marginal distribution of the next state. The smoother
+        # also needs the joint distribution with this state.
         joint = self._prediction(t, u, state)
         return _like(Belief(joint.mean, joint.covariance), state)
 
     def log_likelihood(self, t: RealScalar, y: Observation, belief: Belief) -> Scalar:
-        """The log-density of an observation, given what is known before it.
+        """The log-density of an observation, given the belief before it.
 
-        Summed over a record, it is the log-likelihood of the model.
+        Its sum over a record is the log-likelihood of the model.
 
         **Arguments:**
 
         - `t`: time of the observation, a scalar.
         - `y`: the observation, shape `(p,)`.
-        - `belief`: what is known of the state at `t`, without `y`.
+        - `belief`: the belief of the state at `t` before the update with `y`.
 
         **Returns:** a scalar; NaN if the covariance of the observation is not definite.
         """
         return self._log_density(belief, *self._innovation(t, y, belief))
 
     def _innovation(self, t, y, belief):
-        """The moments of the expected observation, and how far `y` is from its mean."""
+        """The moments of the observation, and the innovation of `y`."""
         if y.shape != self.V.shape[:1]:
             raise wrong_observation(self, self.V.shape[0], y)
         joint = self._observation(t, belief)
@@ -211,7 +212,7 @@ class AbstractGaussianFilter(AbstractEstimator):
         return joint, self.observation_difference(y, joint.mean)
 
     def _corrected(self, belief, joint, innovation):
-        # Of normal x and z: the mean moves by G (z - E[z]), and the covariance becomes
+        # For normal x and z, the mean moves by G (z - E[z]), and the covariance becomes
         # P - G S G'.
         G = joint.gain()
         mean = belief.mean + matvec(G, innovation)
@@ -223,8 +224,8 @@ class AbstractGaussianFilter(AbstractEstimator):
         S = joint.covariance
         posed, p = is_definite(S), len(S)
         L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))
-        # `r' S^-1 r = |L^-1 r|^2` and `log det S = 2 sum log L_ii`, from one factor.
-        # A triangular solve, because the inverse of S would square the condition of L.
+        # r' S^-1 r = |L^-1 r|^2 and log det S = 2 sum log L_ii both follow from L. The
+        # triangular solve has the condition of L; the inverse of S would square it.
         lower = lx.MatrixLinearOperator(L, lx.lower_triangular_tag)
         r = innovation.astype(S.dtype)
         whitened = lx.linear_solve(lower, r, lx.Triangular(), throw=False).value
@@ -242,15 +243,15 @@ class AbstractGaussianFilter(AbstractEstimator):
         return self._transition(t, u.astype(belief.mean.dtype), belief)
 
     def _smoothed(self, t, u, belief, after):
-        """The belief once that of the next state, `after`, is known from all data."""
+        """One step of the backward pass: the belief given all data. `after` is that of
+        the next state."""
         joint = self._prediction(t, u, belief)
-        # Backwards, `P_k A' Sigma_{k+1}^-1` is the gain of `x_k` on the next state.
+        # This is G_k = P_k A' Sigma_{k+1}^-1.
         G = joint.gain()
-        # By the difference of the dynamics, so that angles go the shorter way.
+        # The difference of the dynamics takes angles the shorter way.
         shift = self.dynamics.difference(after.mean, joint.mean)
-        # P + G (P_after - Sigma) G', of which the remainder is P - G Sigma G': a sum of
-        # two semidefinite terms, where the textbook's difference may lose that in
-        # rounding.
+        # P + G (P_after - Sigma) G' as a sum of two semidefinite terms. Rounding in the
+        # difference of the textbook could make it indefinite.
         covariance = joint.remainder(G) + congruence(G, after.covariance)
         return _like(Belief(belief.mean + matvec(G, shift), covariance), belief)
 
@@ -264,8 +265,11 @@ def checked_model(
     where: str,
     default: Array | None = None,
 ) -> tuple[Array, Array, Array, Array]:
-    """`W`, `V`, and the mean and covariance of the first state, checked, and in the
-    precision of all; where they are not given, `default` or zero and the identity.
+    """`W`, `V`, and the mean and covariance of the first state, checked and in one
+    precision.
+
+    If `mean` is `None`, it is `default` or zero; if `covariance` is `None`, it is the
+    identity.
     """
     n, p = dynamics.state_size, dynamics.observation_size
     k = dynamics.disturbance_size
@@ -282,20 +286,20 @@ def checked_model(
 
 
 def check_dynamics(dynamics: Any, where: str) -> None:
-    """Raise unless these are dynamics that measure deviations of their state."""
+    """Raise unless `dynamics` is dynamics whose `difference` has the state's size."""
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
     n = dynamics.state_size
     x = jnp.zeros(n)
     shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape
     if shape != (n,):
         raise ValueError(
-            f"{where}: dynamics must have a difference of the size of the state, "
-            f"{(n,)}, got shape {shape}."
+            f"{where}: dynamics.difference must return a vector of shape {(n,)}, like "
+            f"the state, got shape {shape}."
         )
 
 
 def _like(after: Belief, before: Belief) -> Belief:
-    """`after` in the types of `before`, as a loop must carry it."""
+    """`after` in the types of `before`, because a loop must keep the types."""
     return Belief(*(a.astype(b.dtype) for a, b in zip(after, before, strict=True)))
 
 

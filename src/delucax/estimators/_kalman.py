@@ -35,42 +35,45 @@ from ._gaussian import (
 
 
 class KalmanFilter(AbstractGaussianFilter):
-    r"""The optimal estimate of the state of linear dynamics with normal noise,
+    r"""The Kalman filter: the optimal estimate for linear dynamics with normal noise.
 
-    `x_next = x_ref_next + A (x - x_ref) + B (u - u_ref) + E w`, `w ~ N(0, W)`,
-    `y = y_ref + C (x - x_ref) + v`, `v ~ N(0, V)`.
+    $$x_{k+1} = x_\mathrm{next} + A (x_k - x_\mathrm{ref}) + B (u_k - u_\mathrm{ref})
+    + E w_k, \quad w_k \sim N(0, W)$$
 
-    The measurement update is `mean + L (y - y_predicted)` with the gain
-    `L = Sigma C' (C Sigma C' + V)^-1`, and takes the covariance from `Sigma` to
-    `(I - L C) Sigma (I - L C)' + L V L'` (Joseph's form); the time update takes it from
-    `P` to `A P A' + E W E'`. In the steady state `Sigma` and `L` are constant: the
-    former is that of [`delucax.riccati.filter_dare`][].
+    $$y_k = y_\mathrm{ref} + C (x_k - x_\mathrm{ref}) + v_k, \quad v_k \sim N(0, V)$$
+
+    The measurement update adds $L (y - \hat y)$ to the mean, with the gain
+    $L = \Sigma C^T (C \Sigma C^T + V)^{-1}$. It changes the covariance from $\Sigma$ to
+    $P = (I - L C) \Sigma (I - L C)^T + L V L^T$ (Joseph's form). The time update
+    changes it from $P$ to $A P A^T + E W E^T$. In the steady state $\Sigma$ and $L$ are
+    constant; [`delucax.riccati.filter_dare`][] computes this $\Sigma$.
 
     **Arguments:**
 
     - `dynamics`: linear dynamics, time-invariant or time-varying.
-    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
-        symmetric, semidefinite. It counts in the space of `w`, and `E W E'` in that of
-        the state: where the dynamics have no `E`, the two are the same.
+    - `W`: covariance of the disturbance `w`, shape `(k, k)`, symmetric, semidefinite.
+        If the dynamics have no `E`, it is the covariance added to that of the state.
     - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
-    - `mean`: of the first state, shape `(n,)`; `x_ref` by default.
-    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
-        semidefinite; the identity by default, and that of the steady state with
-        `steady_state`.
-    - `steady_state`: use the gain of the steady state at all times; false by default.
-    - `y_ref`: what is observed at the operating point, shape `(p,)`; `C x_ref` by
-        default. Needed where a nonlinear sensor was linearised, whose reading there is
-        not `C x_ref`.
-    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
-        among the observations; subtraction by default.
+    - `mean`: mean of the first state, shape `(n,)`; `x_ref` by default.
+    - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
+        symmetric, semidefinite; the identity by default. With `steady_state` it is that
+        of the steady state, and must not be given.
+    - `steady_state`: whether to use the gain of the steady state at all times; false by
+        default.
+    - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by
+        default. Give it if a nonlinear sensor was linearised, because its reading there
+        is not `C x_ref`.
+    - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
+        angles among the observations; subtraction by default.
 
-    **Attributes:** those above, and in the steady state `L`, the gain, trainable, shape
-    `(n, p)`; `updated_covariance`, that of the state once it is observed, shape
-    `(n, n)`.
+    **Attributes:** the arguments. With `steady_state` also `L`, the gain, shape
+    `(n, p)`, trainable; and `updated_covariance`, the covariance after the measurement
+    update, shape `(n, n)`. They are `None` otherwise.
 
-    **Raises:** `ValueError` if `dynamics` is not linear, if a covariance is not one or
-    sizes do not fit, or if a steady state is asked for with time-varying dynamics or a
-    `covariance`; an error at run time if there is no steady state.
+    **Raises:** `ValueError` if `dynamics` is not linear, a covariance is not symmetric
+    and semidefinite, or sizes do not fit; or if `steady_state` is combined with
+    time-varying dynamics or with `covariance`. An error at run time if there is no
+    steady state.
 
     Source: Kalman, 1960; Bucy and Joseph, 1968.
 
@@ -86,6 +89,11 @@ class KalmanFilter(AbstractGaussianFilter):
         kalman = dlx.estimators.KalmanFilter(dynamics, 0.1 * jnp.eye(2), jnp.eye(1))
         belief = eqx.filter_jit(kalman.update)(0.0, jnp.array([0.5]), kalman.init())
         belief = eqx.filter_jit(kalman.predict)(0.0, jnp.zeros(1), belief)
+        belief.mean
+        ```
+
+        ```text
+        Array([0.25, 0.  ], dtype=float32)
         ```
     """
 
@@ -128,8 +136,8 @@ class KalmanFilter(AbstractGaussianFilter):
         check_time_invariant(dynamics, "dynamics with steady_state", where)
         if covariance is not None:
             raise ValueError(
-                f"{where}: covariance must not be given with steady_state, of which it "
-                "follows."
+                f"{where}: covariance must not be given with steady_state, because the "
+                "steady state determines it."
             )
         self.covariance, self.L, self.updated_covariance = _steady_state(
             dynamics.A, dynamics.C, dynamics.E, self.W, self.V, self.mean
@@ -151,7 +159,7 @@ class KalmanFilter(AbstractGaussianFilter):
         return jnp.eye(self.dynamics.state_size, dtype=self.dynamics.A.dtype)
 
     def _noise(self, here: LinearDynamics) -> Array:
-        """The covariance that a step adds to that of the state."""
+        """The covariance that a step adds to the covariance of the state."""
         return noise_of_state(here.E, self.W)
 
     def _observation(self, t, belief):
@@ -159,8 +167,7 @@ class KalmanFilter(AbstractGaussianFilter):
         if self.y_ref is None:
             mean = dynamics.observe(t, belief.mean)
         else:
-            # y_ref + C (x - x_ref): `observe` is linear, so that it is C on a
-            # deviation, too.
+            # y_ref + C (x - x_ref). `observe` is linear, so on a deviation it is C.
             deviation = belief.mean - dynamics.at(t).x_ref
             mean = self.y_ref + dynamics.observe(t, deviation)
         known = dict(known_gain=self.L, known_remainder=self.updated_covariance)
@@ -168,9 +175,9 @@ class KalmanFilter(AbstractGaussianFilter):
 
     def _transition(self, t, u, belief):
         here = self.dynamics.at(t)
-        # Without w, whose mean is zero; its covariance is the noise.
+        # The mean of w is zero; its covariance is the noise.
         mean, _ = here.advance(t, belief.mean, u, None)
-        # In the steady state A P A' + E W E' is Sigma again.
+        # In the steady state, A P A' + E W E' is Sigma again.
         known = None if self.L is None else self.covariance
         P, noise = belief.covariance, self._noise(here)
         return Joint(mean, None, here.A, P, noise, known_covariance=known)
@@ -185,11 +192,10 @@ def _check_linear(dynamics: Any) -> None:
 def _steady_state(A, C, E, W, V, mean) -> tuple[Array, Array, Array]:
     """The covariance before an observation, the gain, and the covariance after it."""
     C = xp.eye(len(A), dtype=A.dtype) if C is None else C
-    # The dual of the regulator's equation. Its X is the covariance before the
-    # observation, P_{k|k-1} in the textbooks, and L is the gain of the update on it,
-    # not the predictor's A L.
+    # X is the covariance before the observation, P_{k|k-1} in textbooks. L is the gain
+    # of the measurement update, not A L, the gain of the predictor.
     solution = filter_dare(A, C, noise_of_state(E, W), V, throw=False)
-    what = "KalmanFilter: there is no steady state. Of A', C' in the places of A, B"
+    what = "KalmanFilter: there is no steady state. With A', C' in the places of A, B"
     solution = raise_on_failure(solution, what, facts=solution._facts)
     covariance = symmetric(solution.X).astype(mean.dtype)
     joint = Joint(C @ mean, None, C, covariance, V)
@@ -198,7 +204,7 @@ def _steady_state(A, C, E, W, V, mean) -> tuple[Array, Array, Array]:
 
 
 class _AbstractNonlinearFilter(AbstractGaussianFilter):
-    """A filter of any dynamics, whose disturbance counts to first order."""
+    """A filter for any dynamics. The disturbance counts to first order."""
 
     def __post_init__(self):
         check_dynamics(self.dynamics, type(self).__name__)
@@ -208,45 +214,45 @@ class _AbstractNonlinearFilter(AbstractGaussianFilter):
         check_dynamics(self.dynamics, type(self).__name__)
 
     def _advanced(self, t, x, u, w=None):
-        """The next state; NaN if the solver fails, which the loop around it reports."""
+        """The next state; NaN if the solver fails, which the caller's loop reports."""
         x_next, result = self.dynamics.advance(t, x, u, w)
         if result is RESULTS.successful:
             return x_next
         return jnp.where(result == RESULTS.successful, x_next, jnp.nan)
 
     def _noise(self, t, u, x):
-        """`E W E'`, what the disturbance adds to the covariance of the next state."""
-        # E at w = 0, where the disturbance has its mean.
+        """`E W E'`, the covariance that the disturbance adds to the next state."""
+        # E is the derivative at w = 0, the mean of the disturbance.
         w = jnp.zeros(len(self.W), x.dtype)
         return congruence(jacobian(lambda w: self._advanced(t, x, u, w))(w), self.W)
 
 
 class ExtendedKalmanFilter(_AbstractNonlinearFilter):
-    r"""The Kalman filter of the dynamics linearised about the estimate, at each step,
-    by automatic differentiation:
+    r"""The extended Kalman filter: the dynamics are linearised about the estimate.
 
-    `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`,
+    $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
+    y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
 
-    with `A = dF/dx`, `E = dF/dw` and `C = dh/dx` in the places of the matrices of
-    [`delucax.estimators.KalmanFilter`][]. On linear dynamics it is that filter.
+    It is the [`delucax.estimators.KalmanFilter`][] with $A = \partial F / \partial x$,
+    $E = \partial F / \partial w$ and $C = \partial h / \partial x$, computed at each
+    step by automatic differentiation. For linear dynamics both filters are the same.
 
     **Arguments:**
 
-    - `dynamics`: any dynamics; their `observe` is the sensor h, and their `difference`
-        counts in a smoother.
-    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
-        symmetric, semidefinite. Of a system with a diffusion that of the Brownian
-        increments.
+    - `dynamics`: any dynamics. Their `observe` is the sensor $h$. Smoothers also use
+        their `difference`.
+    - `W`: covariance of the disturbance `w` of the dynamics, shape `(k, k)`, symmetric,
+        semidefinite. For a system with a diffusion, `w` are the Brownian increments.
     - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
-    - `mean`: of the first state, shape `(n,)`; zero by default.
-    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
-        semidefinite; the identity by default.
-    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
-        among the observations: `dynamics.difference` where the state is observed, for
-        example. Subtraction by default.
+    - `mean`: mean of the first state, shape `(n,)`; zero by default.
+    - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
+        symmetric, semidefinite; the identity by default.
+    - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
+        angles among the observations; subtraction by default. If the state is observed,
+        use `dynamics.difference`.
 
-    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one, or
-    sizes do not fit.
+    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
+    symmetric and semidefinite, or sizes do not fit.
 
     Source: Schmidt, 1966; Jazwinski, 1970.
 
@@ -267,7 +273,11 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
         def step(t, y, u, belief):
             return ekf.predict(t, u, ekf.update(t, y, belief))
 
-        belief = step(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), ekf.init())
+        step(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), ekf.init()).mean
+        ```
+
+        ```text
+        Array([0.1], dtype=float32)
         ```
     """
 
@@ -281,14 +291,13 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
-        # About the prediction, the best estimate before y; an iterated filter would go
-        # on from the update (Jazwinski, 1970).
+        # Linearised about the prediction, the best estimate before y. An iterated
+        # filter would linearise again about the updated mean (Jazwinski, 1970).
         C = jacobian(observe)(belief.mean)
         return Joint(observe(belief.mean), None, C, belief.covariance, self.V)
 
     def _transition(self, t, u, belief):
-        # F(x) is about F(mean) + A (x - mean): A for the covariance only, F itself for
-        # the mean.
+        # A is used for the covariance only; the mean is moved by F itself.
         A = jacobian(lambda x: self._advanced(t, x, u))(belief.mean)
         mean = self._advanced(t, belief.mean, u)
         noise = self._noise(t, u, belief.mean)
@@ -296,36 +305,39 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
 
 class UnscentedKalmanFilter(_AbstractNonlinearFilter):
-    r"""The Kalman filter whose moments are those of `2 n + 1` points, each passed
-    through the dynamics and the sensor:
+    r"""The unscented Kalman filter: moments come from points moved by the dynamics.
 
-    `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`.
+    $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
+    y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
 
-    The points are the mean, and the mean plus and minus the columns of
-    `sqrt(c) chol(covariance)`, with `c = alpha^2 (n + kappa)`; the outer ones weigh
-    `1 / (2 c)`, the middle one `1 - n / c` in the mean and `2 - n / c - alpha^2 + beta`
-    in the covariance. They are computed anew for each update. The disturbance counts to
-    first order, by `E W E'` with `E = dF/dw` at the mean, which is exact where it is
-    added to the state. On linear dynamics this is the
+    The $2 n + 1$ points are the mean, and the mean plus and minus each column of
+    $\sqrt{c}\, \mathrm{chol}(\mathrm{covariance})$, with $c = \alpha^2 (n + \kappa)$.
+    The outer points have the weight $1 / (2 c)$. The middle point has the weight
+    $1 - n / c$ in the mean and $2 - n / c - \alpha^2 + \beta$ in the covariance. The
+    points are computed anew for the measurement update and for the time update.
+
+    The disturbance counts to first order: it adds $E W E^T$, with
+    $E = \partial F / \partial w$ at the mean, to the covariance. This is exact if the
+    disturbance is added to the state. For linear dynamics the filter is the same as the
     [`delucax.estimators.KalmanFilter`][].
 
-    With the default weights no weight is negative, so that covariances stay
-    semidefinite. A small `alpha`, such as the common 1e-3, has weights of `1 / alpha^2`
-    that cancel, at the cost of as many digits. A state of zero variance is taken to be
-    known; there is no derivative with respect to that variance.
+    With the default `alpha`, `beta` and `kappa` no weight is negative, so covariances
+    stay semidefinite. A small `alpha`, such as the common 1e-3, gives weights of size
+    $1 / \alpha^2$ that cancel, and digits are lost. A state with zero variance is taken
+    to be known, and there is no derivative with respect to this variance.
 
     **Arguments:**
 
     - `dynamics`, `W`, `V`, `mean`, `covariance`, `observation_difference`: as for
         [`delucax.estimators.ExtendedKalmanFilter`][]. The `difference` of the dynamics
         measures the spread of the moved points.
-    - `alpha`: spread of the points, a positive number; 1 by default.
-    - `beta`: prior knowledge of the distribution, a number that is added to the weight
-        of the middle point in covariances; 2 by default, optimal for normal states.
-    - `kappa`: more spread, a number above `-n`; 0 by default.
+    - `alpha`: $\alpha$, the spread of the points, a positive number; 1 by default.
+    - `beta`: $\beta$, a number added to the weight of the middle point in covariances;
+        2 by default, which is optimal for normal states.
+    - `kappa`: $\kappa$, additional spread, a number above `-n`; 0 by default.
 
-    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one, a
-    number is out of its range, or sizes do not fit.
+    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
+    symmetric and semidefinite, a number is out of its range, or sizes do not fit.
 
     Source: Julier and Uhlmann, 1997; Wan and van der Merwe, 2000.
 
@@ -340,6 +352,10 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
         noise, tilted = 1e-3 * jnp.eye(2), jnp.array([0.1, 0.0])
         ukf = dlx.estimators.UnscentedKalmanFilter(dynamics, noise, noise, kappa=1.0)
         eqx.filter_jit(ukf.update)(0.0, tilted, ukf.init()).mean
+        ```
+
+        ```text
+        Array([0.0999, 0.    ], dtype=float32)
         ```
     """
 
@@ -362,7 +378,7 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
         n, kappa = self.dynamics.state_size, self.kappa
         if is_concrete(kappa) and not np.asarray(kappa) > -n:
             raise ValueError(
-                f"{where}: kappa must be above -n = {-n}, n being the size of the "
+                f"{where}: kappa must be above -n = {-n}, where n is the size of the "
                 f"state, got {kappa}."
             )
 
@@ -378,28 +394,29 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
     @full_precision
     def _sampled(self, function, difference, belief, noise):
         mean, (n,) = belief.mean, belief.mean.shape
-        # n + lambda in the textbooks, with lambda = alpha^2 (n + kappa) - n.
+        # In textbooks this is n + lambda, with lambda = alpha^2 (n + kappa) - n.
         spread = self.alpha**2 * (n + self.kappa)
-        # Any root serves; the triangular one needs no eigenvalues, whose derivative is
-        # infinite where two of them meet.
+        # Any square root would do. The triangular root needs no eigenvalues, whose
+        # derivative is infinite if two of them are equal.
         columns = jnp.sqrt(spread) * square_root(belief.covariance)
         dx = jnp.concatenate([jnp.zeros((1, n)), columns.T, -columns.T])
         dx = dx.astype(mean.dtype)
         z = jax.vmap(function)(mean + dx)
-        # About the middle point, so that angles are averaged across the wrap.
+        # Deviations from the middle point, so that angles are averaged across the wrap.
         middle = z[0]
         if difference is None:
             dz = z - middle
         else:
             dz = jax.vmap(difference, in_axes=(0, None))(z, middle)
-        # 1 / (2 (n + lambda)): then X W X' = P exactly, as each column of the root
-        # counts twice, and the rules of a linear map hold for points, too.
+        # 1 / (2 (n + lambda)). With it X W X' = P exactly, because each column of the
+        # root counts twice.
         outer = jnp.full(2 * n, 1 / (2 * spread), mean.dtype)
-        # The weights of the mean add up to 1, and the middle deviation is 0: its weight
-        # of `1 - n / c`, which is huge where alpha is small, is never used.
+        # The deviation of the middle point is 0, so its weight 1 - n / c, which is huge
+        # for a small alpha, is not needed for the mean.
         shift = outer @ dz[1:]
-        # lambda / (n + lambda) + 1 - alpha^2 + beta (Wan and van der Merwe, 2000).
+        # This is lambda / (n + lambda) + 1 - alpha^2 + beta (Wan and van der Merwe,
+        # 2000).
         inner = 2 - n / spread - self.alpha**2 + self.beta
         weights = jnp.concatenate([jnp.reshape(inner, 1).astype(mean.dtype), outer])
-        # About the mean, from which the middle point is `-shift` away: it counts here.
+        # Deviations from the mean: the middle point is -shift away, so it counts here.
         return Joint(middle + shift, dx.T, (dz - shift).T, weights, noise)

@@ -52,6 +52,10 @@ class Bootstrap(NamedTuple):
         std = draws.std(axis=0)
         dlx.training.sysid.Bootstrap(("mass",), draws, std, *ends, 0).low
         ```
+
+        ```text
+        array([0.86271225])
+        ```
     """
 
     names: tuple[str, ...]

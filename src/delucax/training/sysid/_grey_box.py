@@ -63,6 +63,10 @@ class GreyBox(NamedTuple):
         physics = dlx.Discretized(field, dt=0.05)
         dlx.training.sysid.GreyBox(physics, None, {0.0: 0.1}, 0.0).spread
         ```
+
+        ```text
+        0.0
+        ```
     """
 
     model: Discretized

@@ -71,10 +71,10 @@ class Identified(eqx.Module):
 
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
-        states = dlx.open_loop(true, [0.0, 0.0], controls)
-        fit = dlx.training.sysid.linear(
-            dlx.training.sysid.Record(states, controls, dt=1.0)
-        )
+        w = 0.01 * jax.random.normal(jax.random.key(1), (50, 2))
+        states = dlx.open_loop(true, [0.0, 0.0], controls, w)
+        record = dlx.training.sysid.Record(states, controls, dt=1.0)
+        fit = dlx.training.sysid.linear(record)
         print(fit.report())
         ```
     """

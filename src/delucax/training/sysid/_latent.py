@@ -63,6 +63,10 @@ class LatentDynamics(AbstractDynamics):
         dynamics = dlx.training.sysid.LatentDynamics(A, B, C, width=8, key=key)
         dynamics.observe(0.0, dynamics(0.0, jnp.ones(2), jnp.zeros(1)))
         ```
+
+        ```text
+        Array([1.2], dtype=float32)
+        ```
     """
 
     A: Float[Array, "n n"] = weight()
@@ -165,6 +169,10 @@ class Encoder(eqx.Module):
         Encoder = dlx.training.sysid.Encoder
         encoder = Encoder(jnp.ones((2, 10)), 5, 1, key=jax.random.key(0))
         encoder(jnp.ones((5, 1)), jnp.zeros((5, 1)))
+        ```
+
+        ```text
+        Array([5., 5.], dtype=float32)
         ```
     """
 

@@ -60,7 +60,14 @@ def linear(
         states = dlx.open_loop(true, [0.0, 0.0], controls)
         record = dlx.training.sysid.Record(states, controls, dt=1.0)
         fit = dlx.training.sysid.linear(record)
-        fit.model.A, fit.model.B, fit.std
+        fit.model.A.round(3), fit.model.B.round(3)
+        ```
+
+        ```text
+        (Array([[0.9, 0.1],
+               [0. , 0.8]], dtype=float32),
+         Array([[0.],
+               [1.]], dtype=float32))
         ```
     """
     where = "sysid.linear"
@@ -129,7 +136,11 @@ def arx(
         back = dict(outputs_back=2, controls_back=2)
         record = dlx.training.sysid.Record(angles, controls, dt=1.0)
         fit = dlx.training.sysid.arx(record, **back, throw=False)
-        fit.estimate
+        fit.estimate.round(3)
+        ```
+
+        ```text
+        Array([[ 1.7 , -0.72,  0.  ,  0.1 ]], dtype=float32)
         ```
     """
     where = "sysid.arx"

@@ -64,6 +64,10 @@ class NeuralDynamics(AbstractDynamics):
         dynamics = Net(2, 1, width=8, depth=1, dt=0.05, key=jax.random.key(0))
         dynamics(0.0, jnp.ones(2), jnp.zeros(1))
         ```
+
+        ```text
+        Array([1.0643, 0.9569], dtype=float32)
+        ```
     """
 
     network: eqx.nn.MLP = weight()
@@ -149,6 +153,10 @@ def windows(
         record = dlx.training.sysid.Record(states, controls, dt=0.05)
         data = dlx.training.sysid.windows(record, 10)
         data[1].shape
+        ```
+
+        ```text
+        (91, 11, 2)
         ```
     """
     where = "sysid.windows"

@@ -57,6 +57,10 @@ class Record(eqx.Module):
         estimation, validation = record.split(0.75)
         len(estimation), len(record[20:])
         ```
+
+        ```text
+        (150, 180)
+        ```
     """
 
     outputs: Float[Array, "N p"]

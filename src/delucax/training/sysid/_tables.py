@@ -55,6 +55,11 @@ def read_csv(
         Path("run.csv").write_text("\\n".join(["t,level,pump", *rows]))
         names = dict(outputs="level", controls="pump", times="t")
         record = dlx.training.sysid.read_csv("run.csv", **names)
+        len(record)
+        ```
+
+        ```text
+        9
         ```
     """
     where = f"sysid.read_csv: {Path(path).name}"
@@ -114,6 +119,13 @@ def from_frame(
         frame = pd.DataFrame({"level": [0.0, 1.0, 3.0], "pump": [1.0, 2.0, 0.0]})
         columns = dict(outputs="level", controls="pump")
         record = dlx.training.sysid.from_frame(frame, dt=0.1, **columns)
+        record.outputs
+        ```
+
+        ```text
+        Array([[0.],
+               [1.],
+               [3.]], dtype=float32)
         ```
     """
     where = "sysid.from_frame: frame"
