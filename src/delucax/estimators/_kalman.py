@@ -195,7 +195,7 @@ def _steady_state(A, C, E, W, V, mean) -> tuple[Array, Array, Array]:
     # X is the covariance before the observation, P_{k|k-1} in textbooks. L is the gain
     # of the measurement update, not A L, the gain of the predictor.
     solution = filter_dare(A, C, noise_of_state(E, W), V, throw=False)
-    what = "KalmanFilter: there is no steady state. With A', C' in the places of A, B"
+    what = "KalmanFilter: there is no steady state. For A' and C' in place of A and B"
     solution = raise_on_failure(solution, what, facts=solution._facts)
     covariance = symmetric(solution.X).astype(mean.dtype)
     joint = Joint(C @ mean, None, C, covariance, V)

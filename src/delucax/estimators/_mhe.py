@@ -22,70 +22,79 @@ from ._window import first_window, Model, moved, solved, Window
 
 
 class MHE(AbstractEstimator):
-    r"""The states of a window of observations, and parameters, by least squares between
-    bounds: moving-horizon estimation. Of `x_{k+1} = F(t_k, x_k, u_k, w_k)`,
-    `w ~ N(0, W)`, and `y_k = h(t_k, x_k) + v_k`, `v ~ N(0, V)`, each `update` minimises
+    r"""Moving-horizon estimation: constrained least squares over a window of the past.
+
+    $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
+    y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
+
+    Each `update` minimises
 
     $$|x_0 - \bar x|^2_{P^{-1}} + \sum_{k < N-1} |w_k|^2_{W^{-1}}
     + \sum_{k < N} 2 \rho(|y_k - h(t_k, x_k)|_{V^{-1}})$$
 
-    over the `N` stages of the window, the last of which is now. The prior
-    $(\bar x, P)$ of the window's first state is that of the extended Kalman filter
-    without the observations of the window, linearised where the window has its states:
-    no observation counts twice (the filtering update). On linear dynamics without
-    active bounds the estimate is that of the [`delucax.estimators.KalmanFilter`][], for
-    any window.
+    over the states of the $N$ stages of the window, the last of which is now. Bounds on
+    states and disturbances are respected, and parameters of the dynamics can be
+    estimated together with the states. The prior $(\bar x, P)$ of the first state comes
+    from an extended Kalman filter, linearised about the states of the window. It leaves
+    out the observations of the window, so that none counts twice (the filtering
+    update). For linear dynamics without active bounds, the estimate is that of the
+    [`delucax.estimators.KalmanFilter`][], whatever the window.
 
-    An update makes one Gauss-Newton step from the solution before, a step later (the
-    real-time iteration), or `iterations` steps whose length is searched. A step is a
-    pass of the Kalman filter over the window and one back. All covariances may be
-    singular: a known state, a constant parameter, a perfect sensor. Active bounds are
-    perfect observations, which more passes find.
+    By default, an update makes one full Gauss-Newton step from the previous solution,
+    shifted by a step (the real-time iteration). If `iterations` is above 1, it makes
+    that many steps with a line search. A step is a pass of the Kalman filter over the
+    window and a pass back. All covariances may be singular, for example for a known
+    state, a constant parameter or a perfect sensor. Active bounds are treated as
+    perfect observations, and finding them takes more passes. The covariance of the
+    estimate is that of the forward pass without bounds.
 
-    The covariance of the estimate is that of the pass forwards, without the bounds.
-
-    It is differentiable with respect to the weights, the prior, the bounds and the
-    dynamics, in both modes: the steps are differentiated as they are made, with the
-    same bounds active. The derivative jumps where a bound becomes active, or a residual
-    crosses the threshold of `robust`. Under `jax.vmap` a batch makes as many passes as
-    the member that needs most.
+    The estimate is differentiable with respect to the weights, the prior, the bounds
+    and the dynamics, in forward and reverse mode. The derivative is that of the steps,
+    with the active bounds fixed. It jumps when a bound becomes active, or when a
+    residual crosses the threshold of `robust`. Under `jax.vmap`, a batch makes as many
+    passes as the member that needs the most.
 
     **Arguments:**
 
-    - `dynamics`: any dynamics; their `observe` is the sensor h.
-    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
-        symmetric, semidefinite.
-    - `V`: covariance of the sensor noise, shape `(p, p)`, likewise.
-    - `window`: how many observations it holds, at least 1.
-    - `mean`: of the first state, shape `(n,)`; zero by default.
-    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
-        semidefinite; the identity by default.
-    - `bounds`: of the states, a pair `(low, high)` of numbers or vectors of shape
-        `(n,)`, which may be infinite; none by default.
-    - `disturbance_bounds`: likewise of `w`, of shape `(k,)`.
-    - `parameters`: a dictionary from paths in the dynamics to
-        [`delucax.estimators.RandomWalk`][]: `{"system.length": RandomWalk(0.1)}`. None
-        by default.
-    - `robust`: the residual, in standard deviations, from which on $\rho$ is linear
-        (Huber's penalty), for outliers; 1.5 to 3 are usual. By default
-        $\rho(r) = r^2 / 2$. Needs a definite `V`.
-    - `iterations`: how many steps an update makes, 1 by default.
-    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
-        among the observations; subtraction by default.
+    - `dynamics`: any dynamics. Their `observe` is the sensor $h$.
+    - `W`: covariance of the disturbance `w` of the dynamics, shape `(k, k)`, symmetric,
+        semidefinite.
+    - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
+    - `window`: $N$, the number of observations in the window, at least 1.
+    - `mean`: mean of the first state, shape `(n,)`; zero by default.
+    - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
+        symmetric, semidefinite; the identity by default.
+    - `bounds`: bounds of the states, a pair `(low, high)` of numbers or vectors of
+        shape `(n,)`, which may be infinite; none by default.
+    - `disturbance_bounds`: bounds of `w`, a pair of numbers or vectors of shape `(k,)`;
+        none by default.
+    - `parameters`: the parameters to estimate, a dictionary from paths in the dynamics
+        to a [`delucax.estimators.RandomWalk`][], such as
+        `{"system.length": RandomWalk(0.1)}`; none by default.
+    - `robust`: a threshold against outliers, in standard deviations. For larger
+        residuals, $\rho$ is linear (Huber's penalty). 1.5 to 3 are usual; `V` must then
+        be definite. By default $\rho(r) = r^2 / 2$.
+    - `iterations`: the number of steps of an update, 1 by default.
+    - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
+        angles among the observations; subtraction by default.
 
-    A reading that is missing is a step without a call of `update`. One that is not
-    finite is left out and counts as a failure. `status` is `diverged` at an observation
-    or a solution that is not finite (the window then keeps the estimate before),
-    `no_feasible_point` if the bounds cannot all hold, `inaccurate` if rounding keeps
-    them from it, and `not_converged` if the active bounds were not found or, with more
-    than one step, if more of them would change the estimate.
+    If a reading is missing, do not call `update` at this step. An observation that is
+    not finite is left out, and counts as a failure. `status` is
 
-    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one,
-    sizes do not fit, bounds are not numbers with `low <= high`, a parameter has no
-    finite number in the dynamics to start from, or a number is out of its range.
+    - `diverged` if an observation or the solution is not finite. If the solution is
+        not, the window keeps the estimate before the update.
+    - `no_feasible_point` if the bounds cannot all hold.
+    - `inaccurate` if the bounds are violated slightly because of rounding.
+    - `not_converged` if the active bounds were not found or, with several iterations,
+        if more iterations would change the estimate.
+
+    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
+    symmetric and semidefinite, sizes do not fit, bounds are not numbers with
+    `low <= high`, a parameter is not finite in the dynamics, or a number is out of its
+    range.
 
     Source: Rao, Rawlings and Mayne, 2003; Haseltine and Rawlings, 2005; Kühl et al.,
-    2011 (the prior); Diehl et al., 2005 (one step each); Huber, 1964.
+    2011 (the prior); Diehl et al., 2005 (the real-time iteration); Huber, 1964.
 
     !!! example
 
@@ -155,7 +164,7 @@ class MHE(AbstractEstimator):
                 )
 
     def _model(self) -> tuple[Model, Belief]:
-        """The model with the parameters as states, and what is known of the first."""
+        """The model with the parameters as states, and the prior of the first state."""
         dynamics, W, P, mean = self.dynamics, self.W, self.covariance, self.mean
         states, noise, dtype = self.bounds, self.disturbance_bounds, mean.dtype
         if walks := tuple(self.parameters.values()):
@@ -214,9 +223,9 @@ class MHE(AbstractEstimator):
         return moved(model, t, u.astype(state.u.dtype), state)
 
     def estimate(self, state: Window) -> Belief:
-        """The mean and covariance of the state now.
+        """The current mean and covariance of the plant's state.
 
-        **Arguments:** `state`: the estimator's state.
+        **Arguments:** `state`: the state of the estimator.
 
         **Returns:** a [`delucax.estimators.Belief`][], without the parameters.
         """
@@ -224,12 +233,12 @@ class MHE(AbstractEstimator):
         return Belief(state.belief.mean[:n], state.belief.covariance[:n, :n])
 
     def estimated_parameters(self, state: Window) -> dict[str, Belief]:
-        """The mean and covariance of each parameter now.
+        """The current mean and covariance of each parameter.
 
-        **Arguments:** `state`: the estimator's state.
+        **Arguments:** `state`: the state of the estimator.
 
         **Returns:** a dictionary from paths to a [`delucax.estimators.Belief`][] of the
-        parameter's entries, one after the other.
+        flattened parameter.
         """
         wide = WithParameters(self.dynamics, tuple(self.parameters))
         at, out = self.dynamics.state_size, {}
@@ -241,14 +250,13 @@ class MHE(AbstractEstimator):
         return out
 
     def trajectory(self, state: Window) -> tuple[Array, Array]:
-        """The states of the window, given all of its observations, and the disturbances
-        of its steps.
+        """The states and disturbances of the window, given all of its observations.
 
-        **Arguments:** `state`: the estimator's state.
+        **Arguments:** `state`: the state of the estimator.
 
         **Returns:** `(states, disturbances)`, shapes `(N, n)` and `(N - 1, k)`, without
-        the parameters. The last ones are the newest; until the window is full, the
-        first ones are NaN.
+        the parameters. The last rows are the newest. Until the window is full, the
+        first rows are NaN.
         """
         model, _ = self._model()
         there = state.is_there[:, None]
@@ -261,13 +269,13 @@ class MHE(AbstractEstimator):
 
 
 def _block(matrix: Array, variances: Array) -> Array:
-    """A covariance with independent entries after its own."""
+    """A covariance extended by independent entries with these variances."""
     rest = jnp.zeros((len(matrix), len(variances)), matrix.dtype)
     return jnp.block([[matrix, rest], [rest.T, jnp.diag(variances)]])
 
 
 def _beside(bounds: Any, like: Array, more: Any) -> tuple[Array, Array]:
-    """Bounds of the entries of `like`, then others."""
+    """The bounds of the entries of `like`, extended by `more`."""
     own = (-jnp.inf, jnp.inf) if bounds is None else bounds
     pairs = zip(own, more, strict=True)
     wide = (jnp.concatenate([jnp.broadcast_to(a, like.shape), b]) for a, b in pairs)

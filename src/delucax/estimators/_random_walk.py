@@ -1,4 +1,4 @@
-"""Parameters that are estimated with the state, as random walks."""
+"""Parameters that are estimated together with the state, as random walks."""
 
 from typing import Any
 
@@ -15,20 +15,22 @@ from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
 class RandomWalk(eqx.Module):
-    r"""What is known of a parameter that [`delucax.estimators.MHE`][] estimates:
+    r"""A parameter that [`delucax.estimators.MHE`][] estimates, as a random walk.
 
-    `theta_0 ~ N(start, variance)`, `theta_{k+1} = theta_k + N(0, step)`, between
-    bounds. It starts from the value that it has in the dynamics.
+    $$\theta_0 \sim N(\theta_\mathrm{start}, \mathrm{variance}), \qquad
+    \theta_{k+1} = \theta_k + e_k, \quad e_k \sim N(0, \mathrm{step})$$
+
+    $\theta_\mathrm{start}$ is the value of the parameter in the dynamics.
 
     **Arguments:**
 
-    - `variance`: of the first value, a number or one for each entry of the parameter.
-        Zero is a value that is known at first.
-    - `step`: the variance of the change in a step, likewise; zero, a constant, by
-        default.
+    - `variance`: the variance of the first value, a number or one for each entry of the
+        parameter. With 0, the first value is known.
+    - `step`: the variance of the change in a step, a number or one for each entry. 0 by
+        default, for a constant.
     - `bounds`: a pair `(low, high)` of numbers or vectors; none by default.
 
-    **Raises:** `ValueError` if a variance is negative or not finite, or bounds are not
+    **Raises:** `ValueError` if a variance is negative or not finite, or `bounds` is not
     a pair with `low <= high`.
 
     Source: Rawlings, Mayne and Diehl, 2017, chapter 4.
@@ -48,7 +50,11 @@ class RandomWalk(eqx.Module):
             10,
             parameters={"system.length": length},
         )
-        mhe.estimated_parameters(mhe.init())
+        mhe.estimated_parameters(mhe.init())["system.length"].mean
+        ```
+
+        ```text
+        Array([1.], dtype=float32)
         ```
     """
 
@@ -66,7 +72,7 @@ class RandomWalk(eqx.Module):
 
 
 class WithParameters(AbstractWrapper):
-    """Dynamics whose last states are parameters at paths in them."""
+    """Dynamics with some of their parameters, given by paths, as additional states."""
 
     dynamics: AbstractDynamics
     paths: tuple[str, ...] = eqx.field(static=True)
@@ -77,7 +83,7 @@ class WithParameters(AbstractWrapper):
 
     @property
     def start(self) -> Array:
-        """The values in the dynamics, one after the other."""
+        """The values of the parameters in the dynamics, flattened and joined."""
         return jnp.concatenate([jnp.ravel(value) for value in self._values])
 
     @property
@@ -91,12 +97,13 @@ class WithParameters(AbstractWrapper):
         return self.dynamics.disturbance_size + own
 
     def values(self, flat: Array) -> dict[str, Array]:
-        """The parameters by their paths."""
+        """The parameters in `flat`, by their paths."""
         shapes = (value.shape for value in self._values)
         return by_path(flat, dict(zip(self.paths, shapes, strict=True)))
 
     def _opened(self, x: Array) -> tuple[AbstractDynamics, Array, Array]:
-        """The dynamics with these parameters, the plant's own state, and they."""
+        """The dynamics with the parameters in `x`, the plant's own state, and the
+        parameters."""
         n = self.dynamics.state_size
         return with_values(self.dynamics, self.values(x[n:])), x[:n], x[n:]
 
@@ -120,7 +127,7 @@ class WithParameters(AbstractWrapper):
 
 
 def check_walks(parameters: Any, dynamics: AbstractDynamics, where: str) -> None:
-    """Raise unless these are random walks of numbers in the dynamics."""
+    """Raise unless `parameters` are random walks that fit numbers in the dynamics."""
     if not isinstance(parameters, dict) or not all(
         isinstance(walk, RandomWalk) for walk in parameters.values()
     ):

@@ -1,4 +1,4 @@
-"""Any estimator along a whole record."""
+"""Running any estimator over a record."""
 
 from typing import Any
 
@@ -40,34 +40,37 @@ def run_estimator(
     t0: Any = 0.0,
     throw: bool = True,
 ) -> Estimated:
-    """Run any estimator over a record.
+    r"""Run any estimator over a record.
 
-    At each step k, with `t_k = t0 + k dt`: `update` with `y_k`, then `predict` with
-    `u_k`. Of a Kalman filter [`delucax.estimators.run_filter`][] also computes the
-    likelihood.
+    At step k, with $t_k = t_0 + k\, dt$, it calls `update` with `observations[k]`, then
+    `predict` with `controls[k]`. For a Kalman filter,
+    [`delucax.estimators.run_filter`][] also computes the likelihood.
 
     **Arguments:**
 
     - `estimator`: a [`delucax.estimators.AbstractEstimator`][] with a field `dynamics`,
         such as [`delucax.estimators.MHE`][].
-    - `observations`: shape `(T, p)`; `trajectory.observations`, for example. The window
-        of a moving-horizon estimator holds at most T.
-    - `controls`: those that were applied, shape `(T, m)`; zero by default.
+    - `observations`: shape `(T, p)`, for example `trajectory.observations`. The window
+        of a moving-horizon estimator must not be longer than T.
+    - `controls`: the controls that were applied, shape `(T, m)`; zero by default.
     - `t0`: the time of the first observation, 0 by default.
-    - `throw`: raise if the `status` of an update is no success (default); if false,
-        look at `result`.
+    - `throw`: raise an error if the `status` of an update is not success; true by
+        default. If false, check `result`.
 
     **Returns:** an object with
 
-    - `predicted`: the belief of each state before it is observed, and at the end that
-        of the state after the last control: a [`delucax.estimators.Belief`][] with a
-        leading axis of `T + 1`;
-    - `updated`: the belief once it is observed, with a leading axis of `T`;
-    - `states`: those of the estimator after each update, with a leading axis of `T`;
-    - `results`: the status of each update; and `result`, the first that is no success.
+    - `predicted`: the belief of each state before it is observed, and last that of the
+        state after the last control; a [`delucax.estimators.Belief`][] with a leading
+        axis of size `T + 1`;
+    - `updated`: the belief of each state after it is observed, with a leading axis of
+        size `T`;
+    - `states`: the state of the estimator after each update, with a leading axis of
+        size `T`;
+    - `results`: the status of each update, and `result`, the first that is not success.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
-    finite, or a window longer than the record; an error at run time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
+    finite, or the window is longer than the record; an error at run time as `throw`
+    says.
 
     !!! example
 
@@ -79,7 +82,11 @@ def run_estimator(
         dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
         y = jnp.sin(jnp.arange(20.0))[:, None]
         mhe = dlx.estimators.MHE(dynamics, jnp.eye(1), jnp.eye(1), 5, bounds=(0.0, 1.0))
-        dlx.estimators.run_estimator(mhe, y).updated.mean
+        dlx.estimators.run_estimator(mhe, y).updated.mean[:4, 0]
+        ```
+
+        ```text
+        Array([0.    , 0.4916, 0.7205, 0.3455], dtype=float32)
         ```
     """
     where = "run_estimator"

@@ -1,4 +1,4 @@
-"""Filters and smoothers of a whole record."""
+"""Kalman filters and smoothers over a record."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ class Filtered(eqx.Module):
 
     @property
     def log_likelihood(self) -> Array:
-        """The log-likelihood of the whole record, or of each record of a batch."""
+        """The log-likelihood of the record, or of each record of a batch."""
         return jnp.sum(self.log_likelihoods, axis=-1)
 
     def _facts(self) -> str:
@@ -58,38 +58,40 @@ def run_filter(
 ) -> Filtered:
     r"""Run a Kalman filter over a record.
 
-    At each step k, with `t_k = t0 + k dt`: the measurement update with `y_k`, then the
-    time update with `u_k`. The log-likelihood of the record,
+    At step k, with $t_k = t_0 + k\, dt$, it makes the measurement update with
+    `observations[k]`, then the time update with `controls[k]`. It also computes the
+    log-likelihood of the record,
 
-    `sum over k of log N(y_k - y_k_predicted; 0, C Sigma_k C' + V)`,
+    $$\sum_k \log N(y_k - \hat y_k;\; 0,\; C \Sigma_k C^T + V).$$
 
-    is differentiable with respect to every array leaf of the estimator: noise levels
-    and constants of the physics can be fitted to it.
+    The log-likelihood is differentiable with respect to every array leaf of the
+    estimator. You can therefore fit noise levels and physical parameters to a record.
 
     **Arguments:**
 
     - `estimator`: a [`delucax.estimators.KalmanFilter`][],
         [`delucax.estimators.ExtendedKalmanFilter`][] or
         [`delucax.estimators.UnscentedKalmanFilter`][].
-    - `observations`: shape `(T, p)`; `trajectory.observations`, for example.
-    - `controls`: those that were applied, shape `(T, m)`; zero by default.
+    - `observations`: shape `(T, p)`, for example `trajectory.observations`.
+    - `controls`: the controls that were applied, shape `(T, m)`; zero by default.
     - `t0`: the time of the first observation, 0 by default.
-    - `throw`: raise if a belief or the likelihood is not finite (default); if false,
-        look at `result`.
+    - `throw`: raise an error if a belief or the likelihood is not finite; true by
+        default. If false, check `result`.
 
     **Returns:** an object with
 
-    - `predicted`: the belief of each state before it is observed, and at the end that
-        of the state after the last control: a [`delucax.estimators.Belief`][] with a
-        leading axis of `T + 1`;
-    - `updated`: the belief once it is observed, with a leading axis of `T`;
+    - `predicted`: the belief of each state before it is observed, and last that of the
+        state after the last control; a [`delucax.estimators.Belief`][] with a leading
+        axis of size `T + 1`;
+    - `updated`: the belief of each state after it is observed, with a leading axis of
+        size `T`;
     - `log_likelihoods`: the log-density of each observation given those before it,
-        shape `(T,)`, and `log_likelihood`, their sum, that of the record;
-    - `result`: one of `delucax.RESULTS`, `diverged` where a belief is not finite, and
-        `ill_posed` where only the likelihood is not, as the covariance of an
-        observation is not definite. After a step that diverges all is NaN.
+        shape `(T,)`, and `log_likelihood`, their sum;
+    - `result`: one of `delucax.RESULTS`. It is `diverged` if a belief is not finite;
+        all results from that step on are NaN. It is `ill_posed` if only the likelihood
+        is not finite, because the covariance of an observation is not definite.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
+    **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
     finite; an error at run time as `throw` says.
 
     Source: Kalman, 1960; Schweppe, 1965 (the likelihood).
@@ -111,6 +113,10 @@ def run_filter(
 
         jax.jit(jax.grad(log_likelihood))(0.0)
         ```
+
+        ```text
+        Array(-4.3515, dtype=float32, weak_type=True)
+        ```
     """
     where = "run_filter"
     filtered = _filter(
@@ -127,18 +133,20 @@ def smooth(
     t0: Any = 0.0,
     throw: bool = True,
 ) -> Smoothed:
-    r"""The estimate of each state from the whole record, by the smoother of Rauch, Tung
-    and Striebel.
+    r"""Estimate each state from the whole record, by the Rauch-Tung-Striebel smoother.
 
-    The backward recursion is, with `G_k = P_k A' Sigma_{k+1}^-1`, the filter's belief
-    being `N(mu_k, Sigma_k)` before `y_k` and `N(m_k, P_k)` after it:
+    The belief of the filter is $N(\mu_k, \Sigma_k)$ before the observation $y_k$ and
+    $N(m_k, P_k)$ after it. The smoother goes backwards:
 
-    `mean_k = m_k + G_k (mean_{k+1} - mu_{k+1})`,
-    `covariance_k = P_k + G_k (covariance_{k+1} - Sigma_{k+1}) G_k'`,
+    $$\mathrm{mean}_k = m_k + G_k (\mathrm{mean}_{k+1} - \mu_{k+1}), \qquad
+    \mathrm{covariance}_k = P_k
+    + G_k (\mathrm{covariance}_{k+1} - \Sigma_{k+1}) G_k^T, \qquad
+    G_k = P_k A^T \Sigma_{k+1}^{-1}$$
 
-    the latter in a form that stays semidefinite. Of a nonlinear filter, `P_k A'` is the
-    covariance of the state with the next one, as that filter finds it. Covariances may
-    be singular: a first state that is known, or noise in some states alone.
+    The covariance is computed in a form that stays semidefinite. For a nonlinear
+    filter, $P_k A^T$ is the covariance of the state with the next state, as the filter
+    computes it. Covariances may be singular, for example for a known first state, or if
+    only some of the states have noise.
 
     **Arguments:**
 
@@ -147,10 +155,10 @@ def smooth(
 
     **Returns:** an object with
 
-    - `mean`: of each state, given the whole record, shape `(T, n)`;
-    - `covariance`: likewise, shape `(T, n, n)`;
-    - `filtered`: the pass of the filter, as `run_filter` returns it;
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `mean`: the mean of each state given the whole record, shape `(T, n)`;
+    - `covariance`: the covariance of each state, shape `(T, n, n)`;
+    - `filtered`: the result of the filter, as `run_filter` returns it;
+    - `result`: success or the failure, one of `delucax.RESULTS`.
 
     **Raises:** as `run_filter`.
 
@@ -169,7 +177,11 @@ def smooth(
         ekf = dlx.estimators.ExtendedKalmanFilter(
             env.dynamics, 1e-6 * jnp.eye(2), 1e-2 * jnp.eye(2)
         )
-        dlx.estimators.smooth(ekf, run.observations, run.controls).mean
+        dlx.estimators.smooth(ekf, run.observations, run.controls).mean[0]
+        ```
+
+        ```text
+        Array([0.09998, 0.00007], dtype=float32)
         ```
     """
     where = "smooth"
@@ -192,7 +204,7 @@ def _record(estimator, observations, controls, t0, where):
         u = as_rows(controls, m, "controls", where, len(y))
     check_finite(u, "controls", where)
     check_number(t0, "t0", where)
-    # A product, and no running sum, whose rounding would grow along the record.
+    # A product, because the rounding of a running sum would grow along the record.
     times = as_float_array(t0) + jnp.arange(len(y)) * estimator.dynamics.dt
     return y, u, times.astype(y.dtype)
 
@@ -204,22 +216,23 @@ def _filter(estimator, y, u, times) -> Filtered:
     def step(carry, inputs):
         belief, ok = carry
         t, y, u = inputs
-        # First y_k, then u_k, which a controller chooses once it has seen y_k. The
-        # density is that of the innovation, given all y before: by the chain rule these
-        # sum up to the likelihood of the record (Schweppe, 1965).
+        # y_k comes first, because a controller chooses u_k after it has seen y_k. The
+        # log-densities of the innovations, each given all earlier observations, sum to
+        # the log-likelihood of the record (Schweppe, 1965).
         expected = estimator._innovation(t, y, belief)
         density = estimator._log_density(belief, *expected)
         updated = estimator._corrected(belief, *expected)
         after = estimator.predict(t, u, updated)
         ok &= updated.is_finite & after.is_finite
-        # After a failure go on from the first belief, and mask the steps at the end: no
-        # NaN of one member of a batch may get into the derivative of the others.
+        # After a failure, continue from the first belief, and mask the results at the
+        # end. So a NaN in one member of a batch does not reach the derivative of the
+        # others.
         after = jax.tree.map(lambda a, b: jnp.where(ok, a, b), after, first)
         return (after, ok), (updated, after, density, ok)
 
     start = first, first.is_finite
     _, (updated, after, densities, ok) = lax.scan(step, start, (times, y, u))
-    # The first belief is a prediction, too, before any data: there is one more.
+    # The first belief is a prediction too, so there are T + 1.
     joined = lambda a, b: jnp.concatenate([a[None], _masked(ok, b)])
     predicted = jax.tree.map(joined, first, after)
     definite = jnp.all(jnp.isfinite(densities))
@@ -234,24 +247,25 @@ def _filter(estimator, y, u, times) -> Filtered:
 def _smooth(estimator, y, u, times) -> Smoothed:
     filtered = _filter(estimator, y, u, times)
     ok = jnp.isfinite(filtered.log_likelihoods)
-    # Steps that failed are run back over the first belief, and masked at the end.
+    # For steps that failed, the backward pass uses the first belief; they are masked at
+    # the end.
     kept = lambda a, b: _masked(ok, a, b)
     updated = jax.tree.map(kept, filtered.updated, estimator.init())
 
     def back(after, inputs):
         t, u, belief = inputs
-        # The prediction from each belief is made again: to keep it would take the
-        # covariance of the state with the next one at all steps.
+        # The prediction is computed again, because keeping it would need memory for the
+        # joint covariances of all steps.
         belief = estimator._smoothed(t, u, belief, after)
         return belief, belief
 
-    # The last state has no later data: its smoothed belief is the filter's.
+    # There are no data after the last state, so its smoothed belief is the filter's.
     last = jax.tree.map(lambda a: a[-1], updated)
     inputs = jax.tree.map(lambda a: a[:-1], (times, u, updated))
     _, smoothed = lax.scan(back, last, inputs, reverse=True)
     whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
-    # A smoothed state is of all that the filter made of later steps: where it failed at
-    # one, none is known.
+    # A smoothed state depends on all later steps of the filter. If one of them failed,
+    # all smoothed states are masked.
     filter_ok = filtered.result == RESULTS.successful
     result = choose(whole.is_finite | ~filter_ok, filtered.result, RESULTS.diverged)
     whole = jax.tree.map(lambda a: jnp.where(filter_ok, a, jnp.nan), whole)
