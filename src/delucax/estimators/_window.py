@@ -1,6 +1,4 @@
-"""The window of moving-horizon estimation: what it holds, its linear model, and its
-Gauss-Newton iterations.
-"""
+"""The window of moving-horizon estimation, its linearisation and its iterations."""
 
 from typing import Any, NamedTuple
 
@@ -20,35 +18,36 @@ from ._window_smoother import independent, observed, Rows, Smoothed, smoothed, S
 
 
 _LENGTHS = tuple(2.0**-i for i in range(12))
-"""The lengths of a step that are tried."""
+"""The lengths of a step that the line search tries."""
 _DECREASE = 1e-4
+"""The share of the predicted decrease that a step must reach (Armijo)."""
 
 
 class Window(NamedTuple):
-    """The state of the estimator. The newest stage is the last one; until the window is
-    full, its first stages stand for nothing."""
+    """The state of the estimator. The newest stage is the last one. Until the window is
+    full, its first stages are unused."""
 
     t: Array  # (N,)
-    u: Array  # (N, m), of the step after each stage; the last one is not known yet
+    u: Array  # (N, m), the control after each stage; the last one is not known yet
     y: Array  # (N, p)
     is_seen: Array  # (N,), whether the stage has an observation
-    count: Array  # of stages
+    count: Array  # the number of stages in use
     prior: Belief  # of the first state, without the observations of the window
     x: Array  # (N, n)
-    zeta: Array  # (N, k), of which `w = W zeta`
+    zeta: Array  # (N, k), the disturbances are `w = W zeta`
     sides: Array  # (N, q), the active bounds
     belief: Belief  # of the last state
     result: Result
 
     @property
     def is_there(self) -> Array:
-        """Which stages stand for something."""
+        """Whether each stage is in use."""
         size = len(self.t)
         return jnp.arange(size) >= size - self.count
 
 
 class Model(eqx.Module):
-    """What the estimator knows beforehand, of states with what is carried along."""
+    """The model of the estimator. Estimated parameters are states of `dynamics`."""
 
     dynamics: AbstractDynamics
     W: Array
@@ -59,35 +58,36 @@ class Model(eqx.Module):
     difference: Difference | None
 
     def advanced(self, t: RealScalar, x: Array, u: Array, w: Array) -> Array:
-        """The next state; NaN where the solver fails."""
+        """The next state; NaN if the solver fails."""
         after, result = self.dynamics.advance(t, x, u, w)
         if result is RESULTS.successful:
             return after
         return jnp.where(result == RESULTS.successful, after, jnp.nan)
 
     def step(self, t: RealScalar, x: Array, u: Array, w: Array) -> Any:
-        """The next state, and its derivatives by state and disturbance."""
+        """The next state, and its derivatives with respect to state and disturbance."""
         after, (A, E) = value_and_jacobians(
             lambda x, w: self.advanced(t, x, u, w), x, w
         )
         return after, A, E
 
     def missed(self, t: RealScalar, x: Array, y: Array) -> Array:
-        """How far an observation is from what the state gives."""
+        """The residual of an observation: its difference from the predicted one."""
         expected = self.dynamics.observe(t, x)
         if self.difference is None:
             return y - expected
         return self.difference(y, expected)
 
     def sensor(self, t: RealScalar, x: Array, y: Array) -> tuple[Array, Array]:
-        """How far an observation is from what the state gives, and the derivative of
-        the latter."""
+        """The residual of an observation, and the derivative of the predicted one."""
         error, (C,) = value_and_jacobians(lambda x: self.missed(t, x, y), x)
         return error, -C
 
     def rows(self, t: Array, x: Array, y: Array, is_seen: Array) -> tuple[Rows, Array]:
-        """The observations of stages as rows, and their penalties. A row whose
-        residual is large counts less."""
+        """The observations of the stages as rows, and their penalties.
+
+        With a threshold, an observation with a large residual has less weight.
+        """
         error, C = jax.vmap(self.sensor)(t, x, y)
         error = jnp.where(is_seen[:, None], error, 0)
         C = jnp.where(is_seen[:, None, None], C, 0)
@@ -96,12 +96,12 @@ class Model(eqx.Module):
         return Rows(C, variance / share[:, None], error), penalty
 
     def weighed(self, variance: Array, error: Array) -> tuple[Array, Array]:
-        """The weights of the observations in least squares, and their penalties."""
+        """The least-squares weights of the observations, and their penalties."""
         square = jnp.sum(error**2 / jnp.where(variance > 0, variance, 1), axis=1)
         if self.threshold is None:
             return jnp.ones_like(square), square / 2
-        # Huber's penalty has the slope r up to the threshold, and then that of the
-        # threshold: in least squares, a weight of threshold / r.
+        # Huber's penalty has the slope r up to the threshold, and a constant slope
+        # beyond. In least squares this is a weight of threshold / r.
         limit = self.threshold
         is_far = square > limit**2
         r = jnp.sqrt(jnp.where(is_far, square, 1))
@@ -130,7 +130,7 @@ def first_window(model: Model, prior: Belief, size: int, bounded: int) -> Window
 
 @full_precision
 def moved(model: Model, t: RealScalar, u: Array, window: Window) -> Window:
-    """The window a step later: the first stage goes into the prior once it is full."""
+    """The window a step later. If it is full, the first stage goes into the prior."""
     dtype = window.x.dtype
     us, ts = window.u.at[-1].set(u), window.t.at[-1].set(t)
     ends = jnp.array([0, -1])
@@ -141,7 +141,8 @@ def moved(model: Model, t: RealScalar, u: Array, window: Window) -> Window:
     def predicted(covariance, k):
         return symmetric(A[k] @ covariance @ A[k].T + E[k] @ model.W @ E[k].T)
 
-    # The Kalman filter of the first stage, linearised where the window has it now.
+    # One step of the Kalman filter on the first stage, linearised about the state that
+    # the window has for it now.
     rows, _ = model.rows(ts[:1], window.x[:1], window.y[:1], window.is_seen[:1])
     first = window.x[0]
     d = model.dynamics.difference(window.prior.mean, first)
@@ -155,7 +156,7 @@ def moved(model: Model, t: RealScalar, u: Array, window: Window) -> Window:
     )
     belief = Belief(after[1], predicted(window.belief.covariance, 1))
     if len(window.t) == 1:
-        # What is left of one stage is the filter.
+        # A window of one stage is the Kalman filter.
         belief = prior
     push = lambda a, new: jnp.concatenate([a[1:], new[None].astype(a.dtype)])
     nothing = lambda a: push(a, jnp.zeros_like(a[0]))
@@ -176,8 +177,8 @@ def moved(model: Model, t: RealScalar, u: Array, window: Window) -> Window:
 
 
 class Point(NamedTuple):
-    """A point of the iteration: the states, the disturbances `W zeta`, and the first
-    state by `mean + covariance rho`."""
+    """An iterate: the states, the disturbances `w = W zeta`, and `rho`, by which the
+    first state is `mean + covariance rho`."""
 
     x: Array
     zeta: Array
@@ -185,7 +186,7 @@ class Point(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """The window about a point, and its penalties there."""
+    """The window linearised about a point, with the penalties at the point."""
 
     steps: Steps
     rows: Rows
@@ -196,7 +197,7 @@ class Linear(NamedTuple):
 
 @full_precision
 def solved(model: Model, window: Window, iterations: int) -> Window:
-    """The window with its least-squares estimate, after so many iterations."""
+    """The window with its least-squares estimate after `iterations` steps."""
     point = Point(window.x, window.zeta, jnp.zeros_like(window.prior.mean))
     if model.states is not None:
         point = point._replace(x=jnp.clip(point.x, *model.states))
@@ -223,7 +224,7 @@ def solved(model: Model, window: Window, iterations: int) -> Window:
 
 
 def _linear(model: Model, window: Window, point: Point) -> Linear:
-    """The window about a point, in deviations from it."""
+    """The window linearised about a point, in deviations from the point."""
     there, x = window.is_there, point.x
     (size, n), k = x.shape, len(model.W)
     w = point.zeta @ model.W
@@ -237,7 +238,7 @@ def _linear(model: Model, window: Window, point: Point) -> Linear:
     E = jnp.where(is_step[:, None, None], E, 0)
     defects = jnp.where(is_step[:, None], defects, 0)
     b = defects - jnp.sum(E * w[:-1, None], axis=2)
-    # The state stays after the last stage, and before the first one.
+    # After the last stage and before the first one in use, the state stays constant.
     stays = jnp.eye(n, dtype=x.dtype)[None], jnp.zeros((1, n, k), x.dtype)
     ends = *stays, jnp.zeros((1, n), x.dtype)
     pairs = zip((A, E, b), ends, strict=True)
@@ -248,7 +249,7 @@ def _linear(model: Model, window: Window, point: Point) -> Linear:
 
 
 def _limits(model: Model, window: Window, point: Point) -> Limits | None:
-    """The bounds of the deviations and the disturbances."""
+    """The bounds of the deviations and of the disturbances, or `None`."""
     n, k = point.x.shape[1], len(model.W)
     there = window.is_there
     is_step = there.at[-1].set(False)
@@ -271,7 +272,8 @@ def _limits(model: Model, window: Window, point: Point) -> Limits | None:
 def _stepped(
     model: Model, window: Window, sides: Array, point: Point, linear: Linear
 ) -> tuple[Point, Array, Belief, Result, Smoothed]:
-    """One full step: the point, the active bounds, what it says of the state now."""
+    """One full step: the new point, its active bounds, the belief of the current state,
+    the status, and the solution of the linear window."""
     limits = _limits(model, window, point)
     if limits is None:
         free = solution = smoothed(linear.steps, linear.rows, linear.start, model.W)
@@ -282,7 +284,7 @@ def _stepped(
     there = window.is_there[:, None]
     x = jnp.where(there, point.x + solution.d, point.x)
     if model.states is not None:
-        # Up to rounding it is between them.
+        # The solution violates the bounds by rounding only.
         x = jnp.where(there, jnp.clip(x, *model.states), point.x)
     after = Point(x, solution.zeta, solution.rho[0])
     belief = Belief(x[-1], free.last.covariance)
@@ -292,7 +294,7 @@ def _stepped(
 def _searched(
     model: Model, window: Window, sides: Array, point: Point
 ) -> tuple[Point, Array, Belief, Result]:
-    """One step of a length that lowers an exact penalty of what it violates."""
+    """One step with a line search on an exact penalty function."""
     linear = _linear(model, window, point)
     full, after, belief, result, solution = _stepped(
         model, window, sides, point, linear
@@ -314,12 +316,12 @@ def _length(
     linear: Linear,
     solution: Smoothed,
 ) -> tuple[Array, BoolScalar]:
-    """The first length of those tried that lowers the penalty enough, and whether
-    nothing is left to gain."""
+    """The first step length that lowers the penalty function enough, and whether the
+    point is near the minimum."""
     count = linear.rows.c.shape[1]
     n, P, W = point.x.shape[1], window.prior.covariance, model.W
     exact = linear.rows.variance == 0
-    # Beyond their multipliers the penalties are exact (Han, 1977).
+    # The penalty is exact if its weights exceed the multipliers (Han, 1977).
     price = 2 * jnp.max(jnp.abs(solution.rho), axis=0)
     row_price = 2 * jnp.max(jnp.abs(solution.u[:, :count]), axis=0)
 
@@ -355,7 +357,7 @@ def _length(
     now = total(
         point, linear.defects, off_start(point), linear.rows.target, linear.penalty
     )
-    # What the linear model promises.
+    # The penalty function that the linear model predicts for the full step.
     rows = linear.rows
     left = rows.target - jnp.sum(rows.c * solution.d[:, None, :], axis=2)
     variance, _ = independent(model.V, left)

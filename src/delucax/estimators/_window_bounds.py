@@ -1,9 +1,9 @@
-"""A linear window between bounds, by guesses of the active ones.
+"""A linear window with bounds, solved by an active-set method.
 
-An active bound is an observation without noise, so that a guess costs one pass of the
-smoother. Its multipliers and violations give the next guess. If guesses do not end, an
-interior-point method finds the active bounds: to it a bound is an observation whose
-noise falls.
+An active bound is treated as an observation without noise, so the solution for a guess
+of the active set takes one pass of the smoother. Its multipliers and violations give
+the next guess. If the guesses do not settle, an interior-point method finds the active
+set. There, a bound is an observation whose noise decreases.
 
 Source: Hintermueller, Ito and Kunisch, 2002 (guesses); Mehrotra, 1992.
 """
@@ -20,18 +20,20 @@ from ._window_smoother import Rows, Smoothed, smoothed, Steps
 
 
 _GUESSES = 10
-"""So many sets are tried in turn, as long as fewer bounds are wrong now and then."""
+"""The maximum number of guesses of the active set."""
 _PATIENCE = 3
+"""The guesses end early if so many in a row do not reduce the number of wrong bounds.
+"""
 _BARRIERS = 50
-"""So many interior-point steps at most."""
+"""The maximum number of interior-point steps."""
 _TO_BOUNDARY = 0.99
 _LOOSE = 30
-"""A bound that is violated by more slacks than this cannot hold."""
+"""A bound that is violated by more than this many slacks counts as infeasible."""
 
 
 class Limits(NamedTuple):
-    """The bounds of the entries of `(d, w)`, shape `(N, q)`, infinite where there are
-    none, and which entries these are."""
+    """The bounds of some entries of `(d, w)`, shape `(N, q)`, infinite for none, and
+    the indices of these entries."""
 
     low: Array
     high: Array
@@ -39,16 +41,16 @@ class Limits(NamedTuple):
 
 
 class Bounded(NamedTuple):
-    """The solution between bounds."""
+    """The solution with bounds."""
 
     solution: Smoothed
-    free: Smoothed  # without bounds
-    sides: Array  # (N, q): 1 at the upper bound, -1 at the lower one
+    free: Smoothed  # the solution without bounds
+    sides: Array  # (N, q): 1 at the upper bound, -1 at the lower one, else 0
     result: Result
 
 
 class _Problem(NamedTuple):
-    """The window, its bounds, and their scale."""
+    """The window, its bounds, and the scale of the bounded entries."""
 
     steps: Steps
     rows: Rows
@@ -56,19 +58,22 @@ class _Problem(NamedTuple):
     W: Array
     low: Array
     high: Array
-    units: Array  # (q, n) or (q, n + k), the rows of the bounded entries
-    width: Array  # (N, q), the standard deviation without bounds
+    units: Array  # (q, n) or (q, n + k), unit vectors of the bounded entries
+    width: Array  # (N, q), the standard deviations without bounds
 
     def bounded(self, on: Array, variance: Array, target: Array) -> Smoothed:
-        """The solution with observations of the bounded entries."""
+        """The solution with additional observations of the bounded entries."""
         c = jnp.where(on[:, :, None], self.units, 0)
         more = Rows(c, variance, jnp.where(on, target, 0))
         return smoothed(self.steps, self.rows.beside(more), self.start, self.W)
 
     @property
     def give(self) -> Array:
-        """The variance of a bound that is held. Bounds of one quantity at many stages
-        are dependent, so that each gives a little."""
+        """The variance of an active bound.
+
+        It is not zero, because active bounds of one quantity at many stages may depend
+        on each other.
+        """
         return 30 * float(jnp.finfo(self.W.dtype).eps) * self.width**2
 
     def held(self, sides: Array) -> Smoothed:
@@ -77,20 +82,20 @@ class _Problem(NamedTuple):
         return self.bounded(sides != 0, self.give, target)
 
     def at(self, solution: Smoothed) -> Array:
-        """The bounded entries."""
+        """The bounded entries of a solution."""
         z = jnp.concatenate([solution.d, solution.zeta @ self.W], axis=1)
         return z[:, : self.units.shape[1]] @ self.units.T
 
     def multipliers(self, solution: Smoothed) -> Array:
-        """The multipliers of the bounds."""
+        """The multipliers of the bounds in a solution."""
         return solution.u[:, self.rows.c.shape[1] :]
 
 
 def smoothed_between(
     steps: Steps, rows: Rows, limits: Limits, start: Belief, W: Array, guess: Array
 ) -> Bounded:
-    """The solution of the window between bounds. The derivative is that with the same
-    bounds active."""
+    """The solution of the window with bounds. It is differentiated with the active set
+    fixed."""
     low, high, entries = limits
     n = steps.A.shape[1]
     free = smoothed(steps, rows, start, W)
@@ -126,7 +131,7 @@ def smoothed_between(
 
 
 def _judged(problem: _Problem, solution: Smoothed) -> Result:
-    """Whether the bounds hold, up to rounding."""
+    """The status: whether the bounds hold, up to rounding."""
     z, info = problem.at(solution), jnp.finfo(problem.W.dtype)
     ends = problem.low, problem.high
     sizes = (jnp.where(jnp.isfinite(a), jnp.abs(a), 0) for a in ends)
@@ -138,14 +143,14 @@ def _judged(problem: _Problem, solution: Smoothed) -> Result:
 
 
 def _corrected(problem: _Problem, solution: Smoothed, sides: Array, u: Array):
-    """The next guess after the solution of one, and how many bounds it changes."""
+    """The next guess of the active set, and the number of bounds that it changes."""
     z, width = problem.at(solution), problem.width
     near = float(jnp.finfo(z.dtype).eps) ** 0.6
-    # What does not vary cannot be moved by its bounds.
+    # A bound cannot move an entry without variance.
     off = (sides == 0) & (width > 0)
     to_high = off & (z - problem.high > near * width)
     to_low = off & (problem.low - z > near * width)
-    # An upper bound pulls down: the multiplier of its equation is negative.
+    # An upper bound pulls its entry down, so its multiplier must be negative.
     leaves = (u * sides * width > near) & (problem.low < problem.high)
     after = jnp.where(leaves, 0, sides)
     after = jnp.where(to_high, 1, jnp.where(to_low, -1, after))
@@ -153,7 +158,7 @@ def _corrected(problem: _Problem, solution: Smoothed, sides: Array, u: Array):
 
 
 def _guessed(problem: _Problem, sides: Array, done: Array) -> tuple[Array, Array]:
-    """The active bounds by guesses, and whether they ended."""
+    """The active set after repeated guesses, and whether the guesses settled."""
 
     def body(carry):
         sides, best, patience, k, _ = carry
@@ -173,7 +178,10 @@ def _guessed(problem: _Problem, sides: Array, done: Array) -> tuple[Array, Array
 
 
 def _by_barrier(problem: _Problem, free: Smoothed) -> Array:
-    """The active bounds by an interior-point method, upper sides before lower ones."""
+    """The active set by an interior-point method (Mehrotra's predictor-corrector).
+
+    The arrays `s` and `z` hold the upper bounds first, then the lower ones.
+    """
     both = lambda a: jnp.stack([a, -a])
     width, dtype = problem.width, problem.W.dtype
     h = jnp.stack([problem.high, -problem.low])
@@ -186,7 +194,7 @@ def _by_barrier(problem: _Problem, free: Smoothed) -> Array:
     mean = lambda s, z: jnp.sum(jnp.where(on, s * z, 0)) / count
 
     def turn(carry, s, z, mu):
-        """The step with or, at first, without a correction of second order."""
+        """One step: first the predictor, then with a second-order correction."""
         ds, dz, aim = carry
         push = (aim - jnp.where(aim > 0, ds * dz, 0)) / s
         rate = jnp.where(on, z / s, 0)
@@ -232,5 +240,5 @@ def _by_barrier(problem: _Problem, free: Smoothed) -> Array:
 
 
 def _length(a: Array, da: Array) -> Array:
-    """The largest step, at most 1, that keeps `a` from below 0."""
+    """The largest step length, at most 1, that keeps `a` nonnegative."""
     return 1 / jnp.maximum(jnp.max(-da / a, initial=0), 1)

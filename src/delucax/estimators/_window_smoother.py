@@ -1,9 +1,9 @@
-"""The smoother of a linear window, forwards and back, without an inverse.
+"""The smoother of a linear window: a pass forwards and a pass back, without inverses.
 
-Of the window `d_{k+1} = A_k d_k + E_k w_k + b_k`, `d_0 ~ N(mean, covariance)`,
-`w_k ~ N(0, W)`, with rows `c'z_k = target + v`, `v ~ N(0, variance)`, `z_k` being
-`(d_k, w_k)` or `d_k` alone. All covariances may be singular: a row of variance 0 is an
-equation, and its multiplier is found with the others.
+The window is `d_{k+1} = A_k d_k + E_k w_k + b_k`, `d_0 ~ N(mean, covariance)`,
+`w_k ~ N(0, W)`. Its observations are rows `c' z_k = target + v`, `v ~ N(0, variance)`,
+where `z_k` is `d_k`, or `d_k` and `w_k`. All covariances may be singular. A row with
+variance 0 is an equation; its multiplier is computed like the others.
 
 Source: Bryson and Frazier, 1963; Bierman, 1973 (without an inverse).
 """
@@ -19,10 +19,11 @@ from ._base import Belief
 
 
 _WRITTEN_OUT = 12
+"""Loops over at most this many rows are unrolled."""
 
 
 class Steps(NamedTuple):
-    """The steps of a window; after the last stage the state stays."""
+    """The steps of a window. After the last stage the state stays constant."""
 
     A: Array  # (N, n, n)
     E: Array  # (N, n, k)
@@ -30,14 +31,14 @@ class Steps(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows with independent noise; one that is all zero takes no part."""
+    """Rows with independent noise. A row of zeros has no effect."""
 
     c: Array  # (N, R, n) or (N, R, n + k)
     variance: Array  # (N, R)
     target: Array  # (N, R)
 
     def beside(self, other: "Rows") -> "Rows":
-        """These rows, then others."""
+        """These rows followed by the rows of `other`."""
         size = max(self.c.shape[2], other.c.shape[2])
         wide = lambda c: jnp.pad(c, ((0, 0), (0, 0), (0, size - c.shape[2])))
         pairs = zip(self._replace(c=wide(self.c)), other, strict=True)
@@ -48,17 +49,20 @@ class Smoothed(NamedTuple):
     """The least-squares solution of a window."""
 
     d: Array  # (N, n)
-    zeta: Array  # (N, k), of which `w = W zeta`
+    zeta: Array  # (N, k), the disturbances are `w = W zeta`
     rho: Array  # (N, n), the multipliers of the steps; `d_0 = mean + covariance rho_0`
-    u: Array  # (N, R), of which the noise of a row is `variance u`
+    u: Array  # (N, R), the noise of a row is `variance u`
     variances: Array  # (N, n), of each state before it is observed
     last: Belief  # of the last state
 
 
 def independent(V: Array, *rows: Array) -> tuple[Array, ...]:
-    """The variances of rows whose noise has the covariance `V` once each is freed of
-    what those before it say, and these rows; their number is the second axis."""
-    # Elimination without exchanges. A row that says nothing new has variance 0.
+    """Transform observations with noise of covariance `V` to independent noise.
+
+    Returns the new variances, and each of `rows` transformed along its second axis.
+    """
+    # Gaussian elimination without pivoting. A row that is determined by the rows before
+    # it gets variance 0.
     p, slack = len(V), len(V) * float(jnp.finfo(V.dtype).eps)
     own, freed = jnp.diagonal(V), list(rows)
     for i in range(p - 1):
@@ -74,8 +78,10 @@ def independent(V: Array, *rows: Array) -> tuple[Array, ...]:
 
 
 def observed(m: Array, P: Array, rows: Rows) -> tuple[Array, Array, tuple]:
-    """Mean and covariance once the rows of one stage are known, one after the other,
-    with what the way back needs: of each row its gain, and its error over its variance.
+    """Mean and covariance after the observations of one stage, one row after the other.
+
+    Also returns what the pass back needs: for each row its gain, and its error over the
+    variance of the error.
     """
 
     def known(carry, row):
@@ -87,7 +93,7 @@ def observed(m: Array, P: Array, rows: Rows) -> tuple[Array, Array, tuple]:
         G = Pc / safe
         error = jnp.where(S > 0, target - jnp.sum(c * m), 0) / safe
         m = m + Pc * error
-        # (I - G c') P (I - G c')' + variance G G', as updates of rank one.
+        # (I - G c') P (I - G c')' + variance G G', by two updates of rank one.
         P = P - G[:, None] * Pc
         P = P - jnp.sum(P * c, axis=1)[:, None] * G + variance * G[:, None] * G
         return (m, P), (G, error)
@@ -98,20 +104,21 @@ def observed(m: Array, P: Array, rows: Rows) -> tuple[Array, Array, tuple]:
 
 
 def _unrolled(count: int) -> int:
-    """How many rows are written out: a loop in a loop is slow, many are a long
-    program."""
+    """The number of rows to unroll. A nested loop is slow, but many unrolled rows make a
+    long program."""
     return count if count <= _WRITTEN_OUT else 1
 
 
 @full_precision
 def smoothed(steps: Steps, rows: Rows, start: Belief, W: Array) -> Smoothed:
-    """The solution of the window. The rows are of `(d, w)` if they have as many
-    columns."""
+    """The solution of the window. If the rows have more columns than `d`, they act on
+    `(d, w)`."""
     A, E, b = steps
     n, k = E.shape[1:]
     is_wide = rows.c.shape[2] > n
     if is_wide:
-        # The noise of a step is known before it is made, as a part of the state.
+        # The disturbance of the next step is part of the state, so that rows can
+        # observe it.
         A, Q = jnp.concatenate([A, E], axis=2), jnp.zeros_like(A)
     else:
         Q = E @ W @ E.mT

@@ -1,4 +1,4 @@
-"""Problems of optimal control with published optima."""
+"""Optimal control problems with published optima."""
 
 from ._base import OptimalControl as OptimalControl, Simulated as Simulated
 from ._fixed_time import (
@@ -39,4 +39,4 @@ NAMES = (
     "methanol_to_hydrocarbons",
     "alpha_pinene",
 )
-"""The functions of this package that make a problem."""
+"""The names of the functions that make a problem."""

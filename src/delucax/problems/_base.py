@@ -1,4 +1,4 @@
-"""A problem of optimal control with its published optimum."""
+"""An optimal control problem with its published optimum."""
 
 from typing import Any, NamedTuple
 
@@ -17,13 +17,14 @@ from ..planning import AbstractPlanner, Constraints, Plan, Problem, SQP, Unknown
 
 
 class Simulated(NamedTuple):
-    """What the controls of a plan do in a simulation with adaptive steps.
+    """The result of `OptimalControl.simulate`.
 
     **Attributes:**
 
-    - `objective`: that of the simulated trajectory, a scalar.
-    - `violation`: the largest violation of a constraint on it, also between the steps.
-    - `times`, `states`: the trajectory, shapes `(K,)` and `(K, n)`.
+    - `objective`: the objective of the simulated trajectory, a scalar.
+    - `violation`: the largest violation of a constraint along the trajectory, also
+        between the steps of the plan.
+    - `times`, `states`: the simulated trajectory, shapes `(K,)` and `(K, n)`.
 
     !!! example
 
@@ -36,7 +37,12 @@ class Simulated(NamedTuple):
             simulated = problem.simulate(plan)
             return simulated.objective, simulated.violation
 
-        jax.eval_shape(check, dlx.problems.catalyst_mixing(20))
+        objective, violation = jax.eval_shape(check, dlx.problems.catalyst_mixing(20))
+        objective.shape
+        ```
+
+        ```text
+        ()
         ```
     """
 
@@ -47,25 +53,25 @@ class Simulated(NamedTuple):
 
 
 class OptimalControl(eqx.Module):
-    """A problem of optimal control in continuous time, discretised, with a start and
-    the optimum that is published. [`delucax.planning.SQP`][] solves it.
+    """A discretised optimal control problem, with a first guess and its known optimum.
 
-    Use double precision (`JAX_ENABLE_X64=1`). In single precision some of the problems
-    do not converge, and the objective of others is off by a percent.
+    [`delucax.planning.SQP`][] solves it. Use double precision (`JAX_ENABLE_X64=1`). In
+    single precision some of the problems do not converge, and the objective of others
+    is wrong by a percent.
 
     **Arguments:**
 
-    - `dynamics`: with the controls held over each step.
+    - `dynamics`: the discretised dynamics. Controls are held over each step.
     - `cost`: the stage and final cost; minus the objective if that is maximised.
     - `x0`: the first state, shape `(n,)`.
-    - `controls`: to start from, shape `(T, m)`.
+    - `controls`: the first guess of the controls, shape `(T, m)`.
     - `reference`: the published objective.
-    - `states`: to start from, shape `(T+1, n)`; those that follow from the controls by
-        default.
-    - `bounds`: of the controls, `(low, high)`; none by default.
+    - `states`: the first guess of the states, shape `(T+1, n)`; by default the states
+        that follow from the controls.
+    - `bounds`: the bounds of the controls, `(low, high)`; none by default.
     - `constraints`: [`delucax.planning.Constraints`][]; none by default.
     - `unknowns`: [`delucax.planning.Unknowns`][]; none by default.
-    - `is_maximised`: false by default.
+    - `is_maximised`: whether the objective is maximised; false by default.
 
     !!! example
 
@@ -99,12 +105,13 @@ class OptimalControl(eqx.Module):
     def solve(
         self, planner: AbstractPlanner | None = None, *, throw: bool = True
     ) -> Plan:
-        """Plan from the start.
+        """Solve the problem, starting at its first guess.
 
         **Arguments:**
 
-        - `planner`: an [`delucax.planning.SQP`][] that starts from `states` by default.
-        - `throw`: raise unless the plan is a solution (default).
+        - `planner`: an [`delucax.planning.AbstractPlanner`][]; by default a
+            [`delucax.planning.SQP`][] that starts at `states`.
+        - `throw`: raise an error if the plan is not a solution; true by default.
 
         **Returns:** a [`delucax.planning.Plan`][], differentiable with respect to every
         array of the problem.
@@ -123,21 +130,27 @@ class OptimalControl(eqx.Module):
         )
 
     def objective(self, plan: Plan) -> Array:
-        """The objective of a plan, of the sign of `reference`.
+        """The objective of a plan, with the sign of `reference`.
 
-        **Arguments:** `plan`: as `solve` returns it.
+        **Arguments:** `plan`: a plan that `solve` returned.
+
+        **Returns:** a scalar.
         """
         return -plan.cost if self.is_maximised else plan.cost
 
     def simulate(self, plan: Plan, points: int = 10, rtol: float = 1e-10) -> Simulated:
-        """Apply the controls of a plan, with its values of the unknowns, with adaptive
-        steps (Dormand and Prince, order 8).
+        """Simulate the controls of a plan with an accurate solver, to check the plan.
+
+        The solver is Dormand and Prince's of order 8 with adaptive steps. The unknowns
+        have their values in the plan.
 
         **Arguments:**
 
-        - `plan`: as `solve` of this problem returns it.
-        - `points`: in each step, at which the constraints are checked; 10 by default.
-        - `rtol`: of the steps, 1e-10 by default; it needs double precision.
+        - `plan`: a plan that `solve` returned for this problem.
+        - `points`: the constraints are checked at this number of points in each step,
+            10 by default.
+        - `rtol`: the relative and absolute tolerance of the solver, 1e-10 by default,
+            which needs double precision.
 
         **Returns:** a [`delucax.problems.Simulated`][].
         """
@@ -164,7 +177,7 @@ class OptimalControl(eqx.Module):
 
 
 def _fine(dynamics: Any, points: int, rtol: float) -> Any:
-    """The dynamics over a part of a step, with adaptive steps."""
+    """The dynamics over a fraction of a step, with adaptive steps."""
     if not isinstance(dynamics, Discretized):
         return dynamics.refined(points, lambda inner: _fine(inner, 1, rtol))
     return Discretized(
@@ -201,7 +214,7 @@ def _violation(
 
 
 class Reach(eqx.Module):
-    """An equality at the end: some of the states have given values."""
+    """An equality constraint at the end: some of the states have given values."""
 
     values: Array = parameter()
     entries: tuple[int, ...] = eqx.field(static=True)
@@ -211,8 +224,8 @@ class Reach(eqx.Module):
 
 
 class FinalState(AbstractCost):
-    """A weighted sum of the last state and an offset; without weights, the time at the
-    end."""
+    """A final cost: a weighted sum of the last state plus an offset. Without weights it
+    is the final time."""
 
     weights: Array | None = parameter(None)
     offset: Real = parameter(0.0)
@@ -227,7 +240,7 @@ class FinalState(AbstractCost):
 
 
 def line(start: Any, end: Any, horizon: int) -> Array:
-    """States on a line from one to another."""
+    """States on a straight line from one state to another."""
     share = jnp.linspace(0.0, 1.0, horizon + 1)[:, None]
     start, end = (jnp.asarray(a, float) for a in (start, end))
     return (1 - share) * start + share * end

@@ -1,4 +1,4 @@
-"""Problems over a fixed interval: a mixture of catalysts, a chain that hangs."""
+"""Problems over a fixed interval: catalyst mixing and the hanging chain."""
 
 import jax.numpy as jnp
 
@@ -12,11 +12,12 @@ from ._base import FinalState, line, OptimalControl, Reach
 
 
 class CatalystMixing(AbstractSystem):
-    r"""A tube with two catalysts, whose mixture `u` varies along it:
+    r"""A tubular reactor with two catalysts, whose mixture $u$ varies along the tube.
 
-    `x_1' = u (k x_2 - x_1)`, `x_2' = u (x_1 - k x_2) - (1 - u) x_2`.
+    $$\dot x_1 = u (k x_2 - x_1), \qquad
+    \dot x_2 = u (x_1 - k x_2) - (1 - u) x_2$$
 
-    **Arguments:** `rate`: k, 10 by default.
+    **Arguments:** `rate`: $k$, 10 by default.
 
     Source: von Stryk, 1999; Dolan, More and Munson, 2004.
 
@@ -26,6 +27,10 @@ class CatalystMixing(AbstractSystem):
         import delucax as dlx
 
         dlx.problems.CatalystMixing(rate=9.0)
+        ```
+
+        ```text
+        CatalystMixing(rate=9.0)
         ```
     """
 
@@ -39,12 +44,15 @@ class CatalystMixing(AbstractSystem):
 
 
 def catalyst_mixing(steps: int = 100) -> OptimalControl:
-    r"""The least `-1 + x_1 + x_2` at time 1 from `(1, 0)`, with `0 <= u <= 1`. It is
-    -0.0480556.
+    r"""Mix two catalysts along a tube such that the most product leaves it.
 
-    It starts from a mixture of 0.5.
+    The final cost $-1 + x_1 + x_2$ at time 1 is minimised, from $(1, 0)$, with
+    $0 \le u \le 1$. The published minimum is -0.0480556. The first guess is a mixture
+    of 0.5.
 
-    **Arguments:** `steps`: T, 100 by default.
+    **Arguments:** `steps`: T, the number of steps, 100 by default.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: von Stryk, 1999; Dolan, More and Munson, 2004.
 
@@ -54,6 +62,10 @@ def catalyst_mixing(steps: int = 100) -> OptimalControl:
         import delucax as dlx
 
         dlx.problems.catalyst_mixing().bounds
+        ```
+
+        ```text
+        (0.0, 1.0)
         ```
     """
     T = check_count(steps, "steps", "catalyst_mixing")
@@ -68,10 +80,12 @@ def catalyst_mixing(steps: int = 100) -> OptimalControl:
 
 
 class HangingChain(AbstractSystem):
-    r"""The height `x` of a chain, its length and its potential energy along the ground,
-    with the slope `u` as the control:
+    r"""A hanging chain: its height $h$, length $s$ and potential energy $e$.
 
-    `x' = u`, `length' = sqrt(1 + u^2)`, `energy' = x sqrt(1 + u^2)`.
+    $$\dot h = u, \qquad \dot s = \sqrt{1 + u^2}, \qquad \dot e = h \sqrt{1 + u^2}$$
+
+    The independent variable is the horizontal position. The control $u$ is the slope of
+    the chain.
 
     Source: Cesari, 1983; Dolan, More and Munson, 2004.
 
@@ -81,6 +95,10 @@ class HangingChain(AbstractSystem):
         import delucax as dlx
 
         dlx.problems.HangingChain()
+        ```
+
+        ```text
+        HangingChain()
         ```
     """
 
@@ -92,12 +110,15 @@ class HangingChain(AbstractSystem):
 
 
 def hanging_chain(steps: int = 100) -> OptimalControl:
-    r"""The least potential energy of a chain of length 4 between the heights 1 at 0 and
-    3 at 1. It is 5.06848, that of a catenary; the benchmark gives 5.06891.
+    r"""Find the shape of a hanging chain, the one with the least potential energy.
 
-    It starts from a line between the ends, with its slope.
+    The chain has length 4 and hangs between the heights 1 at position 0 and 3 at
+    position 1. The minimum is 5.06848, the energy of the catenary. `reference` is the
+    published value, 5.06891. The first guess is a straight line between the ends.
 
-    **Arguments:** `steps`: T, 100 by default.
+    **Arguments:** `steps`: T, the number of steps, 100 by default.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Cesari, 1983; Dolan, More and Munson, 2004.
 
@@ -107,6 +128,10 @@ def hanging_chain(steps: int = 100) -> OptimalControl:
         import delucax as dlx
 
         dlx.problems.hanging_chain().states[-1]
+        ```
+
+        ```text
+        Array([3., 4., 8.], dtype=float32)
         ```
     """
     T = check_count(steps, "steps", "hanging_chain")

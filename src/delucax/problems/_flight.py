@@ -1,4 +1,4 @@
-"""Problems of flight: a rocket that climbs, a glider in an updraft."""
+"""Problems of flight: a climbing rocket, and a hang glider in an updraft."""
 
 import math
 
@@ -14,17 +14,20 @@ from ._base import FinalState, line, OptimalControl, Reach
 
 
 class GoddardRocket(AbstractSystem):
-    r"""A rocket that climbs through an atmosphere, in units of the radius of the earth,
-    its gravity and the first mass:
+    r"""A rocket that climbs through an atmosphere.
 
-    `h' = v`, `v' = (u - D) / m - 1 / h^2`, `m' = -u / c`, with the drag
-    `D = drag v^2 exp(-decay (h - 1))`.
+    $$\dot h = v, \qquad \dot v = \frac{u - D}{m} - \frac{1}{h^2}, \qquad
+    \dot m = -\frac{u}{c}, \qquad D = \mathrm{drag}\, v^2 e^{-\mathrm{decay}\,(h - 1)}$$
+
+    The height $h$ is the distance from the centre of the earth. The units are the
+    radius of the earth, its gravity, and the initial mass of the rocket.
 
     **Arguments:**
 
-    - `drag`: 310 by default.
-    - `decay`: of the density of the air with height, 500 by default.
-    - `exhaust`: the speed `c` of what it throws off, 0.5 by default.
+    - `drag`: the coefficient of the drag $D$, 310 by default.
+    - `decay`: the rate at which the density of the air falls with height, 500 by
+        default.
+    - `exhaust`: $c$, the exhaust speed, 0.5 by default.
 
     Source: Goddard, 1919; Bryson, 1999; Dolan, More and Munson, 2004.
 
@@ -34,6 +37,10 @@ class GoddardRocket(AbstractSystem):
         import delucax as dlx
 
         dlx.problems.GoddardRocket(drag=300.0)
+        ```
+
+        ```text
+        GoddardRocket(drag=300.0, decay=500.0, exhaust=0.5)
         ```
     """
 
@@ -50,15 +57,20 @@ class GoddardRocket(AbstractSystem):
 
 
 def goddard_rocket(steps: int = 100) -> OptimalControl:
-    r"""The greatest height at the end, with the mass 0.6 there, from rest at the height
-    1 with the mass 1, and `0 <= u <= 3.5`, `h >= 1`, `v >= 0`. The time is free. The
-    bounds `0.6 <= m <= 1` of the benchmark follow from the others. The height is
-    1.01283. The best thrust is full, then between its bounds (a singular arc), then
-    none.
+    r"""Climb as high as possible with the given fuel.
 
-    It starts from a line to the height 1.01, half thrust and a duration of 0.2.
+    The final height is maximised. The rocket starts at rest at height 1 with mass 1,
+    and ends with mass 0.6. The bounds are $0 \le u \le 3.5$, $h \ge 1$ and $v \ge 0$;
+    the duration is free. The bounds $0.6 \le m \le 1$ of the benchmark follow from
+    these. The published maximum is 1.01283. The optimal thrust is full at first, then
+    between its bounds (a singular arc), then zero.
 
-    **Arguments:** `steps`: T, 100 by default.
+    The first guess is a straight line to height 1.01, half thrust, and a duration of
+    0.2.
+
+    **Arguments:** `steps`: T, the number of steps, 100 by default.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Goddard, 1919; Bryson, 1999; Dolan, More and Munson, 2004.
 
@@ -67,7 +79,11 @@ def goddard_rocket(steps: int = 100) -> OptimalControl:
         ```python
         import delucax as dlx
 
-        dlx.problems.goddard_rocket().unknowns.duration
+        dlx.problems.goddard_rocket().reference
+        ```
+
+        ```text
+        1.01283
         ```
     """
     T = check_count(steps, "steps", "goddard_rocket")
@@ -88,24 +104,27 @@ def goddard_rocket(steps: int = 100) -> OptimalControl:
 
 
 class HangGlider(AbstractSystem):
-    r"""A hang glider that crosses an updraft, with the lift coefficient as its control:
+    r"""A hang glider that crosses an updraft. The control $u$ is the lift coefficient.
 
-    `x' = v_x`, `y' = v_y`, `v_x' = -(L sin eta + D cos eta) / m`,
-    `v_y' = (L cos eta - D sin eta) / m - g`,
+    $$\dot x = v_x, \quad \dot y = v_y, \quad
+    \dot v_x = -\frac{L \sin\eta + D \cos\eta}{m}, \quad
+    \dot v_y = \frac{L \cos\eta - D \sin\eta}{m} - g$$
 
-    in air that rises by `updraft (1 - r) exp(-r)`, `r = (x / 100 - 2.5)^2`. With the
-    velocity `(v_x, w)` relative to the air and its size `v`, `sin eta = w / v`,
-    `D = (drag + induced u^2) rho S v^2 / 2` and `L = u rho S v^2 / 2`. Lengths are in
-    metres, times in seconds.
+    $$D = \frac{(\mathrm{drag} + \mathrm{induced}\, u^2) \rho S v^2}{2}, \qquad
+    L = \frac{u \rho S v^2}{2}$$
+
+    The air rises with the speed $\mathrm{updraft}\,(1 - r) e^{-r}$, where
+    $r = (x / 100 - 2.5)^2$. Relative to the air, the velocity is $(v_x, w)$, its
+    magnitude is $v$, and $\sin\eta = w / v$. Lengths are in m, times in s.
 
     **Arguments:**
 
-    - `updraft`: [m/s], 2.5 by default.
-    - `mass`: [kg], 100 by default.
-    - `drag`, `induced`: the coefficients of drag, 0.034 and 0.069662 by default.
-    - `area`: S [m^2], 14 by default.
-    - `density`: rho [kg/m^3], 1.13 by default.
-    - `gravity`: [m/s^2], 9.81 by default.
+    - `updraft`: the largest speed of the updraft [m/s], 2.5 by default.
+    - `mass`: $m$ [kg], 100 by default.
+    - `drag`, `induced`: the drag coefficients, 0.034 and 0.069662 by default.
+    - `area`: $S$, the area of the wing [m^2], 14 by default.
+    - `density`: $\rho$, the density of the air [kg/m^3], 1.13 by default.
+    - `gravity`: $g$ [m/s^2], 9.81 by default.
 
     Source: Bulirsch, Nerz, Pesch and von Stryk, 1993; Dolan, More and Munson, 2004.
 
@@ -114,7 +133,11 @@ class HangGlider(AbstractSystem):
         ```python
         import delucax as dlx
 
-        dlx.problems.HangGlider(updraft=2.0)
+        dlx.problems.HangGlider(updraft=2.0).state_names
+        ```
+
+        ```text
+        ('x', 'y', 'v_x', 'v_y')
         ```
     """
 
@@ -133,7 +156,8 @@ class HangGlider(AbstractSystem):
         v_x, v_y = x[2], x[3]
         r = (x[0] / 100 - 2.5) ** 2
         rising = v_y - self.updraft * (1 - r) * jnp.exp(-r)
-        # The forces over the mass, each times the speed: no root of a zero is taken.
+        # The forces per mass are divided by the speed here and multiplied by the
+        # components of the velocity below, so no quotient by the speed is needed.
         speed = jnp.sqrt(v_x**2 + rising**2)
         size = self.density * self.area * speed / (2 * self.mass)
         drag = (self.drag + self.induced * u[0] ** 2) * size
@@ -144,16 +168,19 @@ class HangGlider(AbstractSystem):
 
 
 def hang_glider(steps: int = 200) -> OptimalControl:
-    r"""The greatest distance `x` at the end, from `(0, 1000)` down to a height of 900
-    with the same velocity `(13.23, -1.288)`, with `0 <= u <= 1.4`, `x >= 0` and
-    `v_x >= 0`. The time is free.
+    r"""Glide as far as possible through an updraft.
 
-    The distance is 1248.03 m (Betts). That of the benchmark, 1255.05 m, is an error of
-    its discretisation, by the trapezoidal rule.
+    The final distance $x$ is maximised. The glider starts at $(0, 1000)$ and ends at a
+    height of 900, both times with the velocity $(13.23, -1.288)$. The bounds are
+    $0 \le u \le 1.4$, $x \ge 0$ and $v_x \ge 0$; the duration is free.
 
-    It starts from a lift of 0.7 for 100 s.
+    The maximum is 1248.03 m (Betts). The benchmark gives 1255.05 m, which contains the
+    error of a discretisation by the trapezoidal rule. The first guess is a lift of 0.7
+    for 100 s.
 
-    **Arguments:** `steps`: T, 200 by default.
+    **Arguments:** `steps`: T, the number of steps, 200 by default.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Bulirsch, Nerz, Pesch and von Stryk, 1993; Betts, 2010; Dolan, More and
     Munson, 2004.
@@ -163,7 +190,11 @@ def hang_glider(steps: int = 200) -> OptimalControl:
         ```python
         import delucax as dlx
 
-        dlx.problems.hang_glider(50).dynamics.state_names
+        dlx.problems.hang_glider(50).reference
+        ```
+
+        ```text
+        1248.03
         ```
     """
     T = check_count(steps, "steps", "hang_glider")

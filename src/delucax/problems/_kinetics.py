@@ -1,6 +1,6 @@
-"""Problems of estimation: the rates of chemical reactions from measurements.
+"""Estimation problems: the rates of chemical reactions from measurements.
 
-The problems are least squares along a differential equation: the rates are unknown, and
+They are least-squares problems with a differential equation. The rates are unknown, and
 there is no control.
 """
 
@@ -23,13 +23,15 @@ from ._base import OptimalControl
 
 
 class Reactions(AbstractSystem):
-    """A system without controls, `dy/dt = f(rates, y)`.
+    r"""A system of chemical reactions, without controls.
+
+    $$\dot y = f(\mathrm{rates}, y)$$
 
     **Arguments:**
 
-    - `rates`: shape `(p,)`.
-    - `function`: `f(rates, y)`, which returns a vector of the size of `y`.
-    - `size`: of `y`.
+    - `rates`: the rates of the reactions, shape `(p,)`.
+    - `function`: the function $f$. It returns a vector of the size of `y`.
+    - `size`: the size of `y`.
 
     !!! example
 
@@ -39,6 +41,10 @@ class Reactions(AbstractSystem):
 
         decay = dlx.problems.Reactions(jnp.ones(1), lambda rates, y: -rates * y, 1)
         decay.vector_field(0.0, jnp.ones(1), jnp.zeros(0), None)
+        ```
+
+        ```text
+        Array([-1.], dtype=float32)
         ```
     """
 
@@ -57,13 +63,15 @@ class Reactions(AbstractSystem):
 
 
 class Sampled(AbstractDynamics):
-    """A discretised system whose step `k` takes the time `widths[k]`; its own time
-    counts the steps.
+    """A discretised system whose step `k` has the length `widths[k]`.
+
+    Its time counts the steps, so `dt` is 1 by default.
 
     **Arguments:**
 
-    - `inner`: a [`delucax.Discretized`][], whose `dt` does not matter.
-    - `widths`: of the steps, shape `(T,)`.
+    - `inner`: a [`delucax.Discretized`][] system. Its `dt` is not used.
+    - `widths`: the lengths of the steps, shape `(T,)`.
+    - `dt`: the step of the time that counts the steps, 1 by default.
 
     !!! example
 
@@ -74,6 +82,12 @@ class Sampled(AbstractDynamics):
         pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=1.0)
         sampled = dlx.problems.Sampled(pendulum, jnp.array([0.1, 0.3]))
         dlx.open_loop(sampled, jnp.array([0.1, 0.0]), jnp.zeros((2, 1)))
+        ```
+
+        ```text
+        Array([[0.1  , 0.   ],
+               [0.108, 0.153],
+               [0.244, 0.858]], dtype=float32)
         ```
     """
 
@@ -98,16 +112,19 @@ class Sampled(AbstractDynamics):
         return inner.advance(jnp.zeros_like(x[0]), x, u, None)
 
     def refined(self, points: int, inner: Callable[[Any], Any]) -> "Sampled":
-        """With each step cut into `points`, and another discretisation.
+        """The same dynamics with each step cut into parts, and another discretisation.
 
-        **Arguments:** `points`: a whole number. `inner`: from the old one to the new.
+        **Arguments:** `points`: the number of parts. `inner`: a function from the old
+        inner dynamics to the new.
+
+        **Returns:** a [`delucax.problems.Sampled`][].
         """
         widths = jnp.repeat(self.widths / points, points)
         return Sampled(inner(self.inner), widths)
 
 
 class Residuals(AbstractCost):
-    """The squares of the differences of the states and measurements."""
+    """The squared differences between the states and the measurements."""
 
     data: Float[Array, "points n"] = parameter()
 
@@ -129,8 +146,8 @@ def _estimated(
     substeps: int,
     reference: float,
 ) -> OptimalControl:
-    """The problem of the rates, which are not negative, from the first values and
-    measurements after them, which are the states to start from too."""
+    """The problem of estimating nonnegative rates from measurements. The measurements
+    are also the first state and the first guess of the states."""
     data = jnp.asarray(np.asarray(data, float))
     system = Reactions(jnp.array(rates), function, data.shape[1])
     inner = Discretized(system, 1.0, substeps=substeps)
@@ -146,11 +163,15 @@ def _estimated(
 
 
 def gas_oil_cracking() -> OptimalControl:
-    r"""The rates of the cracking of gas oil, from 20 measurements:
+    r"""Estimate the rates $(a, b, c)$ of the cracking of gas oil from 20 measurements.
 
-    `y_1' = -(a + c) y_1^2`, `y_2' = a y_1^2 - b y_2` from `(1, 0)`.
+    $$\dot y_1 = -(a + c) y_1^2, \qquad \dot y_2 = a y_1^2 - b y_2, \qquad
+    y(0) = (1, 0)$$
 
-    The sum of squares is 5.2366e-3. It starts from the measurements and rates of 1.
+    The published sum of squares is 5.2366e-3. The first guess consists of the
+    measurements and of rates of 1.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Tjoa and Biegler, 1991; Dolan, More and Munson, 2004.
 
@@ -159,7 +180,11 @@ def gas_oil_cracking() -> OptimalControl:
         ```python
         import delucax as dlx
 
-        dlx.problems.gas_oil_cracking().unknowns.parameters
+        dlx.problems.gas_oil_cracking().x0
+        ```
+
+        ```text
+        Array([1., 0.], dtype=float32)
         ```
     """
     times = [0.0, 0.025, 0.05, 0.075, 0.1, 0.125, 0.15, 0.175, 0.2, 0.225, 0.25, 0.3]
@@ -180,13 +205,17 @@ def _gas_oil(rates: Array, y: Array) -> Array:
 
 
 def methanol_to_hydrocarbons() -> OptimalControl:
-    r"""The rates of the conversion of methanol, from 16 measurements. With
-    `q = (b + e) y_1 + y_2`,
+    r"""Estimate the rates of the conversion of methanol to hydrocarbons.
 
-    `y_1' = -(2 b - a y_2 / q + c + d) y_1`, `y_2' = a y_1 (b y_1 - y_2) / q + c y_1`,
-    `y_3' = a y_1 (y_2 + e y_1) / q + d y_1` from `(1, 0, 0)`.
+    $$\dot y_1 = -\left(2 b - \frac{a y_2}{q} + c + d\right) y_1, \quad
+    \dot y_2 = \frac{a y_1 (b y_1 - y_2)}{q} + c y_1, \quad
+    \dot y_3 = \frac{a y_1 (y_2 + e y_1)}{q} + d y_1$$
 
-    The sum of squares is 9.02229e-3. It starts from the measurements and rates of 1.
+    Here $q = (b + e) y_1 + y_2$ and $y(0) = (1, 0, 0)$. The rates $(a, b, c, d, e)$ are
+    estimated from 16 measurements. The published sum of squares is 9.02229e-3. The
+    first guess consists of the measurements and of rates of 1.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Maria, 1989; Dolan, More and Munson, 2004.
 
@@ -195,7 +224,11 @@ def methanol_to_hydrocarbons() -> OptimalControl:
         ```python
         import delucax as dlx
 
-        dlx.problems.methanol_to_hydrocarbons().dynamics.widths
+        dlx.problems.methanol_to_hydrocarbons().dynamics.widths[:3]
+        ```
+
+        ```text
+        Array([0.05 , 0.015, 0.015], dtype=float32)
         ```
     """
     times = [0.0, 0.05, 0.065, 0.08, 0.123, 0.233, 0.273, 0.354, 0.397, 0.418, 0.502]
@@ -223,13 +256,17 @@ def _methanol(rates: Array, y: Array) -> Array:
 
 
 def alpha_pinene() -> OptimalControl:
-    r"""The rates of the thermal isomerisation of alpha-pinene, from 8 measurements:
+    r"""Estimate the rates of the thermal isomerisation of alpha-pinene.
 
-    `y_1' = -(a + b) y_1`, `y_2' = a y_1`, `y_3' = b y_1 - (c + d) y_3 + e y_5`,
-    `y_4' = c y_3`, `y_5' = d y_3 - e y_5` from `(100, 0, 0, 0, 0)`.
+    $$\dot y_1 = -(a + b) y_1, \quad \dot y_2 = a y_1, \quad
+    \dot y_3 = b y_1 - (c + d) y_3 + e y_5, \quad \dot y_4 = c y_3, \quad
+    \dot y_5 = d y_3 - e y_5$$
 
-    The sum of squares is 19.8721. It starts from the measurements and rates of 1e-5 per
-    minute.
+    The first state is $(100, 0, 0, 0, 0)$. The rates $(a, b, c, d, e)$ are estimated
+    from 8 measurements. The published sum of squares is 19.8721. The first guess
+    consists of the measurements and of rates of 1e-5 per minute.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Box, Hunter, MacGregor and Erjavec, 1973; Dolan, More and Munson, 2004.
 
@@ -238,7 +275,11 @@ def alpha_pinene() -> OptimalControl:
         ```python
         import delucax as dlx
 
-        dlx.problems.alpha_pinene().states
+        dlx.problems.alpha_pinene().states[1]
+        ```
+
+        ```text
+        Array([88.35,  7.3 ,  2.3 ,  0.4 ,  1.75], dtype=float32)
         ```
     """
     times = [0.0, 1230.0, 3060.0, 4920.0, 7800.0, 10680.0, 15030.0, 22620.0, 36420.0]

@@ -1,4 +1,4 @@
-"""Problems of least time: a particle that is steered, a robot arm."""
+"""Minimum-time problems: particle steering and a robot arm."""
 
 import math
 from typing import Any
@@ -15,11 +15,12 @@ from ._base import FinalState, line, OptimalControl, Reach
 
 
 class ParticleSteering(AbstractSystem):
-    r"""A particle under a force of constant size whose direction is steered:
+    r"""A particle under a constant force. The control $u$ is the angle of the force.
 
-    `dx/dt = v_x`, `dy/dt = v_y`, `dv_x/dt = a cos u`, `dv_y/dt = a sin u`.
+    $$\dot x = v_x, \qquad \dot y = v_y, \qquad \dot v_x = a \cos u, \qquad
+    \dot v_y = a \sin u$$
 
-    **Arguments:** `acceleration`: `a`, 100 by default.
+    **Arguments:** `acceleration`: $a$, 100 by default.
 
     Source: Bryson and Ho, 1975; Dolan, More and Munson, 2004.
 
@@ -29,6 +30,10 @@ class ParticleSteering(AbstractSystem):
         import delucax as dlx
 
         dlx.problems.ParticleSteering(acceleration=50.0)
+        ```
+
+        ```text
+        ParticleSteering(acceleration=50.0)
         ```
     """
 
@@ -42,12 +47,15 @@ class ParticleSteering(AbstractSystem):
 
 
 def particle_steering(steps: int = 100) -> OptimalControl:
-    r"""From rest at the origin to `y = 5` with `v = (45, 0)` in the least time, with
-    `|u| <= pi / 2`. It takes 0.554577.
+    r"""Steer a particle to a height and a velocity in the least time.
 
-    It starts from a line between the ends, an angle of zero and a duration of 1.
+    The particle starts at rest at the origin. It ends at $y = 5$ with the velocity
+    $(45, 0)$, and $|u| \le \pi / 2$. The published minimum time is 0.554577. The first
+    guess is a straight line between the ends, an angle of zero, and a duration of 1.
 
-    **Arguments:** `steps`: T, 100 by default.
+    **Arguments:** `steps`: T, the number of steps, 100 by default.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Bryson and Ho, 1975; Dolan, More and Munson, 2004.
 
@@ -58,6 +66,10 @@ def particle_steering(steps: int = 100) -> OptimalControl:
 
         problem = dlx.problems.particle_steering(steps=20)
         problem.horizon, problem.reference
+        ```
+
+        ```text
+        (20, 0.554577)
         ```
     """
     T = check_count(steps, "steps", "particle_steering")
@@ -75,13 +87,16 @@ def particle_steering(steps: int = 100) -> OptimalControl:
 
 
 class RobotArm(AbstractSystem):
-    r"""A robot arm that slides, turns and lifts. Its parts of length `rho` and
-    `L - rho` have the inertia of thin rods:
+    r"""A robot arm that slides, turns and lifts.
 
-    `rho'' = u_1 / L`, `theta'' = u_2 / I_theta`, `phi'' = u_3 / I_phi`, with
-    `I_phi = ((L - rho)^3 + rho^3) / 3` and `I_theta = I_phi sin(phi)^2`.
+    $$\ddot\rho = \frac{u_1}{L}, \quad \ddot\theta = \frac{u_2}{I_\theta}, \quad
+    \ddot\phi = \frac{u_3}{I_\phi}, \quad
+    I_\phi = \frac{(L - \rho)^3 + \rho^3}{3}, \quad I_\theta = I_\phi \sin^2 \phi$$
 
-    **Arguments:** `length`: `L`, 5 by default.
+    The two parts of the arm, of length $\rho$ and $L - \rho$, have the inertia of thin
+    rods.
+
+    **Arguments:** `length`: $L$, 5 by default.
 
     Source: Moessner-Beigel, 1995; Dolan, More and Munson, 2004.
 
@@ -91,6 +106,10 @@ class RobotArm(AbstractSystem):
         import delucax as dlx
 
         dlx.problems.RobotArm(length=4.0)
+        ```
+
+        ```text
+        RobotArm(length=4.0)
         ```
     """
 
@@ -107,15 +126,19 @@ class RobotArm(AbstractSystem):
 
 
 def robot_arm(steps: int = 90) -> OptimalControl:
-    r"""From `(4.5, 0, pi/4)` to `(4.5, 2 pi/3, pi/4)`, at rest at both, in the least
-    time, with `|u| <= 1`, `0 <= rho <= L`, `|theta| <= pi`, `0 <= phi <= pi`. It takes
-    9.14138.
+    r"""Turn a robot arm from rest to rest in the least time.
 
-    It starts from a line between the ends, controls of zero and a duration of 10. The
-    bound of `rho` is 5, whatever the `length`. With some numbers of steps, 100 for one,
-    a control switches exactly at a step; the derivatives of the solution are NaN then.
+    The arm moves from $(\rho, \theta, \phi) = (4.5, 0, \pi/4)$ to $(4.5, 2\pi/3,
+    \pi/4)$. The bounds are $|u| \le 1$, $0 \le \rho \le 5$, $|\theta| \le \pi$ and
+    $0 \le \phi \le \pi$. The published minimum time is 9.14138. The first guess is a
+    straight line between the ends, controls of zero, and a duration of 10.
 
-    **Arguments:** `steps`: T, 90 by default.
+    For some numbers of steps, for example 100, a control switches exactly at a step.
+    The derivatives of the solution are then NaN.
+
+    **Arguments:** `steps`: T, the number of steps, 90 by default.
+
+    **Returns:** a [`delucax.problems.OptimalControl`][].
 
     Source: Moessner-Beigel, 1995; Dolan, More and Munson, 2004.
 
@@ -124,7 +147,11 @@ def robot_arm(steps: int = 90) -> OptimalControl:
         ```python
         import delucax as dlx
 
-        dlx.problems.robot_arm().constraints.states
+        dlx.problems.robot_arm().bounds
+        ```
+
+        ```text
+        (-1.0, 1.0)
         ```
     """
     T = check_count(steps, "steps", "robot_arm")

@@ -30,7 +30,7 @@ class Prior(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """The parameters and first states of an iterate, its residuals and sensitivities."""
+    """An iterate: parameters and first states, with residuals and sensitivities."""
 
     theta: Float[Array, " p"]
     starts: Float[Array, "windows n"]

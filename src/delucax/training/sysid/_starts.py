@@ -26,7 +26,7 @@ _MAX_STEPS = 30
 def guessed_starts(
     dynamics: AbstractDynamics, x0: Any, groups: list[Record], where: str
 ) -> list[Float[Array, "_ n"]]:
-    """A guess of the first state of each record: `x0`, or else the first measurement."""
+    """A guess of the first state of each record: `x0`, or the first measurement."""
     n, sizes = dynamics.state_size, [len(group.outputs) for group in groups]
     if x0 is None:
         if groups[0].outputs.shape[2] == n:
