@@ -104,8 +104,8 @@ def observed(m: Array, P: Array, rows: Rows) -> tuple[Array, Array, tuple]:
 
 
 def _unrolled(count: int) -> int:
-    """The number of rows to unroll. A nested loop is slow, but many unrolled rows make a
-    long program."""
+    """The number of rows to unroll. A nested loop is slow, and many unrolled rows are
+    a long program."""
     return count if count <= _WRITTEN_OUT else 1
 
 
