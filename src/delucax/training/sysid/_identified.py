@@ -77,6 +77,17 @@ class Identified(eqx.Module):
         fit = dlx.training.sysid.linear(record)
         print(fit.report())
         ```
+
+        ```text
+        parameter                   estimate         low        high
+        output 0: x0                  0.9006      0.8958      0.9055
+        output 0: x1                  0.1022      0.0997      0.1046
+        output 0: u0                  0.0019     -0.0012      0.0050
+        output 1: x0                 -0.0012     -0.0057      0.0033
+        output 1: x1                  0.8005      0.7982      0.8028
+        output 1: u0                  0.9988      0.9959      1.0017
+        all directions are identifiable
+        ```
     """
 
     model: Any

@@ -84,8 +84,8 @@ def physical(
 
     - `dynamics`: the dynamics; their parameters are the first guess. If the step of the
         record differs from that of the dynamics, or if the controls are interpolated,
-        they must be a [`delucax.Discretized`][] system. Its step, with the same solver
-        and substeps, is then stretched to each step of the record.
+        they must be a [`delucax.Discretized`][] system without events. Its step, with
+        the same solver and substeps, is then stretched to each step of the record.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
         of paths, or a dictionary from path to constraint, as `trainable` of
