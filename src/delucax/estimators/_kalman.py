@@ -277,7 +277,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
         ```
 
         ```text
-        Array([0.1], dtype=float32)
+        Array([0.1009, 0.0746], dtype=float32)
         ```
     """
 
