@@ -243,8 +243,8 @@ class AbstractGaussianFilter(AbstractEstimator):
         return self._transition(t, u.astype(belief.mean.dtype), belief)
 
     def _smoothed(self, t, u, belief, after):
-        """One step of the backward pass: the belief given all data. `after` is that of
-        the next state."""
+        """One step of the backward pass: the smoothed belief, from the smoothed belief
+        `after` of the next state."""
         joint = self._prediction(t, u, belief)
         # This is G_k = P_k A' Sigma_{k+1}^-1.
         G = joint.gain()

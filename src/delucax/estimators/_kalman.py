@@ -52,12 +52,12 @@ class KalmanFilter(AbstractGaussianFilter):
 
     - `dynamics`: linear dynamics, time-invariant or time-varying.
     - `W`: covariance of the disturbance `w`, shape `(k, k)`, symmetric, semidefinite.
-        If the dynamics have no `E`, it is the covariance added to that of the state.
+        If the dynamics have no `E`, a step adds `W` itself to the covariance.
     - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
     - `mean`: mean of the first state, shape `(n,)`; `x_ref` by default.
     - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
-        symmetric, semidefinite; the identity by default. With `steady_state` it is that
-        of the steady state, and must not be given.
+        symmetric, semidefinite; the identity by default. Do not give it together with
+        `steady_state`, which computes it.
     - `steady_state`: whether to use the gain of the steady state at all times; false by
         default.
     - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by

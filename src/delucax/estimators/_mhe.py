@@ -37,8 +37,8 @@ class MHE(AbstractEstimator):
     estimated together with the states. The prior $(\bar x, P)$ of the first state comes
     from an extended Kalman filter, linearised about the states of the window. It leaves
     out the observations of the window, so that none counts twice (the filtering
-    update). For linear dynamics without active bounds, the estimate is that of the
-    [`delucax.estimators.KalmanFilter`][], whatever the window.
+    update). For linear dynamics without active bounds, the estimate is the same as with
+    a [`delucax.estimators.KalmanFilter`][], whatever the window.
 
     By default, an update makes one full Gauss-Newton step from the previous solution,
     shifted by a step (the real-time iteration). If `iterations` is above 1, it makes
@@ -46,13 +46,13 @@ class MHE(AbstractEstimator):
     window and a pass back. All covariances may be singular, for example for a known
     state, a constant parameter or a perfect sensor. Active bounds are treated as
     perfect observations, and finding them takes more passes. The covariance of the
-    estimate is that of the forward pass without bounds.
+    estimate comes from the forward pass without bounds.
 
     The estimate is differentiable with respect to the weights, the prior, the bounds
-    and the dynamics, in forward and reverse mode. The derivative is that of the steps,
-    with the active bounds fixed. It jumps when a bound becomes active, or when a
-    residual crosses the threshold of `robust`. Under `jax.vmap`, a batch makes as many
-    passes as the member that needs the most.
+    and the dynamics, in forward and reverse mode. The steps are differentiated as they
+    were made, with the active bounds fixed. The derivative jumps when a bound becomes
+    active, or when a residual crosses the threshold of `robust`. Under `jax.vmap`, a
+    batch makes as many passes as the member that needs the most.
 
     **Arguments:**
 

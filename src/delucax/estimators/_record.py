@@ -59,9 +59,9 @@ def run_estimator(
 
     **Returns:** an object with
 
-    - `predicted`: the belief of each state before it is observed, and last that of the
-        state after the last control; a [`delucax.estimators.Belief`][] with a leading
-        axis of size `T + 1`;
+    - `predicted`: the belief of each state before it is observed, and of the state
+        after the last control; a [`delucax.estimators.Belief`][] with a leading axis of
+        size `T + 1`;
     - `updated`: the belief of each state after it is observed, with a leading axis of
         size `T`;
     - `states`: the state of the estimator after each update, with a leading axis of

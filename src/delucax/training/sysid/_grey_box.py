@@ -118,8 +118,8 @@ def grey_box(
     - `width`, `depth`: units in each hidden layer and number of hidden layers of the
         network, 8 and 1 by default.
     - `corrected`: the names of the states whose derivatives the network corrects; all
-        by default. Leave out derivatives that are known exactly, such as that of a
-        position. The size of each correction is the standard deviation of the
+        by default. Leave out derivatives that are known exactly, such as the derivative
+        of a position. The size of each correction is the standard deviation of the
         derivative along the record.
     - `spreads`: the spreads to try; 0.01, 0.03, 0.1 and 0.3 by default.
     - `x0`, `window`: as in `physical`; a `window` of `None` takes each record as one

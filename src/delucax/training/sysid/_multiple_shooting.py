@@ -128,7 +128,7 @@ def solve(
     known = prior_rows(theta, units[0])
     _, on_starts, _, on_theta, by_theta = _projected(by_theta, by_start, known, eps)
     size = data.observations.shape[2]
-    # The degrees of freedom: the number of observations less that of the unknowns.
+    # The degrees of freedom: the number of observations less the number of unknowns.
     unknown = p + (starts.size if estimates_starts else 0)
     free = jnp.maximum(jnp.sum(data.counts) * size - unknown, 1)
     sigma = jnp.sqrt(jnp.sum(best.residuals**2) / free)

@@ -82,10 +82,10 @@ def physical(
 
     **Arguments:**
 
-    - `dynamics`: the dynamics; their parameters are the first guess. If the step of the
-        record differs from that of the dynamics, or if the controls are interpolated,
-        they must be a [`delucax.Discretized`][] system without events. Its step, with
-        the same solver and substeps, is then stretched to each step of the record.
+    - `dynamics`: the dynamics; their parameters are the first guess. If the dynamics
+        and the record have different steps, or if the controls are interpolated, the
+        dynamics must be a [`delucax.Discretized`][] system without events. Its step,
+        with the same solver and substeps, is then stretched to each step of the record.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
         of paths, or a dictionary from path to constraint, as `trainable` of
@@ -191,8 +191,8 @@ def physical(
     unknown = len(names) + n * at[-1] * estimates_starts
     few = bool(size * sum(map(len, records)) <= unknown)
     solution = fit(values, guesses, window)
-    # A second attempt, unless the values are traced, if the first did not converge or
-    # its residuals are correlated, which white noise is not.
+    # Make a second attempt if the first did not converge or its residuals are
+    # correlated. Under a trace this is not known, and there is none.
     is_observed = size == n
     # If the state is measured but x0 is given, the windows start as the caller asked.
     has_rungs = estimates_starts and not few and (x0 is None or not is_observed)
