@@ -103,6 +103,8 @@ def test_tables(tmp_path):
         (LINES.replace("4,5,a", "4"), "got '' in line 4, column 'pump'"),
         (LINES, "times must increase, but 0 in row 3 is before 1 in row 2"),
         ("", "must be a text file whose first line names the columns"),
+        ("t,level,pump,run\n", "must have rows of numbers below its first line"),
+        (LINES.replace("run", "t"), "must have one column 't', got "),
     ],
 )
 def test_bad_tables(tmp_path, text, match):
@@ -112,8 +114,9 @@ def test_bad_tables(tmp_path, text, match):
         sysid.read_csv(path, **NAMES)
     with user_error(match="frame must be a data frame or a dictionary of .*got 3"):
         sysid.from_frame(3, **NAMES)
-    with user_error(match="must have numbers in column 'level'"):
-        sysid.from_frame({"level": ["a"], "pump": [1], "t": [0]}, **NAMES)
+    table = {"level": [1, "a"], "pump": [1, 2], "t": [0, 1]}
+    with user_error(match="must have numbers, got .*'a'.* in row 1, column 'level'"):
+        sysid.from_frame(table, **NAMES)
 
 
 def test_numpy_is_enough():

@@ -123,6 +123,12 @@ def test_bad_records():
         wrong[row] = time
         with user_error(match=f"times must increase, but .* in row {what}"):
             record(dt=None, times=wrong)
+    late = times + 40.0 * (np.arange(len(times)) > 8)
+    with user_error(match="gap of 41 between rows 8 and 9; .* at most 1"):
+        record(dt=None, times=late)
+    assert record(dt=None, times=late, allow_gaps=True).steps[8] == 41
+    with user_error(match="column 0 of outputs is 2 in all 5 rows"):
+        sysid.Record(np.full(5, 2.0), np.arange(5.0), dt=0.1)
     with user_error(match="samples must be uniform in time, but those of record"):
         sysid.linear(record(dt=None, times=times**1.5))
     with user_error(match="must be a delucax.Discretized system without events"):
@@ -132,7 +138,7 @@ def test_bad_records():
 
 @once
 def test_a_record_is_a_pytree():
-    record = sysid.Record(np.ones((5, 1)), np.arange(5.0), dt=0.1)
+    record = sysid.Record(np.arange(1.0, 6.0), np.arange(5.0), dt=0.1)
     doubled = eqx.filter_jit(lambda r: jax.tree.map(lambda a: 2 * a, r))(record)
     assert_close(doubled.controls[:, 0], 2 * np.arange(5.0))
     first, second = record.split(0.6)
@@ -201,9 +207,10 @@ def test_bootstrap():
     rows = np.concatenate([past, np.ones_like(past)], axis=1)
     std = fitted.noise[0] * np.sqrt(np.linalg.inv(rows.T @ rows)[0, 0])
     assert_close(fitted.std, std, rtol=1e-6)
-    drawn = functools.partial(sysid.bootstrap, fitted, record, window=None)
+    drawn = functools.partial(sysid.bootstrap, fitted, record)
     again = drawn(draws=200, key=jax.random.key(0))
     assert again.failures == 0 and again.names == fitted.names
+    assert repr(again).endswith("0 of 200 fits failed")
     # The standard deviation of 200 draws is known to 5%.
     assert_close(again.std, std, rtol=0.2)
     assert_close(again.low, fitted.low, atol=float(std))

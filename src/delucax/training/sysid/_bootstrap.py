@@ -10,7 +10,14 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..._check import check_at_most, check_count, check_instance, check_key, check_range
+from ..._check import (
+    check_at_most,
+    check_count,
+    check_instance,
+    check_key,
+    check_range,
+    is_concrete,
+)
 from ..._module import as_float_array
 from ..._results import RESULTS
 from ..._typing import PRNGKey
@@ -30,6 +37,8 @@ _AT_ONCE = 20
 
 class Bootstrap(NamedTuple):
     """The estimates from resampled records, and their confidence intervals.
+
+    Printing the object prints a table.
 
     **Attributes:**
 
@@ -65,6 +74,16 @@ class Bootstrap(NamedTuple):
     high: Float[Array, " p"]
     failures: Any
 
+    def __repr__(self):
+        if not is_concrete(self.std) or jnp.ndim(self.std) != 1:
+            return tuple.__repr__(self)
+        head = ("parameter", "std", "low", "high")
+        lines = ["{:<24}{:>12}{:>12}{:>12}".format(*head)]
+        for name, *ends in zip(self.names, self.std, self.low, self.high, strict=True):
+            lines.append(f"{name:<24}" + "".join(f"{float(e):>12.5g}" for e in ends))
+        lines.append(f"{int(self.failures)} of {len(self.estimates)} fits failed")
+        return "\n".join(lines)
+
 
 def bootstrap(
     fitted: Identified,
@@ -73,7 +92,7 @@ def bootstrap(
     *,
     draws: int = 100,
     block: int = 1,
-    window: int | None = 20,
+    window: int | None = None,
     level: Any = 0.95,
     max_steps: int = 20,
     key: PRNGKey,
@@ -102,8 +121,7 @@ def bootstrap(
     - `block`: the number of neighbouring residuals that are drawn together, 1 by
         default. Take several times the number of samples over which the noise is
         correlated.
-    - `window`: the window of the fit in steps, 20 by default; `None` takes each record
-        as one window.
+    - `window`: the window of each fit in steps; by default that of `fitted`.
     - `level`: the confidence level, 0.95 by default.
     - `max_steps`: the maximum number of iterations of each fit, 20 by default.
     - `key`: a random key.
@@ -151,8 +169,8 @@ def bootstrap(
         parameters = sorted({name.split("[")[0] for name in fitted.names})
     model, x0 = fitted.model, fitted.x0
     longest = max(map(len, records)) - 1
-    whole = longest if window is None else check_count(window, "window", _WHERE)
-    window = min(whole, longest)
+    window = fitted.window if window is None else window
+    window = min(check_count(window, "window", _WHERE), longest)
     sampling, groups, rows = sampling_of(model, records, _WHERE)
     firsts = x0[None] if isinstance(record, Record) else x0
     firsts = guessed_starts(model, firsts, groups, _WHERE)
@@ -163,7 +181,8 @@ def bootstrap(
     unknown = len(fitted.names) + x0.size
     total = sum(map(len, records)) * outputs[0].shape[1]
     residuals = residuals * np.sqrt(total / max(total - unknown, 1))
-    options: Any = dict(x0=x0, window=window, max_steps=max_steps, throw=False)
+    options: Any = dict(x0=x0, window=window, burn_in=fitted.burn_in)
+    options |= dict(max_steps=max_steps, throw=False)
 
     def one(key):
         made = []

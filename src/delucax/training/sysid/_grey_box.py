@@ -18,7 +18,7 @@ from ..._check import (
     check_positive,
     check_range,
 )
-from ..._results import RESULTS
+from ..._results import Result, RESULTS
 from ..._typing import PRNGKey
 from ...dynamics import Discretized
 from ...systems import Corrected
@@ -53,6 +53,11 @@ class GreyBox(NamedTuple):
         root-mean-square error of a free run over the last part of the records. The
         entry of 0 is the physics alone.
     - `spread`: the spread that was chosen; 0 for the physics alone.
+    - `result`: success, or the reason why the last fit ended before it had converged.
+        The model is then the best so far: raise `max_steps`.
+
+    The intervals in `physics` are those of the physics alone. The parameters in `model`
+    were estimated together with the network, and have no intervals.
 
     !!! example
 
@@ -61,7 +66,8 @@ class GreyBox(NamedTuple):
 
         field = dlx.systems.Pendulum()
         physics = dlx.Discretized(field, dt=0.05)
-        dlx.training.sysid.GreyBox(physics, None, {0.0: 0.1}, 0.0).spread
+        done = dlx.RESULTS.successful
+        dlx.training.sysid.GreyBox(physics, None, {0.0: 0.1}, 0.0, done).spread
         ```
 
         ```text
@@ -73,6 +79,7 @@ class GreyBox(NamedTuple):
     physics: Identified
     errors: dict[float, float]
     spread: float
+    result: Result
 
 
 def grey_box(
@@ -205,11 +212,11 @@ def grey_box(
     if errors[spread] > (1 - _WORTH) * errors[0.0]:
         spread = 0.0
     if spread == 0.0:
-        return GreyBox(plain, physics, errors, spread)
+        return GreyBox(plain, physics, errors, spread, result)
     chosen, prior = solutions[spread], _prior(values, spread, depth)
     begin = chosen.values, chosen.starts
     final = solve(assembly, *begin, data, sampling, most, prior)
-    return GreyBox(assembly(final.values), physics, errors, spread)
+    return GreyBox(assembly(final.values), physics, errors, spread, final.result)
 
 
 @eqx.filter_jit

@@ -58,6 +58,7 @@ class Identified(eqx.Module):
         errors, or less than half of the `noise` that was given; `None` in linear fits.
     - `x0`: the estimated first state, shape `(n,)`, or `(runs, n)` for a list of
         records; `None` in linear fits, which do not estimate it.
+    - `window`, `burn_in`: those of the fit, in steps; `None` and 0 in linear fits.
     - `result`: success; `RESULTS.unexciting` if a direction is not identifiable; or the
         failure of the solver.
 
@@ -103,6 +104,8 @@ class Identified(eqx.Module):
     correlation: Float[Array, ""] | None
     x0: Float[Array, "*runs n"] | None
     result: Result
+    window: int | None = eqx.field(static=True, default=None)
+    burn_in: int = eqx.field(static=True, default=0)
 
     def __repr__(self):
         result: Any = self.result
@@ -144,14 +147,19 @@ class Identified(eqx.Module):
         return "\n".join(lines)
 
 
-def checked(fit: Identified, throw: bool) -> Identified:
+def checked(fit: Identified, throw: bool, where: str) -> Identified:
     """`fit` with its final result, and without intervals if the solver failed."""
     intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]
     judged = lambda fit: [*intervals(fit), fit.identifiable, fit.result]
     given = fit.estimate, fit.identifiable, fit.result, intervals(fit)
     fit = eqx.tree_at(judged, fit, _judged(*given))
     result: Any = fit.result
-    return result.error_if(fit, result != RESULTS.successful) if throw else fit
+    if not throw:
+        return fit
+    if is_concrete(fit.estimate) and result != RESULTS.successful:
+        # The table names the directions that are not identifiable.
+        raise RuntimeError(f"{where}: {RESULTS[result]}\n\n{fit.report()}")
+    return result.error_if(fit, result != RESULTS.successful)
 
 
 @eqx.filter_jit

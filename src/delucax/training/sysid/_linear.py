@@ -249,7 +249,7 @@ def _fitted(
         x0=None,
         result=RESULTS.successful,
     )
-    return checked(fit, throw)
+    return checked(fit, throw, "sysid.linear")
 
 
 def _realised(estimate, p, m, a, b, delay) -> dict[str, Any]:

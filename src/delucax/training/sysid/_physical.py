@@ -65,7 +65,10 @@ def physical(
     simulated with the recorded controls, from the state $z_j$ at its beginning. These
     states are estimated together with the parameters, so that measurement noise does
     not bias the estimate. Short windows keep a simulation with wrong parameters from
-    drifting far from the record.
+    drifting far from the record. Unlike in the original method, nothing ties the end of
+    a window to the beginning of the next, so each window costs the information of one
+    state. If some states are not measured, `window=None` is often several times as
+    precise; a fit on short windows gives it a good first guess.
 
     The method is Levenberg-Marquardt. Its steps are scaled by the sensitivities of the
     data, so that parameters of very different size can be estimated together.
@@ -110,7 +113,8 @@ def physical(
     or of each record.
 
     **Raises:** `ValueError` on arguments of the wrong shape or kind, or if there is no
-    such parameter; an error at run time as `throw` says.
+    such parameter; if `throw`, also if the record has fewer measurements than unknowns,
+    and `RuntimeError` if the fit fails (under a transformation, an error at run time).
 
     Source: Bock, 1983 (multiple shooting); Moré, 1978 (scaling); Ljung, 1999.
 
@@ -189,7 +193,15 @@ def physical(
     counts = [len(begins_of(g, window)) for g in groups for _ in g.outputs]
     at = np.cumsum([0, *counts])
     unknown = len(names) + n * at[-1] * estimates_starts
-    few = bool(size * sum(map(len, records)) <= unknown)
+    measured = size * sum(map(len, records))
+    few = bool(measured <= unknown)
+    if few and throw:
+        states = unknown - len(names)
+        raise ValueError(
+            f"{where}: record must have more measurements than unknowns, got "
+            f"{measured} for {len(names)} parameters and {states} states at which "
+            "windows begin. Record more, fit less, or take longer windows."
+        )
     solution = fit(values, guesses, window)
     # Make a second attempt if the first did not converge or its residuals are
     # correlated. Under a trace this is not known, and there is none.
@@ -226,11 +238,13 @@ def physical(
         noise=solution.noise,
         correlation=solution.correlation,
         x0=starts[0] if isinstance(record, Record) else starts,
+        window=window,
+        burn_in=burn_in,
         # With too few data the iteration may not converge. `checked` then reports that
         # the parameters are not identifiable.
         result=RESULTS.successful if few else solution.result,
     )
-    return checked(fitted, throw)
+    return checked(fitted, throw, where)
 
 
 def _rungs(window: int, is_observed: bool) -> list[int]:

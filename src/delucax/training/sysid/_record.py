@@ -11,7 +11,13 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._check import check_choice, check_instance, check_step, is_concrete
+from ..._check import (
+    check_bool,
+    check_choice,
+    check_instance,
+    check_step,
+    is_concrete,
+)
 from ..._message import shortened
 from ..._module import as_float_array, shown
 
@@ -21,6 +27,8 @@ _WHERE = "Record"
 _HOLDS = {"zero": 0, "linear": 1, "cubic": 3}
 # Times are uniform if their steps differ by less than this share.
 _UNEVEN = 1e-4
+# A gap is a step so many times as long as this quantile of the steps.
+_GAP, _USUAL = 5, 0.9
 
 
 class Record(eqx.Module):
@@ -35,6 +43,8 @@ class Record(eqx.Module):
         may have one row less, as in a simulation.
     - `dt`: the time between two samples, for uniform samples; or
     - `times`: the times of the samples, shape `(N,)`, increasing. Steps may differ.
+    - `allow_gaps`: accept gaps in `times`; false by default. A gap is a step that is
+        longer than five times nine tenths of the others.
     - `hold`: the control between two samples, `"zero"` by default:
         - `"zero"`: the control of the sample before, as a digital controller holds it;
         - `"linear"`: the straight line between the two samples;
@@ -42,8 +52,8 @@ class Record(eqx.Module):
             band-limited signals.
 
     **Raises:** `ValueError` if an array has the wrong shape, a sample is not finite,
-    the times do not increase, or one of several outputs or controls never changes. The
-    message names the row and the column.
+    the times do not increase or have a gap, or an output or one of several controls
+    never changes. The message names the row and the column.
 
     !!! example
 
@@ -80,6 +90,7 @@ class Record(eqx.Module):
         dt: Any = None,
         times: Any = None,
         hold: Hold = "zero",
+        allow_gaps: bool = False,
     ):
         check_choice(hold, tuple(_HOLDS), "hold", _WHERE)
         outputs, controls = _table(outputs, "outputs"), _table(controls, "controls")
@@ -106,7 +117,8 @@ class Record(eqx.Module):
             times, steps = dt * np.arange(len(outputs)), dt * np.ones(len(outputs) - 1)
             self.is_uniform = True
         else:
-            times = _checked_times(times, len(outputs))
+            check_bool(allow_gaps, "allow_gaps", _WHERE)
+            times = _checked_times(times, len(outputs), allow_gaps)
             # Differences are taken before the times are rounded to a lower precision.
             steps = times[1:] - times[:-1]
             self.is_uniform = is_concrete(times) and _has_one_step(steps)
@@ -262,9 +274,9 @@ def _table(value: Any, name: str) -> Any:
             "record where samples are missing."
         )
     still = np.ptp(array, axis=0) == 0
-    # A single control may be constant for a whole experiment. One constant column among
-    # several is the wrong column, or a channel that was not connected.
-    if still.any() and not still.all():
+    # A single control may be constant for a whole experiment. A constant output, or one
+    # constant control among several, is the wrong column or was not connected.
+    if still.any() and (name == "outputs" or not still.all()):
         column = int(np.argmax(still))
         raise ValueError(
             f"{_WHERE}: column {column} of {name} is {array[0, column]:g} in all "
@@ -273,7 +285,7 @@ def _table(value: Any, name: str) -> Any:
     return array
 
 
-def _checked_times(times: Any, count: int) -> Any:
+def _checked_times(times: Any, count: int, allow_gaps: bool) -> Any:
     array = as_float_array(times)
     if array.shape != (count,):
         raise ValueError(
@@ -297,6 +309,16 @@ def _checked_times(times: Any, count: int) -> Any:
         raise ValueError(
             f"{_WHERE}: times must increase, but {array[row]:g} in row {row} {what} "
             f"{array[row - 1]:g} in row {row - 1}."
+        )
+    steps = np.diff(array)
+    usual = np.quantile(steps, _USUAL)
+    if not allow_gaps and steps.max() > _GAP * usual:
+        row = int(np.argmax(steps))
+        raise ValueError(
+            f"{_WHERE}: times has a gap of {steps[row]:g} between rows {row} and "
+            f"{row + 1}; nine tenths of the steps are at most {usual:g}. Split the "
+            "record there and pass a list of records, or pass allow_gaps=True if the "
+            "controls are known in between."
         )
     return array
 

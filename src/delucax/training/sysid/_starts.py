@@ -13,6 +13,7 @@ from ..._check import check_finite
 from ..._module import as_float_array
 from ...dynamics import AbstractDynamics
 from .._trainable import Assembly
+from ._latent import LatentDynamics
 from ._multiple_shooting import Solution, solve
 from ._record import Record
 from ._sampled import Sampling
@@ -31,6 +32,9 @@ def guessed_starts(
     if x0 is None:
         if groups[0].outputs.shape[2] == n:
             return [group.outputs[:, 0] for group in groups]
+        if isinstance(dynamics, LatentDynamics):
+            # Its states are of size one, about zero.
+            return [jnp.zeros((size, n), groups[0].outputs.dtype) for size in sizes]
         raise ValueError(
             f"{where}: x0 must be given, because the state (of size {n}) is not "
             f"measured: the record has {groups[0].outputs.shape[2]} outputs."

@@ -23,6 +23,7 @@ def read_csv(
     dt: Any = None,
     by: str | None = None,
     hold: Hold = "zero",
+    allow_gaps: bool = False,
     delimiter: str = ",",
 ) -> Any:
     """Read a record from a CSV file whose first line names the columns.
@@ -37,6 +38,7 @@ def read_csv(
         the same entry make one record. By default the file is one record.
     - `hold`: the control between samples, as in [`delucax.training.sysid.Record`][];
         `"zero"` by default.
+    - `allow_gaps`: accept gaps in the times; false by default.
     - `delimiter`: the character between columns, a comma by default.
 
     **Returns:** a [`delucax.training.sysid.Record`][], or a list of them if `by` is
@@ -80,10 +82,12 @@ def read_csv(
         for name, place in places.items():
             entry = line[place].strip() if place < len(line) else ""
             table[name].append(
-                entry if name == by else _number(entry, name, number, where)
+                entry if name == by else _number(entry, name, f"line {number}", where)
             )
+    if not all(table.values()):
+        raise ValueError(f"{where} must have rows of numbers below its first line.")
     columns = {name: np.asarray(values) for name, values in table.items()}
-    return _records(columns, outputs, controls, times, dt, by, hold)
+    return _records(columns, outputs, controls, times, dt, by, hold, allow_gaps)
 
 
 def from_frame(
@@ -95,6 +99,7 @@ def from_frame(
     dt: Any = None,
     by: str | None = None,
     hold: Hold = "zero",
+    allow_gaps: bool = False,
 ) -> Any:
     """Make a record from a data frame or a dictionary of columns.
 
@@ -102,7 +107,7 @@ def from_frame(
 
     - `frame`: a data frame of pandas or Polars, or a dictionary of columns. If the
         times are dates, they are converted to seconds since the first row.
-    - `outputs`, `controls`, `times`, `dt`, `by`, `hold`: as in
+    - `outputs`, `controls`, `times`, `dt`, `by`, `hold`, `allow_gaps`: as in
         [`delucax.training.sysid.read_csv`][].
 
     **Returns:** a [`delucax.training.sysid.Record`][], or a list of them if `by` is
@@ -142,11 +147,12 @@ def from_frame(
         if values.dtype.kind == "M":
             values = (values - values[0]) / np.timedelta64(1, "s")
         if name != by and values.dtype.kind not in "biuf":
-            raise ValueError(
-                f"{where} must have numbers in column {name!r}, got {values.dtype}."
+            # A column of objects may still hold numbers alone.
+            values = np.array(
+                [_number(v, name, f"row {k}", where) for k, v in enumerate(values)]
             )
         columns[name] = values
-    return _records(columns, outputs, controls, times, dt, by, hold)
+    return _records(columns, outputs, controls, times, dt, by, hold, allow_gaps)
 
 
 def _listed(names: Names | None) -> list[str]:
@@ -158,19 +164,18 @@ def _wanted(outputs: Names, controls: Names, times: str | None) -> list[str]:
 
 
 def _place(name: str, names: list[str], where: str) -> int:
-    if name not in names:
-        raise ValueError(
-            f"{where} must have a column {name!r}, got {shortened(names)}."
-        )
+    if names.count(name) != 1:
+        many = f"one column {name!r}" if name in names else f"a column {name!r}"
+        raise ValueError(f"{where} must have {many}, got {shortened(names)}.")
     return names.index(name)
 
 
-def _number(entry: str, name: str, line: int, where: str) -> float:
+def _number(entry: Any, name: str, row: str, where: str) -> float:
     try:
         return float(entry)
-    except ValueError:
+    except (TypeError, ValueError):
         raise ValueError(
-            f"{where} must have numbers, got {shortened(entry)} in line {line}, column "
+            f"{where} must have numbers, got {shortened(entry)} in {row}, column "
             f"{name!r}."
         ) from None
 
@@ -183,6 +188,7 @@ def _records(
     dt: Any,
     by: str | None,
     hold: Hold,
+    allow_gaps: bool,
 ) -> Any:
     y, u = (
         np.stack([np.asarray(columns[name], float) for name in _listed(names)], axis=1)
@@ -190,7 +196,12 @@ def _records(
     )
     t = None if times is None else np.asarray(columns[times], float)
     make = lambda rows: Record(
-        y[rows], u[rows], dt=dt, times=None if t is None else t[rows], hold=hold
+        y[rows],
+        u[rows],
+        dt=dt,
+        times=None if t is None else t[rows],
+        hold=hold,
+        allow_gaps=allow_gaps,
     )
     if by is None:
         return make(slice(None))

@@ -78,10 +78,11 @@ class Validation(eqx.Module):
         lines = [f"{'output':<10}{'rmse':>12}{'fit, %':>10}{'p(white)':>12}"]
         columns = self.rmse, self.fit, self.p_value
         for i, (error, share, p) in enumerate(zip(*columns, strict=True)):
-            lines.append(f"y{i:<9}{error:>12.5g}{share:>10.2f}{p:>12.3g}")
+            lines.append(f"y{i:<9}{error:>12.5g}{share:>10.3g}{p:>12.3g}")
         if len(self.ahead):
             k = len(self.ahead)
-            ends = f"{self.ahead[0].tolist()} to {self.ahead[-1].tolist()}"
+            each = zip(self.ahead[0], self.ahead[-1], strict=True)
+            ends = ", ".join(f"{float(a):.3g} to {float(b):.3g}" for a, b in each)
             lines.append(f"rmse of predictions of 1 to {k} steps: {ends}")
         return "\n".join(lines)
 
@@ -107,7 +108,8 @@ def validate(
     - `model`: the dynamics.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `x0`: a guess of the first state, shape `(n,)`, or one for each record; by default
-        the first measurement, which must then be the state.
+        the first measurement, which must then be the state, or zero for
+        [`delucax.training.sysid.LatentDynamics`][].
     - `start`: the number of samples from which a state is estimated, 10 by default.
         They do not count in the errors.
     - `ahead`: the largest number of steps of a prediction; 0 by default, for no
