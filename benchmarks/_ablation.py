@@ -18,7 +18,7 @@ from benchmarks._synthesis import regret
 
 
 STORE = _cases.RESULTS / "ablation.jsonl"
-SEEDS = 3
+SEEDS = 1
 TASKS = (
     "acrobot",
     "cartpole_swing_up",
