@@ -1,4 +1,4 @@
-"""Trajectory optimisation over dynamics and a cost."""
+"""Trajectory optimisation: planners that minimise a cost along the dynamics."""
 
 from ._constraints import (
     Constraints as Constraints,

@@ -1,4 +1,4 @@
-"""A run-time counter of evaluations of the dynamics, by host callbacks."""
+"""Count the evaluations of dynamics at run time, by host callbacks."""
 
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -19,7 +19,8 @@ from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
 class Evaluations(NamedTuple):
-    """The numbers of calls of dynamics, and of products with their Jacobian."""
+    """The number of calls of dynamics (`primal`), and of products with their Jacobian
+    (`tangent`) and its transpose (`cotangent`)."""
 
     primal: int
     tangent: int
@@ -31,21 +32,24 @@ def count_evaluations(
 ) -> tuple[Any, Evaluations]:
     """Run a function of dynamics, and count how often it evaluates them.
 
-    The dynamics that it is given report each evaluation to the host as it happens, also
-    in compiled loops whose length depends on the data. Under `jax.vmap` each lane
-    counts. Dead code that XLA removes is not counted. It
-    is for counting, not for timing: each report takes microseconds, and each call
-    compiles anew.
+    The function gets dynamics that report each evaluation to the host at run time. The
+    count is therefore exact in compiled loops too. Under `jax.vmap` each member of the
+    batch counts. Dead code, which XLA removes, does not count.
+
+    Use it to count, not to time: each report takes microseconds, and each call compiles
+    anew.
 
     **Arguments:**
 
-    - `function`: of the dynamics, such as a call of a planner.
-    - `dynamics`: the dynamics.
+    - `function`: a function of the dynamics, such as a call of a planner.
+    - `dynamics`: the dynamics, a [`delucax.AbstractDynamics`][].
 
-    **Returns:** `(what the function returns, evaluations)`, the latter a named tuple
-    of whole numbers: `primal`, calls, of which the first pass of each derivative is
-    one; `tangent`, products of their Jacobian with a vector; `cotangent`, products of
-    its transpose with one.
+    **Returns:** `(out, evaluations)`: `out` is what the function returns, and
+    `evaluations` a named tuple of whole numbers:
+
+    - `primal`: calls of the dynamics. The first pass of a derivative is one call.
+    - `tangent`: products of their Jacobian with a vector.
+    - `cotangent`: products of the transposed Jacobian with a vector.
 
     **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or `function`
     is not a function.
@@ -64,6 +68,10 @@ def count_evaluations(
         )
         evaluations
         ```
+
+        ```text
+        Evaluations(primal=60, tangent=0, cotangent=60)
+        ```
     """
     where = "count_evaluations"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
@@ -71,7 +79,7 @@ def count_evaluations(
     reports: SimpleQueue[tuple[str, int]] = SimpleQueue()
     out = function(_Counted(dynamics, reports))
     jax.block_until_ready(eqx.filter(out, eqx.is_array))
-    # Callbacks may still be under way when the arrays are ready.
+    # Callbacks may still be running when the arrays are ready.
     jax.effects_barrier()
     counts = dict.fromkeys(Evaluations._fields, 0)
     while not reports.empty():
@@ -84,7 +92,7 @@ class _Counted(AbstractWrapper):
     """Dynamics that report each evaluation."""
 
     dynamics: AbstractDynamics
-    # Compiled code puts reports here, from any thread.
+    # A queue, because compiled code reports from any thread.
     reports: SimpleQueue[tuple[str, int]] = eqx.field(static=True)
 
     def advance(
@@ -96,11 +104,11 @@ class _Counted(AbstractWrapper):
 
 
 _report = Primitive("report")
-"""Its first argument, reported. The second one is what the dynamics are at the point of
-the evaluation: a derivative is batched with it and repeated with it, and it needs it.
+"""`report(x, where)` returns `x` and reports one evaluation. `where` is the value of the
+dynamics at this point, so that a derivative is batched and repeated like the value.
 
-Each transformation reports for itself: so an evaluation is counted where it is run, and
-only if it is."""
+Each transformation has its own report, so that an evaluation counts only if it is run.
+"""
 
 
 def _called(x: Any, where: Any, *, reports: Any, kind: str, lanes: int) -> Array:
@@ -109,15 +117,15 @@ def _called(x: Any, where: Any, *, reports: Any, kind: str, lanes: int) -> Array
         reports.put((kind, lanes))
         return np.zeros((), bool)
 
-    # Truth values alone go to the host and back, for its thread need not have the
-    # precision of this one.
+    # Only booleans go to the host and back, because the thread of the callback may use
+    # another precision.
     flag = jnp.any(x > 0) | jnp.any(where > 0)
     wrong = jax.pure_callback(count, jax.ShapeDtypeStruct((), jnp.bool), flag)
     return jnp.where(wrong, jnp.nan, x)
 
 
 def _batch(values, dims, *, lanes, **params):
-    # Under `jax.vmap` one report stands for all members of the batch.
+    # Under `jax.vmap` one report counts for all members of the batch.
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
     x = batching.bdim_at_front(values[0], dims[0], size)
     return _report.bind(x, values[1], lanes=lanes * size, **params), 0

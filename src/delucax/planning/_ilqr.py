@@ -1,4 +1,4 @@
-"""Iterative linear-quadratic regulator, and differential dynamic programming."""
+"""The iterative linear-quadratic regulator and differential dynamic programming."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,81 +30,94 @@ from ._start import Start
 
 
 class ILQR(AbstractPlanner):
-    r"""Controls that locally minimise the cost over a horizon, and feedback about them:
+    r"""The iterative linear-quadratic regulator: a locally optimal trajectory, and
+    feedback gains about it.
 
-    `minimise sum over k < T of c(t_k, x_k, u_k) + final(t_T, x_T)`, along
-    `x_{k+1} = F(t_k, x_k, u_k, w_k)`, `low <= u_k <= high`, by the iterative
-    linear-quadratic regulator. Each iteration solves the problem that is linear in the
-    dynamics and quadratic in the cost about the present trajectory, cross terms
-    included, and follows `u - a k - K (x - x_present)` through the true dynamics.
+    It solves
 
-    A step `a = 1, 1/2, ..., 1/2048` is accepted if the cost falls by at least 1e-4 of
-    the predicted decrease. A candidate that diverges is rejected. When none is
-    accepted, or the control Hessian is not positive definite, the regularisation `mu`
-    rises, and it falls after a success, by the schedule of Tassa, Erez and Todorov.
-    It has converged if the (projected) gradient with respect to each control is at most
-    `tolerance` times one plus the size of the terms that cancel in it, or if the
-    predicted decrease is below the rounding of the cost, and of the states and controls
-    that go into it.
+    $$\min \sum_{k=0}^{T-1} c(t_k, x_k, u_k) + c_T(t_T, x_T)
+    \quad \text{subject to} \quad
+    x_{k+1} = F(t_k, x_k, u_k, w_k), \quad \mathrm{low} \le u_k \le \mathrm{high}$$
 
-    It is called as every [`delucax.planning.AbstractPlanner`][], and takes constraints,
+    where $c_T$ is the final cost. Each iteration linearises the dynamics about the
+    current trajectory $\bar x$, $\bar u$, expands the cost to second order, cross terms
+    included, and solves this linear-quadratic problem. It then follows
+    $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ through the true dynamics,
+    where $-d_k$ is the change of the control in the solution, and $K_k$ its gain.
+
+    The line search tries the steps $\alpha = 1, 1/2, \dots, 1/2048$. It accepts a step
+    if the cost falls by at least 1e-4 of the predicted decrease. It rejects a step if
+    the trajectory diverges. The regularisation $\mu$ rises if no step is accepted or
+    the control Hessian is not positive definite. It falls after each accepted step, by
+    the schedule of Tassa, Erez and Todorov.
+
+    The iteration has converged if the projected gradient with respect to each control
+    is at most `tolerance` times one plus the size of the terms that cancel in it. It
+    has also converged if full steps no longer lower the gradient, and the predicted
+    decrease is below the rounding of the cost.
+
+    Call it like every [`delucax.planning.AbstractPlanner`][]. It takes hard constraints
     by the method of multipliers.
 
-    The plan is differentiable, in either mode and to any order, with respect to every
-    array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`, by the implicit function
-    theorem: one linear-quadratic problem at the solution, with exact second
-    derivatives, whatever the iteration used. Derivatives are NaN unless the solution is
-    a converged strict minimum. They are zero with respect to `controls` and `states`,
-    from which the iteration only starts.
+    *Derivatives.* You can differentiate the plan, in both modes and to any order, with
+    respect to every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The
+    derivative comes from the implicit function theorem: it takes one linear-quadratic
+    problem at the solution, with exact second derivatives even if the iteration used
+    none. Derivatives are NaN unless the plan converged to a strict minimum. They are
+    zero with respect to `controls` and `states`, because the solution does not depend
+    on the start.
 
-    The minimum is a local one, and which one it is depends on the start. On an unstable
-    plant controls alone lead far away, and the iteration may end in a stationary point
-    far from the region of interest. If `controls` is a number of steps, it starts from
-    the LQR's trajectory if that is cheaper than that of the equilibrium's control.
+    *Start.* The minimum is local, so it depends on the start. On an unstable plant,
+    controls without feedback lead far away, and the iteration may end at a stationary
+    point there. If `controls` is a number of steps, the iteration starts from
+    [`delucax.planning.Start.default`][], which also tries the trajectory of an LQR.
 
-    Where the number of events in a step of a hybrid plant is another, the model of an
-    iterate does not hold, and the cost may have a kink or a jump. If the iteration ends
-    there without convergence, the result is `events_changed`, and the plan is the best
-    so far. A start with the wanted events leads to a plan that has them.
+    *Events.* The model of a hybrid plant only holds as long as the number of events in
+    each step is the same. If this number changes, the cost may have a kink or a jump.
+    If the iteration ends there without convergence, the result is `events_changed`, and
+    the plan is the best so far. To get a plan with other events, start from a
+    trajectory that has them.
 
-    Under `jax.vmap` on CPU the plans of a batch are made one after the other, which is
-    up to six times as fast as together, where each iteration would wait for the longest
-    line search and the last plan; accelerators make them together.
+    *Batches.* Under `jax.vmap` on CPU, the plans of a batch are computed one after the
+    other. This is up to six times as fast as all together, because no plan waits for
+    the line searches of another. On accelerators they are computed together.
 
     **Arguments:**
 
-    - `max_iterations`: 500 by default.
-    - `tolerance`: the square root of the precision by default (1.5e-8 in float64), or
-        the square of `finite_difference` if that is larger. At 0 all iterations are
-        taken.
-    - `constraint_tolerance`: by how much a constraint may be violated; the precision
-        to the power 0.4 by default (5.5e-7 in float64).
-    - `second_order`: if true, with the second derivatives of dynamics and constraints
-        (differential dynamic programming), except in iterations in which they would
-        make the problem concave: fewer but more expensive iterations. If false, without
-        them (Gauss-Newton), which is slow where multipliers are large. By default true
-        if there are constraints.
-    - `regularise`: `"control"` (default), which adds `mu` to the control Hessian, or
-        `"state"`, which adds it to that of the cost-to-go.
-    - `line_search`: `"backtracking"` (default), one step after the other; or
-        `"parallel"`, all at once, for accelerators.
+    - `max_iterations`: the most iterations; 500 by default.
+    - `tolerance`: the relative tolerance of the gradient. By default it is the square
+        root of the machine precision (1.5e-8 in float64), or the square of
+        `finite_difference` if that is larger. With 0, all iterations are taken.
+    - `constraint_tolerance`: by how much a constraint may be violated. The default is
+        the machine precision to the power 0.4 (5.5e-7 in float64).
+    - `second_order`: whether to use the second derivatives of dynamics and constraints
+        (differential dynamic programming). This takes fewer but more expensive
+        iterations. An iteration leaves them out if they make the problem nonconvex. If
+        false, no iteration uses them (Gauss-Newton), which is slow if multipliers are
+        large. By default true if there are constraints and no `finite_difference`.
+    - `regularise`: `"control"` (default) adds $\mu$ to the control Hessian, `"state"`
+        to the Hessian of the cost-to-go.
+    - `line_search`: `"backtracking"` (default) tries one step after the other;
+        `"parallel"` tries all at once, for accelerators.
     - `parallel`: if true, the linear-quadratic problems are solved in parallel over
-        time, for long horizons on accelerators; in sequence by default.
-    - `finite_difference`: the spacing of the central differences by which the dynamics
-        are linearised, two calls of them for each state and control, such as 1e-2; by
-        default they are differentiated. The derivatives of the plan are exact in both
-        cases, those of the cost too.
-    - `states`: states to start from, shape `(T+1, n)`, which need not follow from
-        `controls` (multiple shooting): the steps close the gaps. `controls` must then
-        be an array, or the number of steps for the controls of the equilibrium. By
-        default the states follow from `controls`.
-    - `penalty`: the first weight of the square of what violates a constraint, over two;
-        10 by default. It grows tenfold where the violation does not fall fast. A start
-        near the solution, or a cost much larger than its constraints, wants more.
+        time, for long horizons on accelerators; false by default.
+    - `finite_difference`: a spacing, such as 1e-2. The dynamics are then linearised by
+        central differences, with two calls for each state and each control. By default
+        they are differentiated. The derivatives of the cost and of the plan are exact
+        in both cases.
+    - `states`: states to start from, shape `(T+1, n)` (multiple shooting). They need
+        not follow from `controls`; the iteration closes the gaps. `controls` must then
+        be an array, or a number of steps, which holds the control of the equilibrium.
+        By default the states follow from `controls`.
+    - `penalty`: the first weight $\rho$ of the penalty $\rho\, c^2 / 2$ of a violation
+        $c$; 10 by default. It grows by a factor of 10 when the violation falls too
+        slowly. Take more if the start is near the solution, or if the cost is much
+        larger than the violations.
 
-    **Raises:** `ValueError` on an option of the wrong kind or out of its range,
-    `parallel` with `regularise="state"`, or `finite_difference` with `second_order`;
-    when it is called also on `parallel` with `bounds`.
+    **Raises:** `ValueError` if an option is of the wrong kind or out of its range; if
+    `parallel` is combined with `regularise="state"`, or `finite_difference` with
+    `second_order`; and, when the planner is called, if `parallel` is combined with
+    `bounds`.
 
     Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
     Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
@@ -121,6 +134,10 @@ class ILQR(AbstractPlanner):
         planner = dlx.planning.ILQR(second_order=True, tolerance=1e-4)
         plan = planner(dynamics, cost, jnp.array([0.5, 0.0]), jnp.zeros((40, 1)))
         plan.cost, plan.iterations
+        ```
+
+        ```text
+        (Array(8.385, dtype=float32), Array(11, dtype=int32))
         ```
     """
 
@@ -170,24 +187,25 @@ class ILQR(AbstractPlanner):
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
         if problem.constraints is not None and not problem.constraints.is_hard:
             raise ValueError(
-                f"{where}: constraints must be hard and given by functions; for soft "
-                "ones, and for bounds of states, use `delucax.planning.SQP`."
+                f"{where}: constraints must be hard and given by functions. For soft "
+                "constraints, and for the bounds `states` and `controls`, use "
+                "`delucax.planning.SQP`."
             )
         states = self.states
         if states is not None:
             n, points = problem.dynamics.state_size, start.horizon + 1
             states = finite_rows(states, n, "states", where, points).astype(dtype)
         eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
-        # The error of central differences is of the order of the spacing squared. Below
-        # it the gradient is not a descent direction of the true cost.
+        # Central differences have an error of the order of the spacing squared. A
+        # gradient below this error may not be a descent direction of the true cost.
         defaults = max(eps**0.5, (spacing or 0.0) ** 2), eps**0.4
         given = self.tolerance, self.constraint_tolerance
         tolerance, feasible = (
             jnp.asarray(default if value is None else value, dtype)
             for default, value in zip(defaults, given, strict=True)
         )
-        # Gauss-Newton drops the curvature of the constraints times their multipliers,
-        # which may be large: it converges slowly there.
+        # Gauss-Newton drops the curvature of the constraints times their multipliers.
+        # It converges slowly if these are large.
         second_order = self.second_order
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
@@ -220,41 +238,50 @@ def ilqr(
     tolerance: Any = None,
     throw: bool = True,
 ) -> Plan:
-    r"""Controls that locally minimise the cost over a horizon, and feedback about them,
-    by the iterative linear-quadratic regulator: the short call of
-    [`delucax.planning.ILQR`][], which says how, and has further options.
+    r"""Plan a locally optimal trajectory, and feedback gains about it, by the iterative
+    linear-quadratic regulator.
+
+    It is a short call of [`delucax.planning.ILQR`][], which describes the method and
+    has more options.
 
     **Arguments:**
 
     - `dynamics`: the discrete-time dynamics.
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
-    - `controls`: what to start from: controls, shape `(T, m)`; the number of steps `T`,
-        for [`delucax.planning.Start.default`][]; feedback, or several starts of which
-        the cheapest is taken, as [`delucax.planning.Start`][]; or an earlier plan, with
-        its gains.
-    - `t0`: the time of the first state, 0 by default.
+    - `controls`: where to start. Give controls, shape `(T, m)`; or the number of steps
+        `T`, which starts from [`delucax.planning.Start.default`][]; or a
+        [`delucax.planning.Start`][], which holds feedback or several starts; or an
+        earlier plan, which starts from its trajectory and gains.
+    - `t0`: the time of the first state; 0 by default.
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
-    - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
-        control is kept; none by default.
-    - `constraints`: [`delucax.planning.Constraints`][] on states and controls, by the
-        method of multipliers; none by default.
-    - `max_iterations`: 500 by default.
-    - `tolerance`: the square root of the precision by default (1.5e-8 in float64). At 0
-        all iterations are taken.
-    - `throw`: raise unless converged (default); if false, look at `plan.result`, which
-        is `not_converged`, `no_descent`, `events_changed` where the events of a hybrid
-        plant are others from one iterate to the next, `no_feasible_point` if no weight
-        makes the constraints hold, or `diverged` if every start diverges: the plan is
-        then the best iterate.
+    - `bounds`: the bounds `(low, high)` of the controls, each a number or an array of
+        shape `(m,)`; none by default.
+    - `constraints`: hard [`delucax.planning.Constraints`][] on states and controls, by
+        the method of multipliers; none by default.
+    - `max_iterations`: the most iterations; 500 by default.
+    - `tolerance`: the relative tolerance of the gradient; the square root of the
+        machine precision by default (1.5e-8 in float64). With 0, all iterations are
+        taken.
+    - `throw`: if true (default), raise if the plan did not converge. If false, check
+        `plan.result` yourself.
 
-    **Returns:** a [`delucax.planning.Plan`][]. It is stationary if it has converged.
-        Where the control Hessian is not positive definite, `plan.regularisation` says
-        what was added to it, and the derivatives are NaN.
+    **Returns:** a [`delucax.planning.Plan`][]. Its `result` is one of:
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, or not finite, a
-    horizon of 0, or a lower bound above an upper one; an error at run time as `throw`
-    says.
+    - `successful`: the plan is stationary.
+    - `not_converged`: it took `max_iterations`.
+    - `no_descent`: no step lowered the cost.
+    - `events_changed`: the events of a hybrid plant changed between iterates.
+    - `no_feasible_point`: no penalty weight made the constraints hold.
+    - `diverged`: every start diverges.
+
+    If it is not `successful`, the plan is the best iterate. If `plan.regularisation` is
+    not zero, this number was added to the control Hessian, which may not be positive
+    definite; the derivatives are then NaN unless it is.
+
+    **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
+    finite, the horizon is 0, or a lower bound is above an upper one; an error at run
+    time as `throw` says.
 
     !!! example
 
@@ -266,7 +293,11 @@ def ilqr(
         cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[100.0, 10.0])
         hanging, start = jnp.array([jnp.pi, 0.0]), jnp.zeros((60, 1))
         plan = dlx.planning.ilqr(dynamics, cost, hanging, start, bounds=(-6.0, 6.0))
-        plan.states[-1], plan.cost, plan.iterations
+        plan.cost, plan.iterations
+        ```
+
+        ```text
+        (Array(129.33, dtype=float32), Array(16, dtype=int32))
         ```
     """
     planner = ILQR(max_iterations, tolerance)

@@ -1,4 +1,4 @@
-"""The plan: a trajectory, feedback about it, and how it was computed."""
+"""The result of a planner: a trajectory, feedback gains about it, and its status."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,43 +17,54 @@ from ._multipliers import Multipliers
 
 
 class Plan(AbstractController):
-    """A locally optimal trajectory, and a controller that follows it,
+    r"""A planned trajectory with feedback gains. It is a controller that follows the
+    trajectory:
 
-    `u = controls[k] - gains[k] (y - states[k])` with `k = round((t - t0) / dt)`,
+    $$u = u_k - K_k\, (y - x_k), \qquad k = \mathrm{round}((t - t_0) / \Delta t)$$
 
-    between the bounds that it was planned with. Outside the horizon the control is NaN,
-    which a rollout reports. [`delucax.planning.ilqr`][] makes it, and so do
-    [`delucax.planning.MPPI`][] and [`delucax.planning.CEM`][], without gains, and
-    [`delucax.planning.ilc`][] and [`delucax.planning.igpc`][].
+    where $x_k$, $u_k$ and $K_k$ are the `states`, `controls` and `gains`. The control
+    is clipped to the bounds of the plan. Outside the horizon it is NaN, which
+    [`delucax.rollout`][] reports.
+
+    Every [`delucax.planning.AbstractPlanner`][] returns a plan, and so do
+    [`delucax.planning.ilqr`][], [`delucax.planning.ilc`][] and
+    [`delucax.planning.igpc`][]. The plans of [`delucax.planning.MPPI`][] and
+    [`delucax.planning.CEM`][] have gains of zero.
 
     **Arguments:**
 
-    - `states`: shape `(T+1, n)`.
-    - `controls`: shape `(T, m)`, trainable.
-    - `gains`: shape `(T, m, n)`, trainable. The rows of controls that a bound holds are
-        zero.
-    - `cost`: the cost of the trajectory, with its final cost.
-    - `trace`: the cost at the start and after each iteration, shape
-        `(max_iterations + 1,)`; the last one repeated where there were fewer. With
-        constraints, of the augmented Lagrangian.
-    - `residual`: the largest entry of the gradient of the cost with respect to the
-        controls, of its projection where a bound holds; of a planner that samples, the
+    - `states`: $x_0, \dots, x_T$, shape `(T+1, n)`.
+    - `controls`: $u_0, \dots, u_{T-1}$, shape `(T, m)`, trainable.
+    - `gains`: $K_0, \dots, K_{T-1}$, shape `(T, m, n)`, trainable. The row of a control
+        is zero at the steps where the control is held at a bound.
+    - `cost`: the cost of the trajectory, with the final cost.
+    - `trace`: the cost of the start and of each iteration, shape
+        `(max_iterations + 1,)`. If there were fewer iterations, the last cost is
+        repeated. With constraints it is the augmented Lagrangian, or for
+        [`delucax.planning.SQP`][] the cost with the penalty of soft constraints.
+    - `residual`: how far the plan is from a stationary point: the largest entry of the
+        gradient of the cost with respect to the controls, projected to the bounds. For
+        `SQP` it is the gradient of the Lagrangian, and for a planner that samples the
         largest change of a control in the last iteration.
-    - `violation`: by how much a constraint is violated, or is inactive although its
-        multiplier is not zero; 0 without constraints.
-    - `multipliers`: [`delucax.planning.Multipliers`][] of the constraints; `None`
-        without constraints, or of a planner that has none.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `iterations`: the iterations taken.
-    - `rollouts`: the trajectories computed, each candidate of a line search being one.
-    - `regularisation`: that of the last iteration. Above zero, the problem has no
-        positive definite control Hessian at the solution, or the search was hard.
+    - `violation`: the largest violation of a constraint. For
+        [`delucax.planning.ILQR`][] it also counts an inactive constraint whose
+        multiplier is not zero. 0 without constraints.
+    - `multipliers`: the [`delucax.planning.Multipliers`][] of the constraints; `None`
+        without constraints, or if the planner has no multipliers.
+    - `result`: the status, one of `delucax.RESULTS`.
+    - `iterations`: the number of iterations.
+    - `rollouts`: the number of computed trajectories. Each candidate of a line search
+        counts.
+    - `regularisation`: the regularisation of the last iteration. If it is above zero,
+        the control Hessian at the solution is not positive definite, or the line search
+        had difficulties.
     - `t0`: the time of the first state.
     - `dt`: the control interval.
-    - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` if there are none.
+    - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` without bounds.
     - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
-    - `parameters`: what [`delucax.planning.Unknowns`][] chose, by paths, with a
-        duration as the step `dt` of the dynamics; `None` without.
+    - `parameters`: the values that the planner chose for
+        [`delucax.planning.Unknowns`][], by their paths. A duration is there as the step
+        `dt` of the dynamics. `None` without unknowns.
 
     !!! example
 
@@ -96,18 +107,17 @@ class Plan(AbstractController):
 
     @property
     def duration(self) -> Array:
-        """The time from the first state to the last."""
+        """The time from the first state to the last one."""
         return self.controls.shape[-2] * self.dt
 
     @property
     def is_usable(self) -> Array:
-        """Whether the plan can be followed: it did not diverge, and the constraints can
-        hold.
+        """Whether the plan can be followed: its controls are finite, and its result is
+        neither `diverged` nor `no_feasible_point`.
 
-        A plan of too few iterations, or whose search failed, is the best so far.
+        A plan that did not converge is usable, because it is the best iterate so far.
         """
         finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
-        # Of other failures, such as too few iterations, the best iterate is left.
         lost = self.result == RESULTS.diverged
         lost = lost | (self.result == RESULTS.no_feasible_point)
         return finite & ~lost
@@ -116,7 +126,7 @@ class Plan(AbstractController):
         size = self.states.shape[1]
         if y.shape != (size,):
             raise wrong_observation(self, size, y)
-        # By the number of steps, because a time k dt is rounded.
+        # Compare numbers of steps, because the time k dt is rounded.
         step = step_at(t - self.t0, self.dt, len(self.controls), "Plan")
         rows = self.states[:-1], self.controls, self.gains
         x_ref, u_ref, K = row_at(rows, step)

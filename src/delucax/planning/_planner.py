@@ -1,4 +1,4 @@
-"""The protocol of planners."""
+"""The base class of planners."""
 
 import abc
 import numbers
@@ -40,7 +40,7 @@ from ._unknowns import solved_problem, Unknowns
 def checked_plan(
     plan: Plan, where: str, throw: bool = True, problem: Problem | None = None
 ) -> Plan:
-    """The plan; if `throw`, raise unless it is a solution."""
+    """Return the plan. If `throw`, raise if the plan is not a solution."""
 
     def facts():
         path = np.isfinite(np.asarray(plan.states)).all(axis=-1)
@@ -55,7 +55,7 @@ def checked_plan(
                 "The trajectory runs away: it is not finite from stage "
                 f"{path.argmin()} on. Start from a number of steps, from a "
                 "`delucax.planning.Start` with gains that stabilise the plant, or "
-                "from `states` of `ILQR` or `SQP`."
+                "from states (the option `states` of `ILQR` and `SQP`)."
             )
         words = (
             f"After {int(plan.iterations)} iterations the cost is "
@@ -74,23 +74,28 @@ _TRAJECTORY = "controls", "states", "gains"
 
 
 class AbstractPlanner(eqx.Module):
-    """Base class of trajectory optimisers. The fields of one are its options, and a
-    call gives it a problem:
+    """Base class of trajectory optimisers.
+
+    The fields of a planner are its options. Call it with a problem to get a
+    [`delucax.planning.Plan`][]:
 
     `plan = planner(dynamics, cost, x0, controls, t0, w, bounds)`.
 
-    To write a planner, subclass it and write `solve(problem, start, key)`, where
-    `problem` is a [`delucax.planning.Problem`][] whose arguments are checked:
+    To write your own planner, subclass this class and write
+    `solve(problem, start, key)`. The `problem` is a [`delucax.planning.Problem`][]
+    whose arguments are already checked. In `solve`:
 
     - `start` may hold several starts. `start.cheapest(problem)` picks one.
-    - Controls must respect the bounds: `problem.roll_out` and `problem.clip` do.
-    - Raise an error on `problem.constraints` if the planner takes none.
-    - Return `problem.plan(states, controls, cost)`. A call raises unless its `result`
-        is `successful`.
-    - Set `is_stochastic` if the planner draws random numbers.
+    - Keep the controls within the bounds. `problem.roll_out` and `problem.clip` do.
+    - If the planner takes no constraints, raise an error if `problem.constraints` is
+        not `None`.
+    - Return `problem.plan(states, controls, cost)`. The call of the planner raises an
+        error if the `result` of this plan is not `successful`.
 
-    It then works in [`delucax.controllers.MPC`][], too. Derivatives of the plan are
-    those of `solve`.
+    If the planner draws random numbers, set `is_stochastic = True`.
+
+    Your planner then also works in [`delucax.controllers.MPC`][]. The derivatives of
+    the plan are those of `solve`.
 
     !!! example
 
@@ -115,38 +120,42 @@ class AbstractPlanner(eqx.Module):
     """
 
     is_stochastic: ClassVar[bool] = False
-    """Whether it draws random numbers, and so needs a key."""
+    """Whether the planner draws random numbers and therefore needs a key."""
     takes_unknowns: ClassVar[bool] = False
-    """Whether it plans with [`delucax.planning.Unknowns`][]."""
+    """Whether the planner takes [`delucax.planning.Unknowns`][]."""
 
     __repr__ = shown
 
     @property
     def starts_from_states(self) -> bool:
-        """Whether it has states to start from, and so takes no feedback."""
+        """Whether an option of the planner gives the states to start from. A call then
+        does not take a `Start` or a `Plan`."""
         return False
 
     def first_multipliers(self, problem: Problem, horizon: int) -> Multipliers | None:
-        """Multipliers of zero, of the shapes that a plan has; `None` (default) if its
-        plans have none.
+        """Multipliers of zero, in the shapes that a plan of this planner has. The
+        default, for plans without multipliers, is `None`.
 
         **Arguments:**
 
         - `problem`: a [`delucax.planning.Problem`][].
-        - `horizon`: T.
+        - `horizon`: the number of steps `T`.
         """
         del problem, horizon
         return None
 
     @abc.abstractmethod
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
-        """The plan, with its `result` set; a failure does not raise here.
+        """Solve a checked problem. Report a failure by the `result` of the plan, not by
+        an error.
 
         **Arguments:**
 
         - `problem`: a [`delucax.planning.Problem`][].
-        - `start`: one start, or several along a first axis.
-        - `key`: a random key if the planner draws, else `None`.
+        - `start`: one [`delucax.planning.Start`][], or several along a first axis.
+        - `key`: a random key if the planner is stochastic, else `None`.
+
+        **Returns:** a [`delucax.planning.Plan`][].
         """
 
     def __call__(
@@ -166,38 +175,39 @@ class AbstractPlanner(eqx.Module):
         key: PRNGKey | None = None,
         throw: bool = True,
     ) -> Plan:
-        """Plan.
+        """Plan a trajectory from `x0`.
 
         **Arguments:**
 
         - `dynamics`: the discrete-time dynamics.
         - `cost`: the stage and final cost.
         - `x0`: the first state, shape `(n,)`.
-        - `controls`: what to start from: controls, shape `(T, m)`; the number of steps
-            `T`, for [`delucax.planning.Start.default`][]; feedback, or several starts
-            of which the cheapest is taken, as [`delucax.planning.Start`][]; or an
-            earlier plan, with its gains.
-        - `t0`: the time of the first state, 0 by default.
+        - `controls`: where to start. Give controls, shape `(T, m)`; or the number of
+            steps `T`, which starts from [`delucax.planning.Start.default`][]; or a
+            [`delucax.planning.Start`][], which holds feedback or several starts; or an
+            earlier plan, which starts from its trajectory and gains.
+        - `t0`: the time of the first state; 0 by default.
         - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
-        - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
-            control is kept; none by default.
-        - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
-            planners that take them; none by default.
-        - `difference`: `(x, x_ref) -> deviation`, such as `system.difference`, which
-            wraps angles, for dynamics that wrap them; subtraction by default.
-        - `unknowns`: [`delucax.planning.Unknowns`][], what is chosen besides the
-            controls, by [`delucax.planning.SQP`][]; none by default.
-        - `fallback`: feedback of the same horizon, with states and gains, used in place
-            of the plan's own if planning fails: every start diverges, or the
-            constraints cannot hold. `result` and `cost` stay those of the failed plan.
-            None by default.
-        - `key`: a random key, for planners that draw.
-        - `throw`: raise unless the plan is a solution (default); if false, look at
-            `plan.result`.
+        - `bounds`: the bounds `(low, high)` of the controls, each a number or an array
+            of shape `(m,)`; none by default.
+        - `constraints`: [`delucax.planning.Constraints`][] on states and controls, if
+            the planner takes them; none by default.
+        - `difference`: `(x, x_ref) -> deviation`; subtraction by default. If the
+            dynamics wrap angles, give `system.difference`, which wraps them too.
+        - `unknowns`: [`delucax.planning.Unknowns`][] that
+            [`delucax.planning.SQP`][] chooses together with the controls; none by
+            default.
+        - `fallback`: a `Start` with states and gains, or a `Plan`, of the same horizon.
+            It replaces the trajectory and the gains of a plan that is not usable: every
+            start diverges, or the constraints cannot all hold. `result` and `cost` stay
+            those of the failed plan. None by default.
+        - `key`: a random key, for stochastic planners.
+        - `throw`: if true (default), raise if the plan is not a solution. If false,
+            check `plan.result` yourself.
 
         **Returns:** a [`delucax.planning.Plan`][].
 
-        **Raises:** `ValueError` on an argument of the wrong kind or shape, or not
+        **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
         finite; an error at run time as `throw` says.
         """
         where = type(self).__name__
@@ -211,8 +221,8 @@ class AbstractPlanner(eqx.Module):
         if isinstance(controls, Start | Plan):
             if self.starts_from_states:
                 raise ValueError(
-                    f"{where}: states go with an array of controls or a number of "
-                    f"steps, got {type(controls).__name__}."
+                    f"{where}: controls must be an array or a number of steps if the "
+                    f"planner has states, got {type(controls).__name__}."
                 )
             given = (getattr(controls, name) for name in (*_TRAJECTORY, "multipliers"))
             start = Start(*given)
@@ -225,7 +235,7 @@ class AbstractPlanner(eqx.Module):
                 start = Start(jnp.tile(operating_point(dynamics, cost)[1], (T, 1)))
             else:
                 start = Start.default(dynamics, cost, T, begin)
-        # A default start has no precision of its own.
+        # The default start takes the precision of the problem.
         dtype = jnp.result_type(x0, *(() if is_count else (start.controls,)))
         if w is not None:
             size = dynamics.disturbance_size
@@ -239,13 +249,13 @@ class AbstractPlanner(eqx.Module):
             check_instance(unknowns, Unknowns, "unknowns", where)
             if not self.takes_unknowns:
                 raise ValueError(
-                    f"{where}: unknowns must be left to `delucax.planning.SQP`, the "
-                    "one planner that takes them."
+                    f"{where}: unknowns must be None, got Unknowns. Only "
+                    "`delucax.planning.SQP` takes unknowns."
                 )
         ends: Any = check_control_bounds(bounds, m, where)
         if ends is not None:
             ends = tuple(_cast(end, dtype, (m,)) for end in ends)
-        # One precision for all: the loops of the planners carry it unchanged.
+        # All arrays get the same precision, because a compiled loop cannot change it.
         x0, begin = _cast(x0, dtype), _cast(begin, dtype)
         distance = as_module(difference)
         problem = Problem(
@@ -258,8 +268,8 @@ class AbstractPlanner(eqx.Module):
             shapes = [getattr(array, "shape", None) for array in spare]
             if shapes != [(T, m), (T + 1, n), (T, m, n)]:
                 raise ValueError(
-                    f"{where}: fallback must be a plan of {T} steps, or a start with "
-                    f"states and gains, got {shortened(fallback)}."
+                    f"{where}: fallback must be a Plan, or a Start with states and "
+                    f"gains, of {T} steps, got {shortened(fallback)}."
                 )
         if self.is_stochastic:
             check_key(key, where)
@@ -272,24 +282,24 @@ class AbstractPlanner(eqx.Module):
 
 
 def _cast(array: Any, dtype: Any, shape: tuple[int, ...] | None = None) -> Array:
-    """The array in another precision, and of another shape if one is given."""
+    """Cast the array to a precision, and broadcast it to `shape` if that is given."""
     shape = np.shape(array) if shape is None else shape
     if isinstance(array, Tracer):
         return jnp.broadcast_to(array, shape).astype(dtype)
     if isinstance(array, jax.Array) and not array.weak_type:
         if array.dtype == dtype and array.shape == shape:
             return array
-    # By NumPy, for each conversion would be compiled as a program of its own.
+    # NumPy, because JAX would compile a program for each conversion.
     return jnp.asarray(np.broadcast_to(np.asarray(array, dtype), shape))
 
 
 @eqx.filter_jit
 def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
+    """The plan, or, if it is not usable, the plan with the fallback's trajectory."""
     trajectory = lambda p: [getattr(p, name) for name in _TRAJECTORY]
     usable = plan.is_usable
-    # By `where`, not `cond`: under `jax.vmap` each member of a batch has its own.
     keep = lambda new, old: jnp.where(usable, new, old).astype(new.dtype)
-    # Controls that are not finite are a failure, whatever the planner's status.
+    # Controls that are not finite are a failure, even if the planner reports success.
     result = choose(plan.result == RESULTS.successful, RESULTS.diverged, plan.result)
     result = choose(usable, plan.result, result)
     kept = jax.tree.map(keep, trajectory(plan), trajectory(fallback))

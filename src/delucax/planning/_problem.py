@@ -1,4 +1,4 @@
-"""The planning problem: dynamics, a cost, constraints; its trajectories."""
+"""The planning problem: dynamics, cost and constraints, and their trajectories."""
 
 import dataclasses
 import functools
@@ -24,11 +24,13 @@ from ._plan import Plan
 
 
 _SPLIT_UP_TO = 6
-"""Trajectories of more components are as fast in one piece, and a shorter program."""
+"""Larger states are carried as one array: this is as fast, and the program is shorter.
+"""
 
 
 class Augmentation(NamedTuple):
-    """The Lagrange multipliers at each step and at the end, and the penalty weight."""
+    """The augmentation of the cost: Lagrange multipliers of the constraints at each
+    step and at the end, and the penalty weight."""
 
     stage: Array  # (T, p)
     final: Array  # (q,)
@@ -36,34 +38,36 @@ class Augmentation(NamedTuple):
 
 
 def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:
-    """The penalty of constraints with values `c` and multipliers `y`:
-    `y c + rho c^2 / 2`, or `(max(0, y + rho c)^2 - y^2) / (2 rho)` of an inequality.
+    """The terms that constraints with values `c` and multipliers `y` add to the cost:
+    `y c + rho c^2 / 2` for an equality, `(max(0, y + rho c)^2 - y^2) / (2 rho)` for an
+    inequality.
 
     Source: Hestenes, 1969; Powell, 1969; Rockafellar, 1973 (inequalities).
     """
-    # The two agree where an inequality is active, and so do their first derivatives at
-    # the switch; the second one jumps there. A weight of zero leaves the Lagrangian.
+    # For an active inequality the two formulas agree. At the switch the first
+    # derivative is continuous, and the second one jumps. With rho = 0 the sum with the
+    # cost is the Lagrangian.
     active = equal | (y + rho * c > 0)
     safe = jnp.where(rho > 0, rho, 1)
     return jnp.sum(jnp.where(active, c * (y + rho * c / 2), -(y**2) / (2 * safe)))
 
 
 def updated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
-    """The multipliers after a minimisation."""
+    """The multipliers after a minimisation of the augmented Lagrangian."""
     return jnp.where(equal, y + rho * c, jnp.maximum(y + rho * c, 0))
 
 
 def violated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
-    """How far each constraint is from holding, or its multiplier from being needed."""
-    # max(c, -y / rho) is zero just where c <= 0, y >= 0 and y c = 0: both feasibility
-    # and complementarity, in the unit of the constraint.
+    """The error of each constraint: its violation, and that of complementarity."""
+    # max(c, -y / rho) is zero exactly if c <= 0, y >= 0 and y c = 0. It has the unit of
+    # the constraint.
     slack = jnp.maximum(c, -y / rho)
     return jnp.where(equal, jnp.abs(c), jnp.abs(slack))
 
 
 class FreeStart(eqx.Module):
-    """The entries of the first state that are unknown, and their bounds, which may be
-    infinite."""
+    """The unknown entries of the first state, and their bounds, which may be infinite.
+    """
 
     low: Array
     high: Array
@@ -71,23 +75,28 @@ class FreeStart(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A planning problem, as [`delucax.planning.AbstractPlanner`][] gives it to the
-    `solve` of a planner: with arguments that are checked, of one precision.
+    """A planning problem: minimise a cost along the trajectory of dynamics.
 
-    It can be differentiated with respect to every array.
+    [`delucax.planning.AbstractPlanner`][] passes it to the `solve` of a planner. Its
+    arguments are then checked, and its arrays have the same precision. You can
+    differentiate with respect to every array.
 
     **Attributes:**
 
-    - `dynamics`, `cost`: as given.
-    - `x0`, `t0`: the first state, shape `(n,)`, and its time.
+    - `dynamics`: the discrete-time dynamics.
+    - `cost`: the stage and final cost.
+    - `x0`: the first state, shape `(n,)`.
+    - `t0`: the time of the first state.
     - `w`: known disturbances, shape `(T, k)`; `None` for zero.
-    - `bounds`: `(low, high)`, each of shape `(m,)`; `None` without.
+    - `bounds`: the bounds `(low, high)` of the controls, each of shape `(m,)`; `None`
+        without bounds.
     - `difference`: `(x, x_ref) -> deviation`; `None` for subtraction.
-    - `constraints`: [`delucax.planning.Constraints`][]; `None` without.
-    - `multipliers`: those of the augmented Lagrangian, which is then the cost; `None`
-        without.
-    - `unknowns`: [`delucax.planning.Unknowns`][]; `None` without.
-    - `free`: the entries of the first state that `x0` only guesses; `None` without.
+    - `constraints`: [`delucax.planning.Constraints`][]; `None` without constraints.
+    - `multipliers`: the multipliers and the weight of the augmented Lagrangian. If they
+        are given, the costs of the problem include its terms. `None` otherwise.
+    - `unknowns`: [`delucax.planning.Unknowns`][]; `None` without unknowns.
+    - `free`: the entries of the first state that are unknown. `x0` then holds guesses
+        of them. `None` if the first state is given.
 
     !!! example
 
@@ -117,15 +126,15 @@ class Problem(eqx.Module):
     __repr__ = shown
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
-        """The deviation of `x` from `x_ref`, by `difference`.
+        """The deviation of `x` from `x_ref`, by `difference` if that is given.
 
-        **Arguments:** `x`, `x_ref`: states.
+        **Arguments:** `x`, `x_ref`: states, shape `(n,)`.
         """
         return x - x_ref if self.difference is None else self.difference(x, x_ref)
 
     def missed_start(self, x: Array) -> Array:
-        """By how much a trajectory from `x` misses the first state, where that is
-        given."""
+        """By how much a trajectory from `x` misses the first state; zero in the entries
+        that are free."""
         missed = self.deviation(self.x0, x)
         if self.free is None:
             return missed
@@ -134,16 +143,16 @@ class Problem(eqx.Module):
     def times(self, horizon: int) -> Array:
         """The times of the states, shape `(T+1,)`.
 
-        **Arguments:** `horizon`: T.
+        **Arguments:** `horizon`: the number of steps `T`.
         """
-        # By products, not by a sum, so that rounding does not accumulate.
+        # Products, because rounding would accumulate in a sum.
         steps = jnp.arange(horizon + 1)
         return (self.t0 + steps * self.dynamics.dt).astype(self.x0.dtype)
 
     def clip(self, u: Array) -> Array:
         """The control, clipped to the bounds.
 
-        **Arguments:** `u`: shape `(m,)`.
+        **Arguments:** `u`: a control, shape `(m,)`.
         """
         if self.bounds is None:
             return u
@@ -151,7 +160,7 @@ class Problem(eqx.Module):
         return jnp.minimum(jnp.maximum(u, low), high)
 
     def room(self, controls: Array) -> tuple[Array, Array] | None:
-        """The bounds of a change of each of `controls`, if there are any."""
+        """The bounds of the changes of `controls`; `None` without bounds."""
         if self.bounds is None:
             return None
         low, high = self.bounds
@@ -160,42 +169,45 @@ class Problem(eqx.Module):
     def step(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
         """The next state.
 
-        **Arguments:** `t`, `x`, `u`, `w`: as for the dynamics.
+        **Arguments:** `t`: time. `x`: state, shape `(n,)`. `u`: control, shape `(m,)`.
+            `w`: disturbance, shape `(k,)`, or `None`.
         """
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
 
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
-        """The values of the constraints of a step, at `t`, `x`, `u`."""
+        """The values of the constraints of a step."""
         assert self.constraints is not None
         return values_of(self.constraints, False, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
-        """The values of the constraints at the end, at `t`, `x`."""
+        """The values of the constraints at the end."""
         assert self.constraints is not None
         return values_of(self.constraints, True, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The values of the constraints at each step of `states` under `controls`, and
-        at the end."""
+        """The values of the constraints along a trajectory: at each step, and at the
+        end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
 
     def with_multipliers(self, multipliers: Augmentation | None) -> "Problem":
-        """The problem whose cost is the augmented Lagrangian with `multipliers`."""
+        """The same problem with the augmented Lagrangian with `multipliers` as its
+        cost."""
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
-        """The cost of a step at `t`, `x`, `u`, with the penalty by multipliers `y`."""
+        """The cost of a step, with the terms of its constraints, which have the
+        multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
-            # A whole number has a gradient then.
+            # `+ 0.0`, because an integer has no gradient.
             return jnp.asarray(cost + 0.0)
         c, equal = self.stage_constraints(t, x, u)
         return cost + augmented(c, y, self.multipliers.rho, equal)
 
     def final_cost(self, t: Array, x: Array) -> Array:
-        """The cost at the end, at `t`, `x`, with the penalty of the constraints."""
+        """The cost at the end, with the terms of the final constraints."""
         cost = jnp.asarray(self.cost.final(t, x) + 0.0)
         if self.multipliers is None:
             return cost
@@ -205,13 +217,15 @@ class Problem(eqx.Module):
 
     @property
     def stage_multipliers(self) -> Array | None:
-        """The multipliers of the stage constraints; `None` without."""
+        """The multipliers of the stage constraints; `None` without multipliers."""
         return None if self.multipliers is None else self.multipliers.stage
 
     def total(self, states: Array, controls: Array) -> Array:
-        """The cost of a trajectory.
+        """The cost of a trajectory: all stage costs and the final cost.
 
         **Arguments:** `states`: shape `(T+1, n)`. `controls`: shape `(T, m)`.
+
+        **Returns:** a scalar.
         """
         times = self.times(controls.shape[0])
         each = (times[:-1], states[:-1], controls, self.stage_multipliers)
@@ -224,33 +238,34 @@ class Problem(eqx.Module):
     def roll_out(
         self, controls: Array, states: Array | None = None, gains: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """The trajectory under `controls - gains (x - states)`, between the bounds.
+        """The trajectory from `x0` under the controls `controls - gains (x - states)`,
+        clipped to the bounds.
 
         **Arguments:**
 
         - `controls`: shape `(T, m)`.
-        - `states`: shape `(T+1, n)`, with `gains`; none by default.
+        - `states`: shape `(T+1, n)`, needed with `gains`; none by default.
         - `gains`: shape `(T, m, n)`; zero by default.
 
-        **Returns:** `(states, controls, cost)`: shapes `(T+1, n)` and `(T, m)`, and a
-        scalar, infinite if a step failed or a number is not finite.
+        **Returns:** `(states, controls, cost)`, of shapes `(T+1, n)`, `(T, m)` and
+        `()`. The cost is infinite if a step fails or a number is not finite.
         """
         if states is None:
             points = controls.shape[0] + 1
             states = jnp.broadcast_to(self.x0, (points, *self.x0.shape))
         return roll_out(self, states, controls, gains)[:3]
 
-    # Compiled: the numbers of a plan that diverged are not refused while it is traced.
+    # Compiled, because `Plan` refuses numbers that are not finite unless it is traced.
     @eqx.filter_jit
     def plan(self, states: Array, controls: Array, cost: Array, **fields: Any) -> Plan:
-        """The plan of a trajectory, such as `roll_out` returns.
+        """Make a plan of a trajectory, such as `roll_out` returns.
 
         **Arguments:**
 
         - `states`, `controls`, `cost`: the trajectory and its cost.
-        - `fields`: others of [`delucax.planning.Plan`][]. By default there are no
-            gains, the trace is the cost, the residual is NaN, and the result is
-            `successful`, or `diverged` if the cost is not finite.
+        - `fields`: other fields of [`delucax.planning.Plan`][], as keywords. By default
+            the gains are zero, the trace is the cost, and the residual is NaN. The
+            result is `successful`, or `diverged` if the cost is not finite.
 
         **Returns:** a [`delucax.planning.Plan`][].
         """
@@ -285,10 +300,11 @@ def roll_out(
     defects: Array | None = None,
     count_events: bool = False,
 ) -> tuple[Array, Array, Array, Array | None]:
-    """The trajectory under `u - length k - K (x - x_planned)`, its cost, and how many
-    events each step has if they are counted and the dynamics have any.
+    """The trajectory under `u - length k - K (x - x_planned)`, and its cost. The last
+    entry is the number of events in each step, or `None` if `count_events` is false or
+    the dynamics have no events.
 
-    Each of `K` and `k` may be left out. `1 - length` of each defect is left.
+    `K`, `k` and `defects` are optional. The step leaves `1 - length` of each defect.
     The cost is infinite if a step fails or a number is not finite.
     """
     count_events = count_events and bool(problem.dynamics.event_names)
@@ -298,7 +314,6 @@ def roll_out(
     def body(parts, inputs):
         t, planned, u, K, k, defect, w = inputs
         x = join_state(parts)
-        # Omitted terms are not computed, rather than added as zeros.
         if k is not None:
             u = u - length * k
         if K is not None:
@@ -311,24 +326,24 @@ def roll_out(
         else:
             (x_next, result), count = problem.dynamics.advance(t, x, u, w), None
         x_next = x_next.astype(x.dtype)
-        # Multiple shooting: a step of this length closes that share of the defects, so
-        # the trajectory stays near the guess of the states.
+        # Multiple shooting: the step closes only the share `length` of the defects, so
+        # that the trajectory stays near the guess of the states.
         if defect is not None:
             x_next = x_next - (1 - length) * defect
         return split(x_next), (parts, u, or_none(result), count)
 
     times = problem.times(controls.shape[0])[:-1]
     inputs = (times, states[:-1], controls, K, k, defects, problem.w)
-    # The state is carried by its components, as in `delucax.rollout`: most of the time
-    # of a planner is spent here. A larger one is carried whole, with its products.
+    # A planner spends most of its time here. A small state is therefore carried by its
+    # components, as in `delucax.rollout`, which is faster.
     whole = size > _SPLIT_UP_TO
     body = products_whole()(body) if whole else by_components(body)
     last, kept = lax.scan(body, split(problem.x0), inputs)
     parts, controls, results, counts = kept
     states = stack_steps(parts, size, last)
-    # All states are checked, because a cost may ignore some of them, or clip them.
+    # Check all states, because a cost may ignore or clip some of them.
     cost = problem.total(states, controls)
     good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(states))
-    # A step whose solver failed may still give finite numbers.
+    # A step whose solver failed may still return finite numbers.
     good = good & (first_of(results) == RESULTS.successful)
     return states, controls, jnp.where(good, cost, jnp.inf), counts

@@ -27,8 +27,8 @@ from ._start import controls_of, Start
 
 
 class AbstractSampler(AbstractPlanner):
-    """A sampling-based planner: sequences of controls are drawn about a mean, which
-    `update` moves, in each iteration. The cheapest of the means is the plan."""
+    """Base class of planners that sample. Each iteration draws sequences of controls
+    about a mean, and `update` moves the mean. The plan is the cheapest mean."""
 
     samples: eqx.AbstractVar[int]
     iterations: eqx.AbstractVar[int]
@@ -52,21 +52,22 @@ class AbstractSampler(AbstractPlanner):
         mean: Float[Array, "T m"],
         width: Float[Array, "T m"],
     ) -> tuple[Float[Array, "T m"], Float[Array, "T m"]]:
-        """The next mean and standard deviation.
+        """The mean and the standard deviation of the next iteration.
 
         **Arguments:**
 
-        - `samples`: the sequences of controls, the first of which is the mean.
-        - `costs`: of their trajectories; infinite for those that diverged.
-        - `mean`, `width`: those that they were drawn with.
+        - `samples`: the sequences of controls; the first one is the mean.
+        - `costs`: the costs of their trajectories; infinite if a trajectory diverged.
+        - `mean`: the mean of the samples.
+        - `width`: the standard deviation of the samples.
         """
 
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         where, m = type(self).__name__, start.controls.shape[-1]
         if problem.constraints is not None:
             raise ValueError(
-                f"{where}: constraints must be None for a planner that samples; "
-                "delucax.planning.ILQR takes them."
+                f"{where}: constraints must be None, because a planner that samples "
+                "takes none. Use `delucax.planning.ILQR` or `delucax.planning.SQP`."
             )
         as_entries(self.scale, m, "scale", where)
         assert key is not None
@@ -74,11 +75,11 @@ class AbstractSampler(AbstractPlanner):
 
 
 def _draw(key: PRNGKey, correlation: Array, count: int, like: Array) -> Array:
-    """Standard normal sequences, shape `(count, T, m)`; the first one is zero."""
+    """Standard normal sequences, shape `(count, T, m)`. The first sequence is zero."""
     T, m = like.shape
     fresh = jr.normal(key, (T, count - 1, m), like.dtype)
-    # An autoregression of order one, v_k = rho v_{k-1} + sqrt(1 - rho^2) e_k, whose
-    # variance stays 1. sqrt(1 - rho^2) is not differentiable at rho = 1.
+    # An autoregression of order one, v_k = rho v_{k-1} + sqrt(1 - rho^2) e_k, keeps the
+    # variance at 1. The root is not differentiable at rho = 1, hence the least value.
     rest = jnp.maximum(1 - correlation**2, jnp.finfo(like.dtype).eps)
 
     def follow(before, now):
@@ -106,12 +107,12 @@ def _search(
     def body(carry, key):
         mean, width, best, _ = carry
         noise = _draw(key, correlation, planner.samples, mean)
-        # Clipped before they are weighed, so that the mean is of controls that act.
+        # Clip first, so that the mean is one of the controls that were applied. It is
+        # then within the bounds, because a box is convex.
         samples = jax.vmap(jax.vmap(problem.clip))(mean + width * noise)
         costs = jax.vmap(cost_of)(samples)
-        # The first sequence is the mean itself: its cost comes with the others.
+        # The first sequence is the mean.
         best = better(best, samples[0], costs[0])
-        # A mean of clipped controls is within the bounds, because a box is convex.
         after, width = planner.update(samples, costs, mean, width)
         moved = jnp.max(jnp.abs(after - mean))
         return (after, width, best, moved), best[1]
@@ -139,40 +140,45 @@ def _search(
 def average(weights: Array, samples: Array, otherwise: Array) -> Array:
     """The weighted mean of the samples; `otherwise` if all weights are zero."""
     total = jnp.sum(weights)
-    # Of a `where` both branches are differentiated: 0/0 in the one that is not taken
-    # would make the gradient NaN.
+    # `where` differentiates both branches, so that 0/0 would make the gradient NaN.
     safe = jnp.where(total > 0, total, 1)
     mean = jnp.einsum("s,s...->...", weights / safe, samples)
     return jnp.where(total > 0, mean, otherwise)
 
 
 class MPPI(AbstractSampler):
-    r"""Controls by sampling, for costs and dynamics that need not be smooth:
+    r"""Model predictive path integral control: plan by sampling. The cost and the
+    dynamics need not be smooth.
 
-    `u_k <- sum over i of v_i u_k^i`, with `v_i` proportional to
-    `exp(-cost^i / temperature)`, over sequences `u^i` drawn about the present one.
+    Each iteration draws sequences $u^i$ of controls about the current mean $u$, and
+    moves the mean to their weighted average:
 
-    This is model predictive path integral control. The cost of a sequence is the whole
-    cost of its trajectory, without a further charge for leaving the present one. A
-    sequence that diverges has no weight. The plan is the best of the means, the start
-    among them, so it costs no more than the start. It has no gains. It is
-    differentiable in whatever the costs are, for the numbers that were drawn.
+    $$u_k \leftarrow \frac{\sum_i v_i\, u_k^i}{\sum_i v_i}, \qquad
+    v_i = e^{-J^i / \lambda}$$
 
-    It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
-    without constraints. Its result is `diverged` if the start and all means diverge.
+    where $J^i$ is the cost of the trajectory of sequence $i$, and $\lambda$ the
+    temperature. No charge is added for the distance from the mean. A sequence that
+    diverges has zero weight.
+
+    The plan is the cheapest of the means and the start, so it costs at most as much as
+    the start. Its gains are zero. You can differentiate it with respect to everything
+    that the costs depend on; the random numbers are then constants.
+
+    Call it like every [`delucax.planning.AbstractPlanner`][], with a `key`. It takes no
+    constraints. The result is `diverged` if the start and all means diverge.
 
     **Arguments:**
 
-    - `samples`: sequences drawn in an iteration, 256 by default.
-    - `iterations`: 10 by default.
-    - `scale`: the standard deviation of the controls drawn, a number or of shape
-        `(m,)`; 1 by default.
-    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
-        default, to 1, a constant.
-    - `temperature`: in the unit of the cost, 1 by default. The lower it is, the fewer
-        of the best sequences count.
+    - `samples`: the number of sequences in each iteration; 256 by default.
+    - `iterations`: the number of iterations; 10 by default.
+    - `scale`: the standard deviation of the samples, a number or an array of shape
+        `(m,)`, in the unit of the control; 1 by default.
+    - `correlation`: the correlation of a sampled control with the one before it, from 0
+        (white noise, the default) to 1 (constant).
+    - `temperature`: $\lambda$, in the unit of the cost; 1 by default. The lower it is,
+        the fewer of the best sequences have weight.
 
-    **Raises:** `ValueError` on an option out of its range.
+    **Raises:** `ValueError` if an option is out of its range.
 
     Source: Williams, Wagener, Goldfain, Drews, Rehg, Boots and Theodorou, 2017.
 
@@ -185,10 +191,9 @@ class MPPI(AbstractSampler):
 
         env = dlx.make("pendulum")
         planner = dlx.planning.MPPI(temperature=0.1, correlation=0.8)
-        plan = planner(
-            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
-        )
-        plan.cost
+        x0, start = jnp.array([0.5, 0.0]), jnp.zeros((20, 1))
+        plan = planner(env.dynamics, env.cost, x0, start, key=jax.random.key(0))
+        plan.trace[0], plan.cost
         ```
     """
 
@@ -209,8 +214,8 @@ class MPPI(AbstractSampler):
         mean: Float[Array, "T m"],
         width: Float[Array, "T m"],
     ) -> tuple[Float[Array, "T m"], Float[Array, "T m"]]:
-        # The softmax of -cost / temperature. The least cost is taken off first, so that
-        # the exponentials do not underflow all together.
+        # A softmax of -cost / temperature. Without subtracting the least cost, all
+        # exponentials may underflow.
         finite, least = jnp.isfinite(costs), jnp.min(costs)
         least = jnp.where(jnp.isfinite(least), least, 0)
         above = jnp.where(finite, costs, least) - least
@@ -220,28 +225,37 @@ class MPPI(AbstractSampler):
 
 
 class CEM(AbstractSampler):
-    r"""Controls by sampling, for costs and dynamics that need not be smooth: the
-    cross-entropy method.
+    r"""The cross-entropy method: plan by sampling. The cost and the dynamics need not
+    be smooth.
 
-    Sequences are drawn with a mean and a standard deviation for each control of each
-    step, and both move to those of the cheapest sequences, the elites:
+    Each iteration draws sequences of controls with a mean $\mu_k$ and a standard
+    deviation $\sigma_k$ at each step. Both move towards the mean
+    $\mu_k^\mathrm{elite}$ and the standard deviation $\sigma_k^\mathrm{elite}$ of the
+    cheapest sequences, the elites:
 
-    `mean <- momentum mean + (1 - momentum) mean of the elites`, and likewise the
-    standard deviation.
+    $$\mu_k \leftarrow \beta \mu_k + (1 - \beta)\, \mu_k^\mathrm{elite}, \qquad
+    \sigma_k \leftarrow \beta \sigma_k + (1 - \beta)\, \sigma_k^\mathrm{elite}$$
 
-    A sequence that diverges is no elite. The plan, its result and the call are as with
-    [`delucax.planning.MPPI`][]. The derivatives are those of the elites that were
-    drawn; which ones those are is held.
+    where $\beta$ is the momentum. A sequence that diverges has no weight among the
+    elites.
+
+    Call it like [`delucax.planning.MPPI`][]. The plan and its result are as described
+    there. For derivatives, the random numbers and the choice of the elites are
+    constants.
 
     **Arguments:**
 
-    - `samples`, `iterations`, `correlation`: as in [`delucax.planning.MPPI`][].
-    - `elites`: how many of the sequences count, 32 by default.
-    - `scale`: the standard deviation to start with, a number or of shape `(m,)`; 1 by
-        default.
-    - `momentum`: how much stays of mean and standard deviation, 0.1 by default.
+    - `samples`: the number of sequences in each iteration; 256 by default.
+    - `iterations`: the number of iterations; 10 by default.
+    - `elites`: the number of elites; 32 by default.
+    - `scale`: the first standard deviation, a number or an array of shape `(m,)`, in
+        the unit of the control; 1 by default.
+    - `correlation`: the correlation of a sampled control with the one before it, from 0
+        (white noise, the default) to 1 (constant).
+    - `momentum`: $\beta$, from 0 to 1; 0.1 by default.
 
-    **Raises:** `ValueError` on an option out of its range, or more elites than samples.
+    **Raises:** `ValueError` if an option is out of its range, or there are more elites
+    than samples.
 
     Source: Rubinstein, 1999; Chua, Calandra, McAllister and Levine, 2018 (planning).
 
@@ -252,9 +266,11 @@ class CEM(AbstractSampler):
         import jax
         import jax.numpy as jnp
 
-        env, key = dlx.make("pendulum"), jax.random.key(0)
+        env = dlx.make("pendulum")
         planner = dlx.planning.CEM(samples=64, elites=8)
-        planner(env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=key).cost
+        x0, start = jnp.array([0.5, 0.0]), jnp.zeros((20, 1))
+        plan = planner(env.dynamics, env.cost, x0, start, key=jax.random.key(0))
+        plan.trace[0], plan.cost
         ```
     """
 
@@ -279,13 +295,13 @@ class CEM(AbstractSampler):
         mean: Float[Array, "T m"],
         width: Float[Array, "T m"],
     ) -> tuple[Float[Array, "T m"], Float[Array, "T m"]]:
-        # Which sequences are the elites is piecewise constant in the costs, and a
-        # derivative through infinite ones would be NaN.
+        # No derivative through the costs, because the choice of the elites is piecewise
+        # constant. A derivative through infinite costs would be NaN.
         _, best = lax.top_k(-lax.stop_gradient(costs), self.elites)
         weights = jnp.isfinite(costs[best]).astype(mean.dtype)
         centre = average(weights, samples[best], mean)
         variance = average(weights, (samples[best] - centre) ** 2, width**2)
-        # The square root has an infinite slope at zero, where all elites agree.
+        # If all elites agree, the variance is zero, where the root has no derivative.
         spreads = variance > 0
         after = jnp.where(spreads, jnp.sqrt(jnp.where(spreads, variance, 1)), 0)
         momentum = self.momentum.astype(mean.dtype)

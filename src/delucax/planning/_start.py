@@ -1,4 +1,4 @@
-"""The starts of planners: trajectories under feedback."""
+"""Starts of planners: trajectories under feedback."""
 
 import dataclasses
 from typing import Any
@@ -24,15 +24,18 @@ from ._problem import Problem
 
 
 class Start(eqx.Module):
-    """A start of a planner: the trajectory of the model under
+    r"""A start of a planner: the trajectory of the model under feedback.
 
-    `u_k = controls[k] - gains[k] (x_k - states[k])`,
+    The control at step $k$ is
 
-    between the bounds of the planner. Controls alone, without gains, drive an unstable
-    plant far away. Under a stabilising gain it stays near `states`.
+    $$u_k = \bar u_k - K_k\, (x_k - \bar x_k)$$
 
-    Several starts are stacked along a first axis. A planner computes their trajectories
-    together and starts from the cheapest. One that diverges is ignored.
+    where $\bar u_k$, $\bar x_k$ and $K_k$ are `controls`, `states` and `gains`. It is
+    clipped to the bounds of the planner. Without gains, controls drive an unstable
+    plant far away. With stabilising gains the plant stays near `states`.
+
+    Several starts are stacked along a first axis. The planner computes the trajectory
+    of each start and takes the cheapest. It ignores a start that diverges.
 
     **Arguments:**
 
@@ -40,11 +43,11 @@ class Start(eqx.Module):
     - `states`: shape `(T+1, n)` or `(c, T+1, n)`; needed with `gains`.
     - `gains`: shape `(T, m, n)` or `(c, T, m, n)`; none by default.
     - `multipliers`: [`delucax.planning.Multipliers`][] to start from, the same for all
-        starts, by planners that have them; zero by default, and where the names or the
-        shapes are not those of the constraints.
+        starts. Zero by default, and for a constraint whose name or shape they do not
+        have. Planners without multipliers ignore them.
 
-    **Raises:** `ValueError` from the planner on shapes that do not fit, or numbers that
-    are not finite.
+    **Raises:** `ValueError`, when a planner is called, if the shapes do not fit or a
+    number is not finite.
 
     !!! example
 
@@ -64,6 +67,10 @@ class Start(eqx.Module):
         )
         plan = dlx.planning.ilqr(dynamics, cost, jnp.array([0.3, 0.0]), start)
         plan.trace[0], plan.cost
+        ```
+
+        ```text
+        (Array(3.285, dtype=float32), Array(3.084, dtype=float32))
         ```
     """
 
@@ -85,7 +92,7 @@ class Start(eqx.Module):
         return Start(self.controls, self.states, self.gains)
 
     def shifted(self) -> "Start":
-        """The start a step later, its last step held."""
+        """The start one step later; its last step is repeated."""
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
         start, y = jax.tree.map(shift, self.trajectories), self.multipliers
         if y is not None:
@@ -97,19 +104,24 @@ class Start(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many starts there are."""
+        """The number of starts."""
         return self.controls.shape[0] if self.controls.ndim == 3 else 1
 
     def checked(
         self, state_size: int, control_size: int, name: str, where: str
     ) -> "Start":
-        """The start with arrays that fit each other and a problem, or an error.
+        """Check that the arrays of the start fit each other and a problem.
 
         **Arguments:**
 
-        - `state_size`: n.
-        - `control_size`: m.
-        - `name`, `where`: of the start and of what takes it, for the message.
+        - `state_size`: the number of states `n`.
+        - `control_size`: the number of controls `m`.
+        - `name`: the name of the start in messages.
+        - `where`: the name of the function that takes it, for messages.
+
+        **Returns:** the start, with floating-point arrays.
+
+        **Raises:** `ValueError` if a shape does not fit or a number is not finite.
         """
         n, m = state_size, control_size
         given = self.controls, self.states, self.gains
@@ -140,16 +152,16 @@ class Start(eqx.Module):
         return Start(*arrays, multipliers=self.multipliers)
 
     def stacked(self, state_size: int) -> "Start":
-        """One start or several as several, with states and gains.
+        """The start with a first axis, with states and with gains.
 
-        **Arguments:** `state_size`: n.
+        **Arguments:** `state_size`: the number of states `n`.
         """
         start = self
         if self.controls.ndim == 2:
             start = jax.tree.map(lambda a: a[None], self.trajectories)
         controls, states, gains = start.controls, start.states, start.gains
         if states is None or gains is None:
-            # Zero gains make the states irrelevant.
+            # With gains of zero, the states do not matter.
             c, T, m = controls.shape
             states = jnp.zeros((c, T + 1, state_size), controls.dtype)
             gains = jnp.zeros((c, T, m, state_size), controls.dtype)
@@ -160,23 +172,23 @@ class Start(eqx.Module):
 
         **Arguments:** `problem`: a [`delucax.planning.Problem`][].
 
-        **Returns:** `(start, states, controls, cost)`: the start alone, and what
-        `problem.roll_out` returns for it; the cost is infinite if all diverge.
+        **Returns:** `(start, states, controls, cost)`: this one start, and what
+        `problem.roll_out` returns for it. The cost is infinite if all starts diverge.
         """
 
         def roll(start):
             states, gains = start.states, start.gains
             states, controls, cost = problem.roll_out(start.controls, states, gains)
-            # The controls of a start that diverges are finite at least as given.
+            # The controls along a start that diverges may be NaN, but not the given.
             given = jax.vmap(problem.clip)(start.controls)
             return states, jnp.where(jnp.isfinite(cost), controls, given), cost
 
         if self.controls.ndim == 2:
             return self, *roll(self)
         starts = self.trajectories
-        # A loop over scalars is faster on CPU than one over vectors of a few entries.
+        # A loop, because on CPU `jax.vmap` over a few starts is slower.
         rolled = lax.map(roll, starts)
-        # The choice is piecewise constant in the costs.
+        # No derivative, because the choice is piecewise constant in the costs.
         best = jnp.argmin(lax.stop_gradient(rolled[2]))
         start, *rolled = jax.tree.map(lambda a: a[best], (starts, *rolled))
         return dataclasses.replace(start, multipliers=self.multipliers), *rolled
@@ -190,42 +202,48 @@ class Start(eqx.Module):
         *,
         controls: Any = None,
     ) -> "Start":
-        """The start that planners take by default, of which they use the cheaper one:
+        """The default of planners: two starts, of which they take the cheaper one.
 
-        1. under the LQR about an operating point,
-        2. with its control held.
+        1. The trajectory of the LQR about an operating point.
+        2. The trajectory of the constant control of this point.
 
-        The operating point is the `targets` of the cost where they name both a state
-        and a control; otherwise the equilibrium that the dynamics define; otherwise
-        zeros stand in for a target that is missing. A [`delucax.costs.Quadratic`][] has
-        targets, and so has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
+        The operating point is the first of these that exists:
 
-        If that point is not an equilibrium, an LQR about it may be a poor start: give
-        the cost both targets, which [`delucax.trim`][] finds.
+        1. the two `targets` of the cost, if it has both,
+        2. the equilibrium of the dynamics,
+        3. the one target of the cost, with zeros for the other,
+        4. zeros.
 
-        The weights of the LQR are the second derivatives of the stage cost at that
+        A [`delucax.costs.Quadratic`][] has targets. A cost that is made of it by `+`,
+        `*` or [`delucax.costs.Rate`][] has them too. If the operating point is not an
+        equilibrium, the LQR may be a poor start: find an equilibrium with
+        [`delucax.trim`][], and give it to the cost as its targets.
+
+        The LQR linearises the dynamics at the operating point. Its weights are the
+        second derivatives of the stage cost there. There is no LQR if:
+
+        - these derivatives are not finite,
+        - the second derivative of the cost with respect to the control is not positive
+            definite,
+        - no gain stabilises the plant, or
+        - the dynamics cannot be differentiated.
+
+        The first start then has a gain of zero: it holds the control of the operating
         point.
-
-        There is no such LQR where the derivatives at that point are not finite, the
-        second derivative of the cost with respect to the control is not positive
-        definite, no gain stabilises the plant, or the dynamics cannot be
-        differentiated. The gain of the first start is then zero, and no LQR is tried.
-
-        A trajectory that rests at the operating point is not among the starts, for it
-        does not begin at the first state. The LQR leads there.
 
         **Arguments:**
 
         - `dynamics`: the discrete-time dynamics.
         - `cost`: the stage and final cost.
-        - `horizon`: the steps `T`.
-        - `t0`: the time at which both are evaluated, 0 by default.
-        - `controls`: in place of those of the second one, shape `(T, m)`.
+        - `horizon`: the number of steps `T`.
+        - `t0`: the time at which dynamics and cost are evaluated; 0 by default.
+        - `controls`: the controls of the second start, shape `(T, m)`; by default the
+            control of the operating point.
 
-        **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
+        **Returns:** a [`delucax.planning.Start`][]. Its derivatives are zero.
 
-        **Raises:** `ValueError` if `dynamics` or `cost` is not one, or the horizon is
-        not a whole number of at least 1.
+        **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, `cost` is
+        not an `AbstractCost`, or the horizon is not a whole number of at least 1.
 
         Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
 
@@ -238,13 +256,16 @@ class Start(eqx.Module):
             start = dlx.planning.Start.default(env.dynamics, env.cost, 20)
             start.gains[0, 0]
             ```
+
+            ```text
+            Array([[19.69, 5.26]], dtype=float32)
+            ```
         """
         where = "Start.default"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_instance(cost, AbstractCost, "cost", where)
         T = check_count(horizon, "horizon", where)
-        # An implicit derivative does not depend on the start, so none need go through
-        # it.
+        # The derivative of a plan does not depend on its start.
         constant = lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf
         dynamics, cost = jax.tree.map(constant, (dynamics, cost))
         point = operating_point(dynamics, cost)
@@ -252,7 +273,8 @@ class Start(eqx.Module):
             t0 = jnp.asarray(t0, point[0].dtype)
             *matrices, posed = _expanded(dynamics, cost, *point, t0)
         except (NotImplementedError, RuntimeError, TypeError, ValueError):
-            # Not differentiable. A planner that needs derivatives says so itself.
+            # The dynamics are not differentiable. A planner that needs derivatives
+            # reports this itself.
             regulator = None
         else:
             solution = dare(*matrices, throw=False)
@@ -263,7 +285,7 @@ class Start(eqx.Module):
 def operating_point(
     dynamics: AbstractDynamics, cost: AbstractCost
 ) -> tuple[Array, Array]:
-    """The operating point, or zeros where neither names one."""
+    """The operating point `(x, u)` of the cost or the dynamics; zeros without one."""
     n, m = dynamics.state_size, dynamics.control_size
     return cost.set_point(dynamics) or (jnp.zeros(n), jnp.zeros(m))
 
@@ -271,7 +293,8 @@ def operating_point(
 @eqx.filter_jit
 @full_precision
 def _expanded(dynamics, cost, x, u, t0):
-    """The linear-quadratic problem about a point, and whether it is one."""
+    """The linear-quadratic problem `(A, B, Q, R, S)` about a point, and whether it is
+    well-posed."""
     n, z = x.shape[0], jnp.concatenate([x, u])
     problem = Problem(dynamics, cost, x, t0)
     stage_cost = lambda z: problem.stage_cost(t0, z[:n], z[n:], None)
@@ -281,22 +304,22 @@ def _expanded(dynamics, cost, x, u, t0):
     # z'Hz = x'Qx + 2 x'Su + u'Ru.
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
     posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
-    # Identities in place of what is not finite, so that the solver ends at once.
+    # Identities, if the problem is not well-posed, so that the solver ends at once.
     safe = (jnp.where(posed, M, jnp.eye(*M.shape, dtype=M.dtype)) for M in (A, B, Q, R))
     return *safe, jnp.where(posed, S, 0), posed
 
 
 @host_unless_traced
 def _both(x, u, regulator, controls, T):
-    """Controls, states and gains of the starts under a regulator, and under the
-    controls alone."""
+    """Controls, states and gains of two starts: under a regulator, and under controls
+    alone."""
     K = xp.zeros((u.shape[0], x.shape[0]), x.dtype)
     if regulator is not None:
         gain, radius, posed = regulator
-        # Any stabilising gain is a valid start, also one of large residual.
+        # Any stabilising gain is a valid start, even if its Riccati residual is large.
         stable = posed & (radius < 1) & xp.all(xp.isfinite(gain))
         K = xp.where(stable, gain, K)
-    # Both starts are feedback, the second with a gain of zero, so that they stack.
+    # The second start has gains of zero, so that both can be stacked.
     held = xp.tile(u, (T, 1))
     return (
         xp.stack([held, held if controls is None else controls]),
