@@ -1,4 +1,4 @@
-"""Constrained plans, by the method of multipliers (augmented Lagrangian)."""
+"""Plans under constraints, by the method of multipliers (augmented Lagrangian)."""
 
 import dataclasses
 
@@ -14,13 +14,14 @@ from ._start import controls_of, Start
 
 
 _RHO_GROWTH = 10.0
+"""The factor by which the penalty weight grows."""
 ENOUGH = 0.25
-"""The weight stays if the violation falls to this share."""
+"""The weight does not grow if the violation falls to this share or less."""
 
 
 def with_constraints(problem: Problem, start: Start, options: Options) -> Outcome:
-    """Minimise the augmented Lagrangian, update the multipliers, and so on, until the
-    constraints hold, the iterations are spent, or no weight makes them hold.
+    """Minimise the augmented Lagrangian and update the multipliers, in a loop that ends
+    if the constraints hold, the iterations are spent, or no weight makes them hold.
 
     Source: Bertsekas, 1982; Howell, Jackson and Manchester, 2019 (in this setting).
     """
@@ -29,7 +30,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
     count, T, m = starts.controls.shape
     if problem.constraints is None:
         return optimise(problem, starts, count, options)
-    # At a larger weight rounding of the squares exceeds the tolerances.
+    # At a larger weight, the rounding of the penalty exceeds the tolerances.
     most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
 
     def body(carry):
@@ -51,8 +52,8 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         settled = (after.result == RESULTS.successful) & precise & holds
         spent = after.iterations >= options.max_iterations
         stage, final = (updated(*given) for given in each)
-        # The multipliers converge by themselves, at a rate that grows with the weight:
-        # it rises only where they are too slow (Bertsekas, 1982).
+        # The multipliers converge at a rate that grows with the weight. The weight only
+        # grows if they are too slow (Bertsekas, 1982).
         enough = holds | (violation <= ENOUGH * before.violation)
         raised = jnp.where(enough, rho, _RHO_GROWTH * rho)
         hopeless = (raised > most_rho) & ~settled & ~spent
@@ -65,13 +66,13 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         result = choose(hopeless, RESULTS.no_feasible_point, result)
         after = after._replace(
             violation=violation,
-            # The new multipliers are those of the weight that was minimised with.
+            # The multipliers are updated with the old weight, then the weight grows.
             multipliers=Augmentation(stage, final, raised),
             result=choose(lost, RESULTS.diverged, result),
         )
-        # Once the constraints hold, the last minimisations are to full precision.
+        # Once the constraints hold, minimise to full precision.
         tolerance = tolerance * jnp.where(holds, 0, 0.1)
-        # The gains keep an unstable plant on the trajectory that it goes on from.
+        # With the gains, an unstable plant stays on the last trajectory.
         on = Start(after.controls, after.states, after.gains)
         starts = jax.tree.map(lambda all, one: all.at[0].set(one), starts, on)
         ended = settled | spent | hopeless | lost
@@ -87,7 +88,8 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         stage = in_order(problem.constraints, False, args, given.stage, stage)
         final = in_order(problem.constraints, True, args[:2], given.final, final)
         if given.penalty is not None:
-            # A step down, or along many plans it would only ever grow.
+            # Start one step lower. Otherwise the weight could only grow from one plan
+            # to the next.
             rho = jnp.maximum(rho, given.penalty / _RHO_GROWTH)
     first = Outcome(
         states=states,
@@ -103,9 +105,9 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         violation=jnp.full((), jnp.inf, dtype),
         multipliers=Augmentation(stage, final, rho),
     )
-    # The first minimisations are coarse, because their multipliers are wrong.
+    # The first minimisations are coarse, because their multipliers are still wrong.
     coarse = jnp.full((), 1e-2, dtype)
     carry = first, starts, jnp.asarray(count, int), coarse, jnp.asarray(False)
     out, *_ = lax.while_loop(lambda carry: ~carry[-1], body, carry)
-    # The cost alone, without what the constraints add to it.
+    # The cost of the plan does not include the terms of the constraints.
     return out._replace(cost=problem.total(out.states, out.controls))

@@ -1,6 +1,6 @@
-"""A problem with unknowns as one whose start is partly free.
+"""Rewrite a problem with unknowns as a problem whose first state is partly free.
 
-Parameters and the duration are carried along as states that do not change.
+Unknown parameters and the duration become additional states, which stay constant.
 """
 
 from typing import Any
@@ -24,8 +24,8 @@ from ._unknowns import bounds_by_path, parts_of
 
 
 class Carried(eqx.Module):
-    """What the states that are carried along stand for: values at paths in the parts of
-    the problem, in units of their guesses."""
+    """The additional states: values at paths in the parts of the problem, in units of
+    their guesses."""
 
     parts: dict[str, Any]
     t0: Array
@@ -36,21 +36,21 @@ class Carried(eqx.Module):
     paths: tuple[str, ...] = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)
-    """How many states come before them."""
+    """The number of states of the original problem, which come first."""
 
     def values(self, carried: Array) -> dict[str, Array]:
-        """The values by their paths."""
+        """The values of the unknowns, by their paths."""
         shapes = dict(zip(self.paths, self.shapes, strict=True))
         return by_path(carried * self.unit, shapes)
 
     def opened(self, k: RealScalar, X: Array) -> tuple[dict[str, Any], Array, Array]:
-        """The parts of the problem, the time and the state at step `k`."""
+        """The parts of the problem, the time and the original state at step `k`."""
         parts = with_values(self.parts, self.values(X[self.size :]))
         return parts, self.t0 + k * parts["dynamics"].dt, X[: self.size]
 
 
 def carried_by(problem: Problem, horizon: int) -> Carried:
-    """What is carried along, with bounds and guesses."""
+    """The additional states of a problem, with their bounds and guesses."""
     parts, named = parts_of(problem), bounds_by_path(problem, horizon)
     dtype, shapes = problem.x0.dtype, []
     columns = [jnp.zeros((3, 0), dtype)]
@@ -60,7 +60,7 @@ def carried_by(problem: Problem, horizon: int) -> Carried:
         fill = lambda a, v=value: jnp.broadcast_to(jnp.asarray(a, dtype), v.shape)
         columns.append(jnp.stack([jnp.ravel(fill(a)) for a in (*pair, value)]))
     low, high, guess = jnp.concatenate(columns, axis=1)
-    # In units of what they start from, so that none is tiny beside the states.
+    # In units of the guess, so that no unknown is tiny compared with the states.
     width = high - low
     width = jnp.where(jnp.isfinite(width) & (width > 0), width, 1)
     unit = jax.lax.stop_gradient(jnp.where(guess == 0, width, jnp.abs(guess)))
@@ -70,7 +70,7 @@ def carried_by(problem: Problem, horizon: int) -> Carried:
 
 
 class _Dynamics(AbstractDynamics):
-    """The dynamics with what is carried along; time counts the steps."""
+    """The dynamics with the additional states. Their time is the number of steps."""
 
     carried: Carried
     dt: Array
@@ -102,6 +102,8 @@ class _Dynamics(AbstractDynamics):
 
 
 class _Cost(AbstractCost):
+    """The cost as a function of the additional states too."""
+
     carried: Carried
 
     def __call__(self, t: RealScalar, x: Array, u: Array) -> Any:
@@ -114,6 +116,8 @@ class _Cost(AbstractCost):
 
 
 class _Constraint(eqx.Module):
+    """A constraint as a function of the additional states too."""
+
     carried: Carried
     field: str = eqx.field(static=True)
     name: str = eqx.field(static=True)
@@ -124,6 +128,8 @@ class _Constraint(eqx.Module):
 
 
 class _Difference(eqx.Module):
+    """The `difference` of states, and subtraction for the additional states."""
+
     carried: Carried
     function: Any
 
@@ -133,7 +139,7 @@ class _Difference(eqx.Module):
 
 
 def _constraints(given: Constraints, carried: Carried) -> Constraints:
-    """The constraints on the states with what is carried along."""
+    """The constraints of the problem with the additional states."""
     fields: dict[str, Any] = dict(controls=given.controls)
     for field in ("inequality", "equality", "final_inequality", "final_equality"):
         wrapped = {}
@@ -159,7 +165,8 @@ def _constraints(given: Constraints, carried: Carried) -> Constraints:
 
 
 def _widened(array: Any, size: int, count: int, fill: float) -> Array:
-    """Bounds of the states, with others for what is carried along."""
+    """Extend bounds of the states by `count` entries `fill` for the additional states.
+    """
     array = jnp.asarray(array)
     if array.ndim == 0:
         array = jnp.broadcast_to(array, (size,))
@@ -170,8 +177,8 @@ def _widened(array: Any, size: int, count: int, fill: float) -> Array:
 def with_carried(
     problem: Problem, start: Start, states: Array | None
 ) -> tuple[Problem, Start, Array | None, Carried]:
-    """The problem whose states carry the unknowns along, its start and its guess of the
-    states."""
+    """The problem with the unknowns as additional states, its start, its guess of the
+    states, and the description of the additional states."""
     unknowns, dynamics = problem.unknowns, problem.dynamics
     assert unknowns is not None
     carried = carried_by(problem, start.horizon)

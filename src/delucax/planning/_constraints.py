@@ -1,4 +1,4 @@
-"""The constraints of a plan, as a user gives them."""
+"""Constraints of a plan, as the user gives them."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
@@ -15,20 +15,22 @@ from ..qp import Soft
 
 
 class SoftConstraint(eqx.Module):
-    """A constraint that may be violated, at a cost: each of its values costs
-    `linear t + 1/2 quadratic t^2`, where `t` is by how much it is violated.
+    r"""A constraint that may be violated, at a cost.
 
-    A linear weight above the multiplier that the hard constraint has makes the solution
-    meet it where it can be met (an exact penalty).
+    If a value of the constraint is violated by $v$, it adds
+    $\mathrm{linear}\; v + \tfrac12\, \mathrm{quadratic}\; v^2$ to the cost.
+
+    If the linear weight is larger than the multiplier of the hard constraint, the
+    solution satisfies the constraint whenever that is possible (an exact penalty).
 
     **Arguments:**
 
-    - `function`: as one of [`delucax.planning.Constraints`][].
-    - `linear`: at least 0; a number, or one for each value of the function; 0 by
-        default.
-    - `quadratic`: likewise.
+    - `function`: a function as for [`delucax.planning.Constraints`][].
+    - `linear`: the linear weight, at least 0: a number, or one for each value of the
+        function; 0 by default.
+    - `quadratic`: the quadratic weight, of the same kind; 0 by default.
 
-    **Raises:** `ValueError` if `function` is not callable, or a weight is negative or
+    **Raises:** `ValueError` if `function` is not a function, or a weight is negative or
     not finite.
 
     Source: Kerrigan and Maciejowski, 2000.
@@ -69,7 +71,7 @@ class SoftConstraint(eqx.Module):
 def _as_functions(value: Any) -> Any:
     """A function, or a dictionary of functions."""
     if isinstance(value, Mapping):
-        # In the order that JAX gives to the keys of a dictionary.
+        # JAX sorts the keys of a dictionary in this order.
         names = sorted(value, key=str)
         return {str(name): as_module(value[name]) for name in names}
     return as_module(value)
@@ -86,38 +88,42 @@ _FUNCTIONS = "inequality", "equality", "final_inequality", "final_equality"
 
 
 class Constraints(eqx.Module):
-    """Constraints along a plan: `inequality(t, x, u) <= 0` and
-    `equality(t, x, u) = 0` at each step, `final_inequality(t, x) <= 0` and
-    `final_equality(t, x) = 0` at the end, and bounds.
+    r"""Constraints of a plan, at each step $k < T$ and at the end:
 
-    Each function returns a number or a vector. To give several, use a dictionary: its
-    keys name them in messages and in [`delucax.planning.Multipliers`][]. The
-    constraints of a step include the first step, whose state is given: a constraint on
-    the state alone must already hold there. Bounds on the
-    controls alone are cheaper as `bounds` of the planner.
+    $$c_\mathrm{in}(t_k, x_k, u_k) \le 0, \quad c_\mathrm{eq}(t_k, x_k, u_k) = 0, \quad
+    d_\mathrm{in}(t_T, x_T) \le 0, \quad d_\mathrm{eq}(t_T, x_T) = 0$$
+
+    These are the functions `inequality`, `equality`, `final_inequality` and
+    `final_equality`. Bounds on states and controls may be added.
+
+    Each function returns a number or a vector. To give several functions, use a
+    dictionary. Its keys name them in messages and in
+    [`delucax.planning.Multipliers`][]. The first step counts too, and its state is
+    given: a constraint on the state alone must already hold there.
 
     **Arguments:**
 
-    - `inequality`: a function of time, state and control, a
-        [`delucax.planning.SoftConstraint`][], or a dictionary of them; none by default.
-    - `equality`: likewise; none by default.
-    - `final_inequality`: likewise, of time and the last state; none by default.
-    - `final_equality`: likewise; none by default.
-    - `states`: `(low, high)`, each a number, or of shape `(n,)` or `(T+1, n)`; or a
-        [`delucax.qp.Soft`][] of them. The first row is ignored, because the first state
-        is given. None by default.
-    - `controls`: likewise, `(m,)` or `(T, m)`. Bounds that do not vary in time are
-        better `bounds` of the planner. None by default.
+    - `inequality`: a function `(t, x, u)`, a [`delucax.planning.SoftConstraint`][], or
+        a dictionary of these; none by default.
+    - `equality`: the same kinds; none by default.
+    - `final_inequality`: the same kinds, with functions `(t, x)`; none by default.
+    - `final_equality`: the same kinds, with functions `(t, x)`; none by default.
+    - `states`: bounds `(low, high)`, each a number or an array of shape `(n,)` or
+        `(T+1, n)`; or a [`delucax.qp.Soft`][] with such bounds. The first row is
+        ignored, because the first state is given. None by default.
+    - `controls`: bounds of the same kinds, of shape `(m,)` or `(T, m)`. For bounds that
+        do not vary in time, use `bounds` of the planner, which is cheaper. None by
+        default.
 
     Only [`delucax.planning.SQP`][] takes soft constraints and the bounds `states` and
     `controls`.
 
-    A function that is a module with [`delucax.parameter`][] fields can be
-    differentiated with respect to them.
+    To differentiate with respect to a number in a constraint, write the constraint as a
+    module with this number as a [`delucax.parameter`][].
 
-    **Raises:** `ValueError` if a constraint is not callable, bounds are not a pair of
-    numbers with `low <= high`, two constraints of a step or of the end share a name, or
-    no constraint is given.
+    **Raises:** `ValueError` if a constraint is not a function, bounds are not a pair of
+    numbers with `low <= high`, an inequality and an equality have the same name, or no
+    constraint is given.
 
     !!! example
 
@@ -137,7 +143,11 @@ class Constraints(eqx.Module):
             jnp.zeros((20, 1)),
             constraints=constraints,
         )
-        plan.states[-1], plan.violation
+        print(f"violation {plan.violation:.4f}")
+        ```
+
+        ```text
+        violation 0.0003
         ```
     """
 
@@ -184,9 +194,9 @@ class Constraints(eqx.Module):
                 )
 
     def named(self, field: str) -> dict[str, Callable[..., Any]]:
-        """The functions of one field by their names.
+        """The functions of one field, by their names.
 
-        **Arguments:** `field`: such as `"inequality"`.
+        **Arguments:** `field`: the name of the field, such as `"inequality"`.
         """
         value = getattr(self, field)
         if value is None:
@@ -195,40 +205,39 @@ class Constraints(eqx.Module):
 
     @property
     def is_hard(self) -> bool:
-        """Whether all are hard constraints by functions."""
+        """Whether all constraints are hard and given by functions."""
         functions = [f for field in _FUNCTIONS for f in self.named(field).values()]
         soft = any(isinstance(f, SoftConstraint) for f in functions)
         return not soft and self.states is None and self.controls is None
 
 
 Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
-"""The values of constraints, inequalities first, and which are of equalities."""
+"""The values of constraints, inequalities first, and which of them are equalities."""
 
 
 class Row(NamedTuple):
-    """What the values of one function have in common."""
+    """One constraint: the name, the number of values and the kind of a function."""
 
     name: str
     size: int
     is_equality: bool
-    weights: tuple[Any, Any] | None  # of a soft constraint
+    weights: tuple[Any, Any] | None  # `None` for a hard constraint
 
 
 def values_of(
     constraints: Constraints, final: bool, arguments: tuple, dtype: Any
 ) -> Values:
-    """The values of all constraints of a step, or of the end, one after the other."""
+    """The values of all constraints of a step, or of the end, in one vector."""
     parts, equal = [jnp.zeros(0, dtype)], [np.zeros(0, bool)]
     for _, function, is_equality in _each(constraints, final):
         c = jnp.ravel(jnp.asarray(function(*arguments), dtype))
         parts.append(c)
         equal.append(np.full(c.size, is_equality))
-    # The sizes are static, so no mask is needed.
     return jnp.concatenate(parts), jnp.asarray(np.concatenate(equal))
 
 
 def rows_of(constraints: Constraints, final: bool, arguments: tuple) -> list[Row]:
-    """What those values are, in their order."""
+    """Describe the values that `values_of` returns, in their order."""
     rows = []
     for name, function, equal in _each(constraints, final):
         try:
@@ -260,7 +269,7 @@ def rows_of(constraints: Constraints, final: bool, arguments: tuple) -> list[Row
 
 
 def _each(constraints: Constraints, final: bool):
-    """The name of each function, the function, and whether it is an equality."""
+    """Yield the name of each function, the function, and whether it is an equality."""
     start = "final_" if final else ""
     for kind in ("inequality", "equality"):
         for name, function in constraints.named(start + kind).items():
@@ -268,7 +277,8 @@ def _each(constraints: Constraints, final: bool):
 
 
 def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any) -> str:
-    """A sentence that names the most violated constraint, by how much, and where."""
+    """A sentence for messages: which constraint is violated most, how much, and where.
+    """
     T, violations = len(controls), []
     times = problem.times(T)
     stage = jax.vmap(lambda t, x, u: problem.stage_constraints(t, x, u)[0])
@@ -300,7 +310,7 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
     if not violations:
         return ""
     over, name, final = max(violations, key=lambda entry: entry[0].max())
-    # What is met up to rounding is not to blame.
+    # Do not blame a constraint that is violated only by rounding.
     if not over.max() > np.finfo(states.dtype).eps ** 0.5:
         return ""
     k, i = (int(j) for j in np.unravel_index(over.argmax(), over.shape))

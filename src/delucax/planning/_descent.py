@@ -1,4 +1,4 @@
-"""The iteration of iterative LQR and differential dynamic programming."""
+"""The iteration of iterative LQR and of differential dynamic programming."""
 
 import functools
 from collections.abc import Callable
@@ -18,24 +18,26 @@ from ._start import Start
 
 SEARCHES = ("parallel", "backtracking")
 HALVINGS = 12
-"""The shortest step tried is 2^-11 of the full one."""
+"""The line search tries 12 steps; the shortest is 2^-11 of the full step."""
 LEAST_SHARE = 1e-4
-"""The constant of sufficient decrease (Armijo): a share of the predicted decrease."""
+"""The Armijo constant: the least share of the predicted decrease."""
 FACTOR = 2.0
+"""The first factor by which the regularisation changes."""
 LEAST_MU = 1e-6
+"""A smaller regularisation is set to zero."""
 MOST_MU = 1e10
-"""The factor by which the regularisation changes first, and its range above zero."""
+"""The iteration gives up at a larger regularisation."""
 
 
 class Options(eqx.Module):
-    """The fields of `ILQR`, defaults filled in."""
+    """The fields of `ILQR` with their defaults filled in."""
 
     tolerance: Array
     constraint_tolerance: Array
     states: Array | None
-    """States to start from that need not follow from the controls."""
+    """States to start from, which need not follow from the controls."""
     penalty: Array
-    """The first weight of the squares of what violates a constraint."""
+    """The first weight of squared violations."""
     second_order: bool = eqx.field(static=True)
     regularise: str = eqx.field(static=True)
     line_search: str = eqx.field(static=True)
@@ -45,7 +47,7 @@ class Options(eqx.Module):
 
 
 class Outcome(NamedTuple):
-    """An iterate with its status; the last one is the outcome."""
+    """An iterate with its status. The last one is the outcome."""
 
     states: Array
     controls: Array
@@ -66,19 +68,19 @@ class _Progress(NamedTuple):
 
     now: Outcome
     policy: Policy
-    """That of the model about `now`."""
+    """The policy of the model about `now`."""
     defects: Array | None
-    """How far each step misses the next state, where the states were given."""
+    """By how much each step misses the next state; `None` without `options.states`."""
     delta: Array
     """The factor by which the regularisation last changed."""
     exact: Array
-    """Whether second derivatives of the dynamics are taken."""
+    """Whether the model has second derivatives of the dynamics."""
     penalty: Array
-    """The weight of the defects."""
+    """The weight of the defects in the merit function."""
     rounding: Array
     """By how much rounding may change the cost."""
     negligible: Array
-    """Whether the decrease that `policy` predicts is less than that."""
+    """Whether the decrease that `policy` predicts is below `rounding`."""
     events: "Events"
     started: Array
     """Whether the starts have been compared."""
@@ -86,18 +88,19 @@ class _Progress(NamedTuple):
 
 
 class Events(NamedTuple):
-    """What the searches saw of a hybrid plant's events; `None` of another plant.
+    """The events of a hybrid plant that the line searches saw; `None` for other plants.
 
-    - `counts`: how many each step of `now` has, shape `(T,)`; -1 where it is not known.
-    - `changed`: whether a candidate had others, since the last full step that was taken
-        without regularisation and without such a candidate.
+    - `counts`: the number of events in each step of `now`, shape `(T,)`; -1 if it is
+        not known.
+    - `changed`: whether a candidate had other numbers of events. It is reset by an
+        accepted step without regularisation whose search saw no such candidate.
     """
 
     counts: Array | None
     changed: Array | None
 
     def differ(self, counts: Array | None) -> Array | None:
-        """Whether a candidate has other events."""
+        """Whether a candidate with these `counts` has other events."""
         if self.counts is None or counts is None:
             return None
         return jnp.any((counts != self.counts) & (self.counts >= 0))
@@ -110,9 +113,11 @@ def optimise(
     options: Options,
     before: Outcome | None = None,
 ) -> Outcome:
-    """Iterate from the cheapest of the first `count` of stacked starts, or from the
-    controls of the first one and the states of the options if there are any; counting
-    on from `before`, if that is given."""
+    """Iterate from the cheapest of the first `count` stacked starts.
+
+    If the options have states, iterate from them and the controls of the first start.
+    If `before` is given, continue its trace and its counts.
+    """
     _, T, m = starts.controls.shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
     zero, infinite = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype)
@@ -121,7 +126,6 @@ def optimise(
     if options.states is not None:
         count = 0
         states = options.states.at[0].set(problem.x0)
-        # How far each step of the guess misses its next state, shape (T, n).
         inputs = problem.times(T)[:-1], states[:-1], controls, problem.w
         reached = jax.vmap(problem.step)(*inputs)
         defects = jax.vmap(problem.deviation)(reached, states[1:])
@@ -169,13 +173,16 @@ def _iterate(
     count: Array | int,
     before: _Progress,
 ) -> _Progress:
-    """A line search, and the model about where it led. The first one compares starts:
-    the loop has one body, so that one roll-out is compiled."""
+    """One line search, and the model about the trajectory that it found.
+
+    The first iteration compares the starts instead, in the same code, so that only one
+    roll-out is compiled.
+    """
     now, started, tolerance = before.now, before.started, options.tolerance
     searched = _searched(problem, options, starts, count, before)
     (states, controls, cost, defects), accepted, tried, events = searched
     lost = ~started & ~jnp.isfinite(cost)
-    # Fall back to Gauss-Newton if the exact Hessian is indefinite or the search failed.
+    # Fall back to Gauss-Newton if the exact Hessian is indefinite or its search failed.
     flatten = ~accepted & before.exact & options.second_order
     mu, delta = now.regularisation, before.delta
     changed = _schedule(accepted, mu, delta)
@@ -185,22 +192,20 @@ def _iterate(
     stuck = mu > MOST_MU
     failed = lost | stuck
     iteration = now.iterations + started
-    # One linear-quadratic problem about the present trajectory.
     about = problem, states, controls, defects, options.second_order
     stages = model(*about, exact, options.finite_difference)
     policy, residual, settled = directions(problem, stages, controls, mu, options)
     missed = 0.0 if defects is None else jnp.max(jnp.abs(defects))
     closed = missed <= tolerance * (1 + jnp.max(jnp.abs(states)))
-    # By how much rounding may change the cost: its own, and that of the states and
-    # controls that it is computed from, which weighs more where targets are far from
-    # zero.
+    # Rounding may change the cost itself, and the states and controls that it depends
+    # on. The second part is larger if the targets are far from zero.
     z = jnp.concatenate([states[:-1], controls], axis=1)
     terms = jnp.sum(jnp.abs(stages.h * z))
     terms = terms + jnp.sum(jnp.abs(stages.v * states[-1]))
     rounding = jnp.finfo(z.dtype).eps * (jnp.abs(cost) + terms)
-    # The predicted decrease may be below the rounding of the cost. Full steps still
-    # lower the gradient then; once they no longer do, the iteration has converged. A
-    # gradient that rises may lift the prediction above the rounding again.
+    # If the predicted decrease is below rounding, full steps may still lower the
+    # gradient. When they no longer do, the iteration has converged. `before.negligible`
+    # counts too, because a larger gradient may lift the prediction above rounding.
     predicted = -policy.slope - policy.curvature / 2
     negligible = (jnp.abs(predicted) <= rounding) & (mu == 0) & (tolerance > 0)
     spent = negligible | (before.negligible & accepted)
@@ -229,19 +234,19 @@ def _iterate(
 
 
 def _searched(problem, options, starts, count, before: _Progress):
-    """Backtracking line search: the states, controls, cost and defects after the
-    longest step of sufficient decrease, or as before; whether one was accepted; how
-    many were tried; and the events. Before the first iteration, those of the cheapest
-    of the starts.
+    """Backtracking line search. Before the first iteration it compares the starts.
 
-    The merit function is the cost plus `penalty` times the sum of the defects. The cost
-    is known to within `rounding`.
+    Returns the states, controls, cost and defects after the longest step of sufficient
+    decrease (or of the cheapest start), unchanged if no step is accepted; whether one
+    is accepted; the number of trials; and the events.
+
+    The merit function is the cost plus `penalty` times the sum of the defects.
     """
     now, policy, defects = before.now, before.policy, before.defects
     events = before.events
     missed = 0.0 if defects is None else jnp.sum(jnp.abs(defects))
-    # A step that only rounding makes worse is taken, or the search would end short of
-    # the minimum.
+    # A step that is worse only by rounding is accepted. Otherwise the search would fail
+    # near the minimum.
     slack = before.rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
     # Without a policy there is nothing to search along.
     halvings = jnp.where(policy.ok, HALVINGS, 0)
@@ -249,9 +254,9 @@ def _searched(problem, options, starts, count, before: _Progress):
     length_of = lambda i: 0.5 ** i.astype(now.cost.dtype)
 
     def trial(i):
-        """The rank of a trajectory, of which the lowest one is taken; itself; and
-        whether it has other events."""
-        # The feedback of a start is followed as it is: the change `k` is zero then.
+        """The rank of a trajectory (the lowest is taken), the trajectory, and whether
+        it has other events."""
+        # Before the first iteration `policy.k` is zero: a start is followed unchanged.
         own = now.states, now.controls, policy.K
         given = starts.states, starts.controls, starts.gains
         pick = lambda own, given: jnp.where(before.started, own, given[i])
@@ -260,8 +265,8 @@ def _searched(problem, options, starts, count, before: _Progress):
         along = xs, us, K, policy.k, length, defects
         path = roll_out(problem, *along, count_events=True)
         *_, cost, counts = path
-        # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
-        # times the defects, of which a step of length a closes that share.
+        # The model predicts a decrease of -(a slope + a^2 curvature / 2) for a step of
+        # length a. This step also closes the share a of the defects.
         curvature = length * policy.curvature / 2
         predicted = length * (before.penalty * missed - policy.slope - curvature)
         decrease = now.cost - cost + length * before.penalty * missed
@@ -288,7 +293,7 @@ def _searched(problem, options, starts, count, before: _Progress):
             kept = (i, new, path), (best, rank, candidate)
             return i + 1, *jax.tree.map(keep, *kept), other
 
-        # Steps are tried until one is accepted, all starts are compared.
+        # Steps are tried until one is accepted, but all starts are compared.
         going = lambda carry: (
             (carry[0] < number) & ~(before.started & jnp.isfinite(carry[2]))
         )
@@ -298,16 +303,15 @@ def _searched(problem, options, starts, count, before: _Progress):
         nothing = index, index, jnp.full_like(now.cost, jnp.inf), last, none
         tried, best, rank, candidate, other = lax.while_loop(going, body, nothing)
     accepted = jnp.isfinite(rank)
-    # Of starts that all diverge the first one is left, for what it shows.
+    # If all starts diverge, keep the first one, because the error describes it.
     keep = lambda new, old: jnp.where(
         accepted | (~before.started & (number > 0)), new, old
     )
     last = now.states, now.controls, now.cost, events.counts
     states, controls, cost, counts = jax.tree.map(keep, candidate, last)
-    # Its controls are finite at least as given.
+    # The controls along a diverged start may be NaN; the given ones are finite.
     controls = jnp.where(accepted, controls, now.controls)
     if defects is not None:
-        # A step of length a removes that share of the defects.
         left = (1 - length_of(best)) * defects
         defects = jnp.where(accepted, left, defects)
     if events.changed is not None and other is not None:
@@ -321,8 +325,8 @@ def first_accepted(
 ) -> tuple[Array, Any, Array]:
     """Try the candidates `0, ..., count - 1` in turn until `trial` accepts one.
 
-    Returns how many were tried, the last of them, and whether it was accepted.
-    `otherwise` has the structure of a candidate.
+    Returns the number of trials, the last candidate, and whether it was accepted. If
+    `count` is zero, the candidate is `otherwise`, which has the same structure.
     """
 
     def body(carry):
@@ -339,40 +343,41 @@ def first_accepted(
 def directions(
     problem: Problem, stages: Stages, controls: Array, mu: Array, options: Options
 ) -> tuple[Policy, Array, Array]:
-    """The policy of the model, the residual, and whether that is small enough."""
+    """The policy of the model, the residual, and whether the residual is small enough.
+    """
     box, tolerance = problem.room(controls), options.tolerance
     if options.parallel:
         policy = in_parallel(stages, mu)
     else:
         policy = in_sequence(stages, mu, options.regularise == "state", box)
     if stages.d is not None:
-        # The backward pass reads both off its terms, which holds only without defects.
+        # The slope and curvature of the backward pass are only valid without defects.
         slope, curvature = predicted_change(stages, policy.K, policy.k)
         policy = policy._replace(slope=slope, curvature=curvature)
     slope, enough = policy.gradient, tolerance * (1 + policy.scale)
     if box is None:
         residual = jnp.max(jnp.abs(slope))
         return policy, residual, residual <= enough
-    # Where a bound is met the gradient may be of any size, and how near the bound is
-    # has nothing to do with that size.
+    # At a bound the gradient may have any size. The distance to the bound is therefore
+    # compared with the control, not with the gradient.
     room = jnp.where(slope > 0, -box[0], box[1])
     small = jnp.abs(slope) <= enough
     met = room <= tolerance * (1 + jnp.abs(controls))
-    # The step to the projection of a gradient step, zero just at a stationary point.
+    # The projected gradient step is zero exactly at a stationary point.
     step = jnp.minimum(jnp.maximum(-slope, box[0]), box[1])
     return policy, jnp.max(jnp.abs(step)), jnp.all(small | met)
 
 
 def _penalty(before: Array, defects: Array | None, policy: Policy) -> Array:
-    """A weight of the defects with which the step goes downhill.
+    """A weight of the defects for which the merit function falls along the step.
 
     Source: Nocedal and Wright, 2006, equation 18.36.
     """
     if defects is None:
         return before
     # The merit function is cost + penalty |defects|_1. It falls along the step if
-    # penalty (1 - rho) |defects|_1 covers what the model says that the cost rises, with
-    # rho 0.1.
+    # penalty (1 - rho) |defects|_1, with rho = 0.1, exceeds the predicted rise of the
+    # cost.
     missed = jnp.sum(jnp.abs(defects))
     rise = policy.slope + jnp.maximum(policy.curvature, 0) / 2
     least = rise / (0.9 * jnp.where(missed > 0, missed, 1))
@@ -380,12 +385,12 @@ def _penalty(before: Array, defects: Array | None, policy: Policy) -> Array:
 
 
 def _schedule(accepted: Array, mu: Array, delta: Array) -> tuple[Array, Array]:
-    """The regularisation of the next iteration, and the factor it changed by.
+    """The regularisation of the next iteration, and the factor by which it changed.
 
     Source: Tassa, Erez and Todorov, 2012.
     """
-    # The factor itself grows while the direction stays the same, so that many orders of
-    # magnitude are crossed in a few iterations.
+    # The factor grows while the direction stays the same, so that the regularisation
+    # crosses many orders of magnitude in a few iterations.
     down = jnp.minimum(1 / FACTOR, delta / FACTOR)
     lower = jnp.where(mu * down > LEAST_MU, mu * down, 0)
     up = jnp.maximum(FACTOR, delta * FACTOR)

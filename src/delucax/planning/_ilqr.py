@@ -43,7 +43,7 @@ class ILQR(AbstractPlanner):
     current trajectory $\bar x$, $\bar u$, expands the cost to second order, cross terms
     included, and solves this linear-quadratic problem. It then follows
     $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ through the true dynamics,
-    where $-d_k$ is the change of the control in the solution, and $K_k$ its gain.
+    where the change $-d_k$ and the gain $K_k$ come from that solution.
 
     The line search tries the steps $\alpha = 1, 1/2, \dots, 1/2048$. It accepts a step
     if the cost falls by at least 1e-4 of the predicted decrease. It rejects a step if
@@ -59,28 +59,27 @@ class ILQR(AbstractPlanner):
     Call it like every [`delucax.planning.AbstractPlanner`][]. It takes hard constraints
     by the method of multipliers.
 
-    *Derivatives.* You can differentiate the plan, in both modes and to any order, with
-    respect to every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The
-    derivative comes from the implicit function theorem: it takes one linear-quadratic
-    problem at the solution, with exact second derivatives even if the iteration used
-    none. Derivatives are NaN unless the plan converged to a strict minimum. They are
-    zero with respect to `controls` and `states`, because the solution does not depend
-    on the start.
+    You can differentiate the plan, in both modes and to any order, with respect to
+    every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The derivative
+    comes from the implicit function theorem: it takes one linear-quadratic problem at
+    the solution, with exact second derivatives even if the iteration used none.
+    Derivatives are NaN unless the plan converged to a strict minimum. With respect to
+    `controls` and `states`, where the iteration starts, they are zero.
 
-    *Start.* The minimum is local, so it depends on the start. On an unstable plant,
-    controls without feedback lead far away, and the iteration may end at a stationary
-    point there. If `controls` is a number of steps, the iteration starts from
+    The minimum is local, so it depends on the start. On an unstable plant, controls
+    without feedback lead far away, and the iteration may end at a stationary point
+    there. If `controls` is a number of steps, the iteration starts from
     [`delucax.planning.Start.default`][], which also tries the trajectory of an LQR.
 
-    *Events.* The model of a hybrid plant only holds as long as the number of events in
-    each step is the same. If this number changes, the cost may have a kink or a jump.
-    If the iteration ends there without convergence, the result is `events_changed`, and
-    the plan is the best so far. To get a plan with other events, start from a
-    trajectory that has them.
+    For a hybrid plant, the model about a trajectory only holds while the number of
+    events in each step is the same. Where this number changes, the cost may have a kink
+    or a jump. If the iteration ends there without convergence, the result is
+    `events_changed`, and the plan is the best so far. To get a plan with certain
+    events, start from a trajectory that has them.
 
-    *Batches.* Under `jax.vmap` on CPU, the plans of a batch are computed one after the
-    other. This is up to six times as fast as all together, because no plan waits for
-    the line searches of another. On accelerators they are computed together.
+    Under `jax.vmap` on CPU, the plans of a batch are computed one after the other. This
+    is up to six times as fast as all together, because no plan waits for the line
+    searches of another. On accelerators they are computed together.
 
     **Arguments:**
 
@@ -275,9 +274,9 @@ def ilqr(
     - `no_feasible_point`: no penalty weight made the constraints hold.
     - `diverged`: every start diverges.
 
-    If it is not `successful`, the plan is the best iterate. If `plan.regularisation` is
-    not zero, this number was added to the control Hessian, which may not be positive
-    definite; the derivatives are then NaN unless it is.
+    If it is not `successful`, the plan is the best iterate. If the control Hessian at
+    the plan is not positive definite, `plan.regularisation` is what was added to it,
+    and the derivatives are NaN.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
     finite, the horizon is 0, or a lower bound is above an upper one; an error at run

@@ -1,10 +1,14 @@
-"""Derivatives of a plan, by the implicit function theorem.
+r"""Derivatives of an iLQR plan, by the implicit function theorem.
 
-At a solution the gradient of the Lagrangian is zero. So the change of the solution with
-the problem solves one linear-quadratic problem, with the exact second derivatives: with
-the conditions `g(z, p) = 0`, `dz = -(dg/dz)^-1 dg/dp dp`, and `dg/dz` is the matrix of
-that problem. No iteration is differentiated, so neither the number of iterations nor
-the start has a part in the derivative.
+The gradient of the Lagrangian is zero at the solution $z$ of a problem with parameters
+$p$. From these conditions, $g(z, p) = 0$, follows
+
+$$\mathrm{d}z = -\left(\frac{\partial g}{\partial z}\right)^{-1}
+\frac{\partial g}{\partial p}\, \mathrm{d}p.$$
+
+The matrix $\partial g / \partial z$ is that of a linear-quadratic problem with the exact
+second derivatives, so one such problem gives the derivative. The iteration is not
+differentiated: the derivative does not depend on the number of iterations or the start.
 """
 
 from typing import Any, NamedTuple
@@ -38,19 +42,19 @@ from ._start import controls_of
 
 
 REFINEMENTS = 20
-"""The refinements of the constrained linear solve, each worth more than a digit."""
+"""The refinements of the constrained linear solve. Each adds more than one digit."""
 STIFFER = 10.0
-"""The weight of the constraints in it, relative to the planner's last one."""
+"""The weight of the constraints in this solve, relative to the last penalty weight."""
 
 
 def _tangents(
     out: Outcome, primals: Any, varied: Any, rest: Any, change: Any
 ) -> dict[str, Array]:
-    """The tangents of the trajectory, its cost and the gains."""
+    """The tangents of the trajectory, its cost, the gains and the multipliers."""
     problem, start, options = primals
     solved = out.result == RESULTS.successful
-    # A failed outcome is not used, but derivatives at it must be finite for those of
-    # other members of a batch: so they are taken at the start.
+    # The derivatives of a failed plan are NaN. They are computed at the start, because
+    # NaN inside would spoil the other members of a batch.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
     X = jnp.where(solved, out.states, x0)
     U = jnp.where(solved, out.controls, controls_of(start))
@@ -62,8 +66,8 @@ def _tangents(
     @full_precision
     @products_whole()
     def gains(given, tangents):
-        """The tangent of the gains of the last backward pass, which depend on the
-        problem and the solution alone."""
+        """The tangent of the gains. The gains of the last backward pass only depend on
+        the problem and the solution."""
         varied, rest, X, U, y, mu, free = given
 
         def after(varied, X, U, y):
@@ -77,7 +81,8 @@ def _tangents(
         return jax.jvp(after, (varied, X, U, y), tangents)[1]
 
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
-    # Few need it, and it takes the third derivatives of the problem.
+    # Deferred, because it needs the third derivatives of the problem and is rarely
+    # used.
     about = varied, rest, X, U, y, out.regularisation, free
     dK = deferred(gains, out.gains, about, (change, dX, dU, dy))
     ok = solved & definite
@@ -91,16 +96,16 @@ def _change(
     """The tangents of states, controls and multipliers; which controls are free; and
     whether the solution is a strict minimum."""
     n, T = X.shape[1], U.shape[0]
-    # Without the squares the augmented Lagrangian is the Lagrangian.
+    # With a weight of zero, the augmented Lagrangian is the Lagrangian.
     plain = None if y is None else y._replace(rho=jnp.zeros_like(y.rho))
-    # The exact second derivatives: those of the Lagrangian, costates included.
+    # The Hessian of the Lagrangian, with exact second derivatives.
     stages = model(problem.with_multipliers(plain), X, U, None, True)
     costates = costates_of(stages.F, stages.h, stages.v)
     z = jnp.concatenate([X[:-1], U], axis=1)
 
     def conditions(varied):
-        """The optimality conditions at the fixed solution. Their tangents with respect
-        to the problem are the right side of the linear problem."""
+        """The optimality conditions at the fixed solution. Their tangents are the right
+        side of the linear problem."""
         problem = given(varied).with_multipliers(plain)
         times = problem.times(T)
 
@@ -117,25 +122,26 @@ def _change(
             c = [c for c, _ in problem.constraints_along(X, U)]
         return (h, after, v), problem.x0, problem.bounds, c
 
-    # Only products with the tangent are needed, whatever number of parameters varies.
+    # One product with the tangent, even if many parameters vary.
     at, linear = jax.jvp(conditions, (varied,), (change,))
     ((slope, *_), *_), ((h, d, v), dx0, ends, dc) = at, linear
     free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
     if problem.bounds is not None:
-        # A control that a bound holds moves with the bound. One that is on it with a
-        # slope of zero is about to leave it, and counts as free.
+        # A control that is held at a bound moves with the bound. A control at a bound
+        # with a slope of zero is about to leave it, and counts as free.
         low, high = problem.bounds
         at_low = (U <= low) & (slope[:, n:] > 0)
         at_high = (U >= high) & (slope[:, n:] < 0)
         free = ~(at_low | at_high)
         fixed = jnp.where(at_low, ends[0], jnp.where(at_high, ends[1], fixed))
-    # The quadratic terms of the problem, with the tangents as its linear terms.
+    # The linear problem: the quadratic terms of the model, with the tangents as linear
+    # terms.
     stages = stages._replace(h=h, d=d, v=v)
     if y is None:
         factors = factorise(stages, free)
         dX, dU = substitute(stages, factors, dx0, fixed, free)
         return dX, dU, None, free, jnp.all(factors.ok)
-    # The slopes of the constraints that hold with equality; zero for the others.
+    # The Jacobians of the active constraints; zero for the others.
     times = problem.times(T)
     stage = lambda z, t: problem.stage_constraints(t, z[:n], z[n:])
     final = lambda x: problem.final_constraints(times[-1], x)
@@ -149,10 +155,10 @@ def _change(
 
 
 def _with_constraints(stages, active, dc, y, dx0, fixed, free):
-    """The linear problem with equality constraints `G dz + dc = 0`, by the method of
+    """Solve the linear problem under the constraints `G dz + dc = 0`, by the method of
     multipliers."""
     (G, on), (end, at_end) = active
-    # The quadratic part is the same in each refinement, so it is factorised once.
+    # All refinements have the same quadratic part, so it is factorised once.
     rho = STIFFER * y.rho
     dc = jnp.where(on, dc[0], 0), jnp.where(at_end, dc[1], 0)
     H = stages.H + rho * jnp.einsum("tpi,tpj->tij", G, G)
@@ -169,7 +175,7 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
         moved = jnp.einsum("tpi,ti->tp", G, dz) + dc[0], end @ dX[-1] + dc[1]
         return dX, dU, (dy[0] + rho * moved[0], dy[1] + rho * moved[1])
 
-    # Each pass contracts the error of the multipliers by about 1 / rho.
+    # Each pass divides the error of the multipliers by about rho.
     refine = lambda dy, _: (minimum(dy)[2], None)
 
     nothing = jnp.zeros_like(y.stage), jnp.zeros_like(y.final)
@@ -189,11 +195,11 @@ class Factors(NamedTuple):
 
 
 def factorise(stages: Stages, free: Array) -> Factors:
-    """The quadratic part of the recursion, controls that are not free held."""
+    """Factorise the quadratic part. Controls that are not `free` are held."""
     n = stages.V.shape[0]
 
-    # As `in_sequence`, without regularisation: where the problem is not convex there is
-    # no strict minimum, and no derivative.
+    # Like `in_sequence`, but without regularisation: if the problem is not convex, the
+    # solution is not a strict minimum and has no derivative.
     def back(V, here):
         F, H, free = here
         M = H + product(F.T, product(V, F))
@@ -208,13 +214,15 @@ def factorise(stages: Stages, free: Array) -> Factors:
 def substitute(
     stages: Stages, factors: Factors, dx0: Array, fixed: Array, free: Array
 ) -> tuple[Array, Array]:
-    """The minimum, linear in `h`, `d`, `v`, `dx0` and the changes `fixed` of the
-    controls that are not free; written so that it transposes."""
+    """The minimum of the linear-quadratic problem with factorised quadratic part.
+
+    It is linear in `h`, `d`, `v`, `dx0` and the changes `fixed` of the controls that
+    are not free, and JAX can transpose it.
+    """
     n = dx0.shape[0]
 
     def back(v, here):
-        # As in `factorise`, for the linear terms: change = -Quu^-1 (Qu + Quu fixed)
-        # where free, and `fixed` elsewhere.
+        # The change is -Quu^-1 (Qu + Quu fixed) for free controls, `fixed` for others.
         F, h, d, V, M, free, fixed = here
         g = h + apply(F.T, v + apply(V, d))
         push = (g[n:] + apply(M[:, n:], fixed))[:, None]

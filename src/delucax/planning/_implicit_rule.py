@@ -1,4 +1,4 @@
-"""The derivative rule of the planners that converge to a stationary point."""
+"""The derivative rule of planners that converge to a stationary point."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,12 +17,12 @@ from ._start import Start
 def implicit(
     where: str, iterate: Callable[..., Any], tangents: Callable[..., dict[str, Any]]
 ) -> Callable[[Problem, Start, Any], Any]:
-    """`iterate(problem, start, options)` with derivatives with respect to the problem.
+    """Give `iterate(problem, start, options)` derivatives with respect to the problem.
 
-    They are `tangents(out, given, varied, rest, change)`, by the names of the fields of
-    the outcome; the other fields have none. `given` are the arguments of `iterate`.
-    `varied` and `rest` are the parts of the problem with and without a tangent, so that
-    nothing else is differentiated; `change` is the tangent.
+    `tangents(out, given, varied, rest, change)` returns the tangents by the names of
+    the fields of the outcome. The other fields have tangents of zero. `given` are the
+    arguments of `iterate`. `varied` is the part of the problem that has a tangent,
+    `rest` the other part, and `change` the tangent.
     """
 
     @eqx.filter_custom_jvp
@@ -38,10 +38,10 @@ def implicit(
             raise ValueError(
                 f"{where}: the dynamics, the cost or a constraint closes over a number "
                 "that is differentiated, or that a transformation outside traces. Make "
-                "it a field of a module, a `delucax.parameter()`."
+                "this number a field of a module, with `delucax.parameter()`."
             )
         out = outcome(*primals)
-        # A tangent of None is known to be zero.
+        # A tangent of None means zero.
         zeros = jax.tree.map(lambda _: None, out)
         if not jax.tree.leaves(change):
             return out, zeros
@@ -54,9 +54,9 @@ def implicit(
         return out, zeros._replace(**changes)
 
     def solve(problem: Problem, start: Start, options: Any) -> Any:
-        # Traced here: a derivative repeats the program, not the tracing of it.
+        # Trace here, so that a derivative does not trace the iteration again.
         iteration = hoisted(iterate, problem, start, options)
-        # The derivative, traced elsewhere, would meet it as a tracer that has escaped.
+        # A tracer that the iteration closes over would have escaped in the derivative.
         traced = not all(map(is_concrete, jax.tree.leaves(iteration)))
         return outcome(iteration, problem, start, options, traced)
 

@@ -1,7 +1,11 @@
-"""The linear-quadratic model of a problem about a trajectory, and its solution.
+r"""The linear-quadratic model of a problem about a trajectory, and its solution.
 
-Each iteration of a planner minimises `sum_k 1/2 z'H z + h'z + 1/2 x_T'V x_T + v'x_T`
-along `x_next = F z + d`, with `z = (x, u)`, in sequence or in parallel over time.
+Each iteration of a planner minimises
+
+$$\sum_k \left(\tfrac12 z_k' H_k z_k + h_k' z_k\right)
++ \tfrac12 x_T' V x_T + v' x_T, \qquad z_k = (x_k, u_k),$$
+
+along $x_{k+1} = F_k z_k + d_k$, in sequence or in parallel over time.
 """
 
 from collections.abc import Callable
@@ -27,13 +31,13 @@ from ._problem import Problem, Values
 
 
 _SMALL_INNER = 16
-"""Products of matrices with an inner dimension up to this are sums."""
+"""Matrix products with an inner dimension up to this are computed as sums."""
 _ELIMINATED = 5
-"""Systems of this many controls are solved entry by entry."""
+"""Linear systems up to this size are solved entry by entry."""
 
 
 class Stages(NamedTuple):
-    """The problem; `d` is `None` where all defects are zero."""
+    """The linear-quadratic problem; `d` is `None` if all defects are zero."""
 
     F: Array  # (T, n, n + m)
     H: Array  # (T, n + m, n + m)
@@ -44,14 +48,14 @@ class Stages(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """The changes `-k - K dx` of the controls, and the predicted change of the cost:
-    `alpha slope + alpha^2 curvature / 2` for a step of length `alpha`.
+    """The changes `-k - K dx` of the controls. For a step of length `alpha`, the model
+    predicts that the cost changes by `alpha slope + alpha^2 curvature / 2`.
     """
 
     K: Array
     k: Array
     gradient: Array  # of the cost-to-go with respect to each control, (T, m)
-    scale: Array  # the size of the two terms that cancel in it
+    scale: Array  # the size of the two terms that cancel in the gradient
     slope: Array
     curvature: Array
     ok: Array
@@ -69,13 +73,13 @@ def model(
 ) -> Stages:
     """The linear-quadratic model of the problem about a trajectory.
 
-    The second derivatives of dynamics and constraints are left out where `use_exact` is
-    false. With a `spacing` the dynamics are linearised by central differences.
+    With `second_order` it has the second derivatives of dynamics and constraints, unless
+    the traced flag `use_exact` is false. With a `spacing`, the dynamics are linearised by
+    central differences.
     """
     size, times = states.shape[1], problem.times(controls.shape[0])
     t, end = times[:-1], times[-1]
-    # State and control are one vector, so that each derivative is taken once, with its
-    # cross terms.
+    # One vector of state and control gives the cross terms in the same derivative.
     z = jnp.concatenate([states[:-1], controls], axis=1)
     like = jax.tree.map(
         lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), (z, t, problem.w)
@@ -95,7 +99,7 @@ def model(
     if problem.multipliers is not None:
         y, end_y, rho = problem.multipliers
     if spacing is None:
-        # In reverse mode if possible, because a step has fewer outputs than inputs.
+        # Reverse mode if possible, because a step has fewer outputs than inputs.
         slopes = first_possible(jax.jacrev(step), jax.jacfwd(step))
     else:
         slopes = central(step, spacing, problem.deviation)
@@ -104,25 +108,24 @@ def model(
     h, H, push = jax.vmap(each)(z, t, y)
     v, V, end_push = expanded(final_cost, final_constraints, end_y, rho, states[-1])
     if second_order:
-        # The Hessian of the Hamiltonian, cost + costate' F: the curvature of the
-        # dynamics is weighted by the costates, that of constraints by multipliers.
+        # The Hessian of the Hamiltonian weights the curvature of the dynamics by the
+        # costates, and the curvature of the constraints by the multipliers.
         def lagrangian(z, t, w, costate, push):
             value = costate @ step(z, t, w)
             return value if push is None else value + push @ constraints(z, t)[0]
 
-        # Forward over reverse is cheapest. Implicit solvers inside may have one mode
-        # only.
+        # Forward over reverse is cheapest, but an implicit solver inside may only have
+        # one mode.
         slope = jax.grad(lagrangian)
         ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(lagrangian))
         given = z, t, problem.w, costates_of(F, h, v), push
-        # Both are computed where a flag of the loop decides, because the flag is
-        # traced.
+        # The flag is traced, so the second derivatives are computed in any case.
         used = lambda M: M if use_exact is None else jnp.where(use_exact, M, 0)
         H = H + used(jax.vmap(first_possible(*ways))(*given))
         if end_push is not None:
             at_end = lambda x: end_push @ final_constraints(x)[0]
             V = V + used(jax.hessian(at_end)(states[-1]))
-    # Rounding leaves Hessians not quite symmetric, which the backward pass relies on.
+    # The backward pass relies on symmetry, which rounding breaks.
     stages = Stages(F, symmetric(H), h, defects, symmetric(V), v)
     return jax.tree.map(lambda a: a.astype(states.dtype), stages)
 
@@ -136,12 +139,13 @@ def expanded(
     z: Array,
     *rest: Array,
 ) -> tuple[Array, Array, Array | None]:
-    """The gradient of a cost and of the augmentation by constraints with multipliers
-    `y`; its Hessian by Gauss and Newton, the exact one of the cost and `rho J'J` of the
-    constraints that act; and the force of each, `y + rho c`."""
+    """The expansion of the augmented Lagrangian of constraints with multipliers `y`:
+    its gradient, its Gauss-Newton Hessian (that of the cost plus `rho J'J` of the
+    active constraints), and the force `y + rho c` of each constraint."""
 
     def slope(z):
-        h = jax.grad(lambda z: cost(z, *rest) + 0.0)(z)  # also of an integer cost
+        # `+ 0.0`, because an integer cost has no gradient.
+        h = jax.grad(lambda z: cost(z, *rest) + 0.0)(z)
         return h, h
 
     def values(z):
@@ -159,8 +163,10 @@ def expanded(
 
 
 def costates_of(F: Array, h: Array, v: Array) -> Array:
-    """The gradient of the cost with respect to each next state, shape `(T, n)`, by the
-    adjoint equation `p_k = h_x + A'p_{k+1}` with the last one `v`."""
+    """The gradient of the cost with respect to each next state, shape `(T, n)`.
+
+    It solves the adjoint equation `p_k = h_x + A'p_{k+1}` from `p_T = v`.
+    """
     size = v.shape[0]
 
     def back(costate, here):
@@ -171,11 +177,11 @@ def costates_of(F: Array, h: Array, v: Array) -> Array:
 
 
 def central(f: Any, spacing: float, deviation: Any) -> Any:
-    """The Jacobian in the first argument by central differences: two calls for each
-    of its entries."""
+    """The Jacobian with respect to the first argument, by central differences: two
+    calls for each of its entries."""
 
     def evaluate(z, *args):
-        # By the deviation, because a wrapped angle may jump between the two sides.
+        # `deviation`, because a wrapped angle may jump between the two sides.
         def along(way):
             change = spacing * way
             return deviation(f(z + change, *args), f(z - change, *args))
@@ -187,10 +193,10 @@ def central(f: Any, spacing: float, deviation: Any) -> Any:
 
 
 def product(a: Array, b: Array) -> Array:
-    """`a @ b`, as a sum of outer products where it is small.
+    """`a @ b`, as a sum of outer products if the matrices are small.
 
-    XLA on CPU makes one loop of it that vectorises, and fuses it with what is around,
-    where a product of small matrices is a call of its own.
+    XLA on CPU turns the sum into one vectorised loop and fuses it with the operations
+    around it. A matrix product would be a separate call.
     """
     if a.shape[1] > _SMALL_INNER:
         return a @ b
@@ -198,26 +204,27 @@ def product(a: Array, b: Array) -> Array:
 
 
 def apply(matrix: Array, vector: Array) -> Array:
-    """`matrix @ vector`, likewise."""
+    """`matrix @ vector`, computed as in `product`."""
     return product(matrix, vector[:, None])[:, 0]
 
 
 def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """`matrix^-1 right` of a symmetric matrix, and whether it is positive definite.
+    """`matrix^-1 right` for a symmetric matrix, and whether the matrix is positive
+    definite.
 
-    Where it is not, the solution means nothing, but is finite if its arguments are.
+    If it is not, the solution is meaningless, but finite if the arguments are.
     """
     m = matrix.shape[0]
     if m > _ELIMINATED:
         ok = is_definite(matrix)
         safe = jnp.where(ok, matrix, jnp.eye(m, dtype=matrix.dtype))
         return solve(safe, right), ok
-    # No pivoting: a definite matrix needs none. Rows of the matrix start at the
-    # diagonal, as what is to the left of it follows by symmetry. They are kept apart
-    # from the right sides, in which the solution is linear.
+    # A definite matrix needs no pivoting. By symmetry, only the entries from the
+    # diagonal on are kept. They are separate from the right sides, in which the
+    # solution is linear.
     rows = [matrix[i, i:] for i in range(m)]
     sides = [right[i] for i in range(m)]
-    # A pivot below this share of its diagonal entry may be rounding alone.
+    # A pivot below this share of its diagonal entry may be only rounding.
     least = m * jnp.finfo(matrix.dtype).eps
     pivots, ok = [], jnp.asarray(True)
     for i in range(m):
@@ -241,15 +248,15 @@ def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
 def in_sequence(
     stages: Stages, mu: Array, on_state: bool, box: Any = None, free: Any = None
 ) -> Policy:
-    """The regularised recursion, back in time.
+    r"""Solve the problem by the regularised Riccati recursion, backwards in time.
 
-    With the cost-to-go `1/2 x'V x + v'x` of the next state, that of a stage is
-    `1/2 z'M z + g'z` with `M = H + F'V F`, `g = h + F'(v + V d)`. Its minimum over the
-    control, of the blocks `Quu`, `Qux`, `Qu`, is `-k - K dx`, `k = Quu^-1 Qu`,
-    `K = Quu^-1 Qux`.
+    The cost-to-go of the next state is $\tfrac12 x'V x + v'x$. Together with the cost of
+    the stage it is $\tfrac12 z'M z + g'z$, with $M = H + F'V F$ and $g = h + F'(v + V d)$.
+    With their blocks $Q_{uu}$, $Q_{ux}$ and $Q_u$, its minimum over the control is at
+    $-k - K \delta x$, with $k = Q_{uu}^{-1} Q_u$ and $K = Q_{uu}^{-1} Q_{ux}$.
 
-    `box` is `(low, high)` of each change of a control, shapes `(T, m)`, if there are
-    bounds. `free`, boolean, shape `(T, m)`, says which controls may change at all.
+    `box` holds the bounds `(low, high)` of the changes of the controls, each of shape
+    `(T, m)`. The boolean array `free`, shape `(T, m)`, says which controls may change.
 
     Source: Tassa, Erez and Todorov, 2012; Tassa, Mansard and Todorov, 2014 (bounds).
     """
@@ -263,8 +270,8 @@ def in_sequence(
         pushed = apply(F.T, v if d is None else v + apply(V, d))
         g = h + pushed
         Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
-        # Either mu |dx_next|^2 / 2 or mu |du|^2 / 2 is added to what is minimised, but
-        # not to the cost-to-go, which stays that of the policy.
+        # Add mu |dx_next|^2 / 2 or mu |du|^2 / 2 to what is minimised over the control.
+        # The cost-to-go does not include it: it stays the true one of the policy.
         if on_state:
             extra = mu * product(F[:, n:].T, F)
         else:
@@ -277,29 +284,29 @@ def in_sequence(
         K, k = S[:, :n], S[:, n] if change is None else -change
         ok = ok & jnp.all(jnp.isfinite(k))
         K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
-        # The cost-to-go under any K and k: the shorter forms hold at the minimum alone,
-        # and bounds and the regularisation lead away from it.
+        # These formulas hold for any K and k. The shorter ones hold only at the minimum,
+        # from which bounds and regularisation lead away.
         Quu_k = apply(Quu, k)
         D = product(K.T, product(Quu, K) - Qux)
         V = M[:n, :n] + D - product(Qux.T, K)
         v = g[:n] + apply(K.T, Quu_k - Qu) - apply(Qux.T, k)
-        # Rounding would let V drift away from symmetry over a long horizon.
+        # Symmetrise, because V would lose its symmetry over a long horizon by rounding.
         return ((V + V.T) / 2, v), (K, k, Qu, pushed[n:], Quu_k, ok)
 
     xs = (stages.F, stages.H, stages.h, stages.d, box, free)
     _, kept = lax.scan(back, (stages.V, stages.v), xs, reverse=True)
     K, k, Qu, pushed, Quu_k, ok = kept
-    # Along -a k the cost changes by -a k'Qu + a^2 k'Quu k / 2, summed over the stages.
+    # A step -a k changes the cost by the sum of -a k'Qu + a^2 k'Quu k / 2.
     slope, curvature = -jnp.sum(k * Qu), jnp.sum(k * Quu_k)
     scale = jnp.max(jnp.abs(pushed))
     return Policy(K, k, Qu, scale, slope, curvature, jnp.all(ok))
 
 
 def solve_free(matrix: Array, right: Array, free: Array | None) -> tuple[Array, Array]:
-    """As `solve_definite`, over the entries that are free; zero in the others."""
+    """Like `solve_definite`, but only for the `free` entries; the others are zero."""
     if free is None:
         return solve_definite(matrix, right)
-    # Rows and columns of the others become those of the identity: the sizes stay fixed.
+    # The other rows and columns become those of the identity, so that the shape stays.
     both = free[:, None] & free[None]
     matrix = jnp.where(both, matrix, jnp.eye(free.shape[0], dtype=matrix.dtype))
     return solve_definite(matrix, jnp.where(free[:, None], right, 0))
@@ -308,13 +315,13 @@ def solve_free(matrix: Array, right: Array, free: Array | None) -> tuple[Array, 
 def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """The minimum of `1/2 u'H u + g'u` between bounds, and which entries are free.
 
-    By projected Newton steps, which find the active bounds in a few.
+    Projected Newton steps find the active bounds in a few iterations.
 
     Source: Bertsekas, 1982; Tassa, Mansard and Todorov, 2014.
     """
     m = g.shape[0]
     if m == 1:
-        # Of one control it is the free minimum, clipped.
+        # For one control, the solution is the free minimum, clipped.
         ok = H[0] > 0
         u = jnp.clip(-g / jnp.where(ok, H[0], 1), low, high)
         return u, (u > low) & (u < high)
@@ -332,14 +339,14 @@ def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Ar
     def body(state):
         u, _, count = state
         slope = gradient(u)
-        # Entries near a bound and on the way to it are kept out of the Newton step,
-        # or they would shorten it.
+        # Entries that are near a bound and move towards it would shorten the Newton
+        # step, so they are left out of it.
         plain = -slope / steep
         left = jnp.max(jnp.abs(jnp.clip(u + plain, low, high) - u))
         free = is_free(u, slope, jnp.minimum(left, 0.01 * (high - low)))
         newton, _ = solve_free(H, -slope[:, None], free)
         step = jnp.where(free, newton[:, 0], plain)
-        # The projected line search, for all lengths at once: they are few and cheap.
+        # All step lengths at once, because they are few and cheap.
         tried = jnp.clip(u + lengths[:, None] * step, low, high)
         values = jax.vmap(value)(tried)
         best = tried[jnp.argmin(values)]
@@ -356,9 +363,9 @@ def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Ar
 
 @full_precision
 def in_parallel(stages: Stages, mu: Array) -> Policy:
-    """The recursion by associative scans, of logarithmic depth in the horizon.
+    """Solve the problem by associative scans, whose depth is logarithmic in the horizon.
 
-    The control is regularised as if `mu |du|^2 / 2` were a cost.
+    The regularisation adds `mu |du|^2 / 2` to the cost of each stage.
 
     Source: Sarkka and Garcia-Fernandez, 2023.
     """
@@ -374,8 +381,8 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     ok = jnp.all(jnp.isfinite(solution.K)) & jnp.all(jnp.isfinite(solution.k))
     parts = solution.X[1:], solution.p[1:], solution.K, solution.k
     X, p, K, k = (jnp.where(ok, part, 0) for part in parts)
-    # The gradient of stage cost and cost-to-go, 1/2 x'X x + p'x of the next state, with
-    # respect to the control.
+    # The part of the gradient with respect to the control that comes from the
+    # cost-to-go 1/2 x'X x + p'x of the next state.
     shift = 0 if d is None else jnp.einsum("tij,tj->ti", X, d)
     pushed = jnp.einsum("tji,tj->ti", B, p + shift)
     slope, curvature = predicted_change(stages, K, k)
@@ -383,7 +390,7 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
 
 
 def predicted_change(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
-    """Slope and curvature of the cost along the step, by following the linear model."""
+    """The slope and the curvature of the cost along the step, from the linear model."""
     F, H, h, d, V, v = stages
 
     def forward(dx, here):

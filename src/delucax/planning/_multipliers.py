@@ -1,4 +1,4 @@
-"""Lagrange multipliers by the names of their constraints."""
+"""Lagrange multipliers, by the names of their constraints."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,23 +14,31 @@ from ._constraints import Constraints, rows_of
 
 
 class Multipliers(eqx.Module):
-    """The Lagrange multipliers of a plan under constraints: the derivative of the
-    optimal cost with respect to what each constraint is tightened by.
+    r"""The Lagrange multipliers of a plan under constraints.
 
-    Those of inequalities and bounds are at least 0, and 0 where there is slack. An
-    earlier plan as the start of a planner gives its multipliers too.
+    A multiplier $y$ is a derivative of the optimal cost: if the constraint
+    $c(t, x, u) \le 0$ is tightened to $c(t, x, u) + e \le 0$, the cost rises by $y\, e$
+    to first order. The same holds for equalities. Multipliers of inequalities and
+    bounds are at least 0, and they are 0 if the constraint is inactive.
+
+    If a planner starts from an earlier plan, it also starts from its multipliers.
 
     **Attributes:**
 
-    - `stage`: of the constraints `inequality` and `equality` by their names, each of
-        shape `(T, p)`.
-    - `final`: of `final_inequality` and `final_equality` by their names, each `(p,)`.
-    - `states`: of bounds, a pair `(lower, upper)` of shape `(T+1, n)`; `None` without.
-    - `controls`: likewise, of shape `(T, m)`. [`delucax.planning.ILQR`][] has none.
-    - `costates`: of `x_0` as given and of `x_{k+1} = F(t_k, x_k, u_k)`, shape
-        `(T+1, n)`: minus the derivative of the cost from stage `k` on with respect to
-        `x_k`, as in [`delucax.qp.StagedMultipliers`][]. `ILQR` has none.
-    - `penalty`: the last weight of violated constraints of `ILQR`; `SQP` has none.
+    - `stage`: those of the constraints `inequality` and `equality`, by their names,
+        each of shape `(T, p)` for a constraint with `p` values.
+    - `final`: those of `final_inequality` and `final_equality`, by their names, each of
+        shape `(p,)`.
+    - `states`: those of the bounds of states, a pair `(lower, upper)` of arrays of
+        shape `(T+1, n)`; `None` without such bounds.
+    - `controls`: those of the bounds of controls, a pair `(lower, upper)` of arrays of
+        shape `(T, m)`; `None` without bounds, and always for
+        [`delucax.planning.ILQR`][].
+    - `costates`: those of the dynamics, shape `(T+1, n)`. Row `k` is minus the
+        derivative of the cost from stage `k` on with respect to $x_k$, as in
+        [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`.
+    - `penalty`: the last penalty weight of `ILQR`; `None` for
+        [`delucax.planning.SQP`][].
 
     !!! example
 
@@ -50,6 +58,10 @@ class Multipliers(eqx.Module):
         )
         plan.multipliers.stage["speed"].max()
         ```
+
+        ```text
+        Array(1.01, dtype=float32)
+        ```
     """
 
     stage: dict[str, Array]
@@ -65,7 +77,7 @@ class Multipliers(eqx.Module):
 def by_name(
     constraints: Constraints | None, final: bool, arguments: tuple, y: Array
 ) -> dict[str, Array]:
-    """The entries of `y` along its last axis, by the names of their constraints."""
+    """Split `y` along its last axis, by the names of the constraints."""
     named, start = {}, 0
     for row in [] if constraints is None else rows_of(constraints, final, arguments):
         named[row.name] = y[..., start : start + row.size]
@@ -76,8 +88,8 @@ def by_name(
 def in_order(
     constraints: Constraints | None, final: bool, arguments: tuple, given: Any, y: Array
 ) -> Array:
-    """The multipliers `given` by name, where they have the shape of the entries of `y`,
-    which is zero, and zero for the others."""
+    """The multipliers `given` by name, as one array like `y`. The entries of a
+    constraint are zero if it is not given or has another shape."""
     parts = [jnp.zeros_like(y[..., :0])]
     for name, part in by_name(constraints, final, arguments, y).items():
         value = given.get(name, part)
@@ -86,6 +98,6 @@ def in_order(
 
 
 def zeros_like_result(function: Callable[..., Multipliers], *args: Any) -> Multipliers:
-    """Zeros of the shapes that `function(*args)` returns, which is not computed."""
+    """Zeros in the shapes of `function(*args)`, which is not computed."""
     like = eqx.filter_eval_shape(function, *args)
     return jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), like)

@@ -1,6 +1,4 @@
-"""What a plan may choose besides the controls: the first state, parameters, the
-duration.
-"""
+"""Unknowns of a plan besides the controls: first state, parameters and duration."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -31,29 +29,29 @@ def _as_bounds(value: Any) -> Any:
 
 
 class Unknowns(eqx.Module):
-    """What [`delucax.planning.SQP`][] chooses besides the controls, between bounds.
-    Bounds may be infinite. The iteration starts from the values that the problem has.
+    """Unknowns that [`delucax.planning.SQP`][] chooses together with the controls: the
+    first state, parameters and the duration.
+
+    Each unknown has bounds `(low, high)`, which may be infinite. The iteration starts
+    from the values in the problem, clipped to the bounds.
 
     **Arguments:**
 
-    - `start`: of the first state, a dictionary from names of states to pairs
-        `(low, high)`. The states that it does not name are given by `x0`. None by
-        default.
+    - `start`: bounds of the first state: a dictionary from names of states to pairs
+        `(low, high)` of numbers. `x0` gives the other states. None by default.
     - `parameters`: a dictionary from paths to pairs `(low, high)`, each a number or of
         the shape of the parameter. A path starts with `dynamics`, `cost` or
-        `constraints`: `{"dynamics.system.length": (0.5, 2.0)}`. None by default.
-    - `duration`: a pair `(low, high)` of positive numbers, the bounds of the time from
-        the first state to the last. The steps are of equal length. The dynamics must
-        come from a system in continuous time, such as [`delucax.Discretized`][].
-        Costs and constraints are given the true times, so that the cost
-        `final(t, x) = t` minimises the time. The stage cost is not multiplied by the
-        step. `T dt` by default.
+        `constraints`, such as `{"dynamics.system.length": (0.5, 2.0)}`. None by
+        default.
+    - `duration`: bounds `(low, high)` of the time from the first state to the last one,
+        two positive numbers. All steps have the same length. The dynamics must
+        discretise a system in continuous time, such as [`delucax.Discretized`][]. Costs
+        and constraints get the true times, so the final cost `t` minimises the time.
+        The stage cost is not multiplied by the step. Not an unknown by default.
 
-    What it starts from is moved between the bounds.
-
-    **Raises:** `ValueError` if nothing is unknown, on a name that is not there, bounds
-    that are not a pair of numbers with `low <= high`, a duration that may be zero or
-    negative, a parameter without a finite value to start from.
+    **Raises:** `ValueError` if nothing is unknown, bounds are not a pair of numbers
+    with `low <= high`, or a duration may be zero or negative; and, when the planner is
+    called, if a name does not exist or a parameter has no finite value to start from.
 
     !!! example
 
@@ -71,7 +69,11 @@ class Unknowns(eqx.Module):
             constraints=dlx.planning.Constraints(final_equality=lambda t, x: x),
             unknowns=dlx.planning.Unknowns(duration=(0.5, 10.0)),
         )
-        plan.duration  # 2, by full acceleration, then full deceleration
+        plan.duration  # full acceleration for 1 s, then full deceleration
+        ```
+
+        ```text
+        Array(2.000, dtype=float32)
         ```
     """
 
@@ -107,7 +109,7 @@ class Unknowns(eqx.Module):
 
 
 def _check_runs(low: Any, name: str, where: str) -> None:
-    """Raise if a lower bound of a time is not positive."""
+    """Raise unless the lower bound of a time is positive."""
     if is_concrete(low) and not np.all(np.asarray(low) > 0):
         raise ValueError(
             f"{where}: {name} must have positive bounds, because time does not run "
@@ -116,7 +118,7 @@ def _check_runs(low: Any, name: str, where: str) -> None:
 
 
 def _check_pair(pair: Any, name: str, where: str) -> Bounds:
-    """The pair, or an error."""
+    """Return the pair. Raise unless it is a pair of numbers with `low <= high`."""
     if not isinstance(pair, tuple):
         raise ValueError(
             f"{where}: {name} must be a pair (low, high), a tuple or a list, got "
@@ -134,7 +136,7 @@ def _check_pair(pair: Any, name: str, where: str) -> Bounds:
 
 
 def check_unknowns(problem: Problem, horizon: int) -> None:
-    """Raise unless the names are there, and have values to start from."""
+    """Raise unless the names of the unknowns exist and have values to start from."""
     if problem.unknowns is None:
         return
     where, names = "SQP", problem.dynamics.state_names
@@ -168,7 +170,7 @@ def check_unknowns(problem: Problem, horizon: int) -> None:
 
 
 def parts_of(problem: Problem) -> dict[str, Any]:
-    """The parts of the problem in which the paths of parameters begin."""
+    """The parts of the problem, by the first words of the paths of parameters."""
     return {name: getattr(problem, name) for name in _PARTS}
 
 
@@ -176,21 +178,23 @@ _PARTS = "dynamics", "cost", "constraints"
 
 
 def bounds_by_path(problem: Problem, horizon: int) -> dict[str, Bounds]:
-    """The bounds of parameters by their paths, and those of the step."""
+    """The bounds of the parameters, and of the step if the duration is unknown, by
+    paths."""
     unknowns = problem.unknowns
     named = dict(unknowns.parameters)
     if unknowns.duration is not None:
         path = _path_of_step(problem.dynamics)
         if path in named:
             raise ValueError(
-                f"SQP: unknowns must name {path!r} or a duration, got both."
+                f"SQP: unknowns must have the parameter {path!r} or a duration, got "
+                "both."
             )
         named[path] = tuple(end / horizon for end in unknowns.duration)
     return named
 
 
 def _path_of_step(dynamics: AbstractDynamics, throw: bool = True) -> str:
-    """The path of the step of a discretised system, through what wraps it."""
+    """The path of the step `dt` of a discretised system, through its wrappers."""
     path = "dynamics"
     inside: Any = dynamics
     while not isinstance(inside, AbstractDiscretization) and hasattr(
@@ -199,8 +203,8 @@ def _path_of_step(dynamics: AbstractDynamics, throw: bool = True) -> str:
         path, inside = f"{path}.dynamics", inside.dynamics
     if throw and not isinstance(inside, AbstractDiscretization):
         raise ValueError(
-            "SQP: with a duration among the unknowns, dynamics must be a system in "
-            "continuous time, such as delucax.Discretized, got "
+            "SQP: with an unknown duration, dynamics must discretise a system in "
+            f"continuous time, as `delucax.Discretized` does, got "
             f"{type(inside).__name__}."
         )
     return f"{path}.dt"
