@@ -165,8 +165,7 @@ def _constraints(given: Constraints, carried: Carried) -> Constraints:
 
 
 def _widened(array: Any, size: int, count: int, fill: float) -> Array:
-    """Extend bounds of the states by `count` entries `fill` for the additional states.
-    """
+    """Extend bounds of the states by `count` entries, with the value `fill`."""
     array = jnp.asarray(array)
     if array.ndim == 0:
         array = jnp.broadcast_to(array, (size,))

@@ -277,8 +277,7 @@ def _each(constraints: Constraints, final: bool):
 
 
 def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any) -> str:
-    """A sentence for messages: which constraint is violated most, how much, and where.
-    """
+    """A sentence for messages: the most violated constraint, by how much, and where."""
     T, violations = len(controls), []
     times = problem.times(T)
     stage = jax.vmap(lambda t, x, u: problem.stage_constraints(t, x, u)[0])

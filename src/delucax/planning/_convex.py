@@ -1,9 +1,9 @@
 """A convex cost with the same minimum along linear dynamics.
 
-Where the Hessian of the Lagrangian is not convex, that of a quadratic program must be.
-The cost-to-go of the Riccati recursion, taken away from each stage and added to the one
-before, changes the cost of no trajectory, and leaves a cost of stages that is convex
-wherever the problem is convex along its dynamics.
+A quadratic program needs a convex cost, but the Hessian of the Lagrangian may not be
+convex. The cost-to-go of the Riccati recursion is therefore subtracted from each stage
+and added to the stage before. This does not change the cost of any trajectory. The cost
+of each stage is then convex if the problem is convex along its dynamics.
 """
 
 from typing import Any, NamedTuple
@@ -18,36 +18,40 @@ from ._transcription import Limits, Model
 
 
 STIFF = 10.0
-"""The weight of the rows that hold with equality, over the largest entry of H."""
+"""The weight of active rows, relative to the largest entry of H and h."""
 FIRM = 1e6
-"""The same of the rows that the feedback must keep."""
+"""The weight of rows that the feedback must keep, relative to the same entry."""
 _TRIES = 20
+"""The most tries to make the cost convex."""
 
 
 class Convex(NamedTuple):
-    """The convex cost: that of the distance from the feedback `u = -k - K x`, weighted
-    by the Hessian of the controls. The costates differ by `P x + s`."""
+    """The convex cost: the squared distance from the feedback `u = -k - K x`, weighted
+    by the Hessian of the controls. Its costates differ from the true ones by `P x + s`.
+    """
 
     H: Array
     h: Array
     P: Array  # (T+1, n, n)
     s: Array  # (T+1, n)
     K: Array  # (T, m, n)
-    shift: Array  # the largest that was added to a pivot
+    shift: Array  # the largest number that was added to a pivot
 
 
 class Held(NamedTuple):
-    """Which rows hold with equality, by their multipliers, and what their change is."""
+    """The active rows, according to their multipliers."""
 
     rows: Array
+    """Whether each row is active."""
     target: Array
+    """The change of each active row that moves it to its bound."""
     price: Array | float = 0.0
-    """Of the squared distance from the target, as part of the cost."""
+    """The price of the squared distance from the target, as part of the cost."""
 
 
 class Weights(NamedTuple):
-    """The weights of what is added to the cost: the squares of the rows that are held,
-    of all variables, and of the controls."""
+    """The weights of the squares that are added to the cost: of the active rows, of all
+    variables, and of the controls."""
 
     rows: Array
     variables: Array
@@ -55,10 +59,10 @@ class Weights(NamedTuple):
 
 
 def held_rows(limits: Limits, sides: Array, low: Array, high: Array) -> Held:
-    """The rows that are held; `low` and `high` are the bounds of their changes."""
+    """The active rows. `low` and `high` are the bounds of their changes."""
     upper, lower = sides
     at_high, at_low = upper > jnp.abs(high), lower > jnp.abs(low)
-    # A soft row that is violated is a part of the cost.
+    # A violated soft row is not active: it is part of the cost.
     v = jnp.where(limits.hard, jnp.inf, limits.linear)
     held = (at_high | (low == high)) & (upper < v) | at_low & (lower < v)
     held = held & (jnp.abs(upper - lower) < v)
@@ -74,14 +78,16 @@ def convexified(
     controls: Array,
     is_firm: Array | bool = False,
 ) -> tuple[Convex, Weights]:
-    """The convex cost, and the weights of what was added. If the cost itself will not
-    do, the squares of the rows that are held are added, as in an augmented Lagrangian,
-    and then a multiple of the identity. If `is_firm`, these squares alone are added,
-    with a weight that makes the feedback keep the rows.
+    """The convex cost, and the weights of the squares that were added.
 
-    Source: Waechter and Biegler, 2006 (how the multiple is found, from the `last`).
+    If the cost is not convex along the dynamics, the squares of the active rows are
+    added, as in an augmented Lagrangian, and then a multiple of the identity. If
+    `is_firm`, only the squares of the active rows are added, with a weight that makes
+    the feedback keep these rows.
+
+    Source: Waechter and Biegler, 2006 (the multiple, which starts from the `last` one).
     """
-    # A cost that is linear has no Hessian before there are multipliers.
+    # With h, because a linear cost has no Hessian before there are multipliers.
     largest = jnp.maximum(jnp.max(jnp.abs(model.H)), jnp.max(jnp.abs(model.h)))
     least = 1e-4 * largest
     firm = jnp.where(is_firm, FIRM * largest, 0)
@@ -119,7 +125,7 @@ def convexified(
 
 
 def weight_of(limits: Limits, model: Model, held: Held, weights: Weights) -> Array:
-    """Of the squared distance of each row from its target."""
+    """The weight of the squared distance of each row from its target."""
     norm = jnp.sum(model.G**2, axis=2)
     norm = jnp.pad(norm, ((0, 0), (limits.own, 0)), constant_values=1)
     weight = weights.rows * held.rows / jnp.where(norm > 0, norm, 1) + held.price
@@ -134,20 +140,20 @@ def with_squares(
     sides: Array,
     change: Array,
 ) -> Array:
-    """The multipliers of the rows without the squares in the cost, which push too where
-    the `change` of a row misses its target."""
+    """The multipliers of the rows in the problem without added squares. A square acts
+    like a part of the multiplier if the `change` of its row misses the target."""
     weight = weight_of(limits, model, held, weights)
     push = sides[0] - sides[1]
     total = push + weight * (change - held.target)
-    # That of an inequality has the sign of its side.
+    # The multiplier of an inequality must keep its sign.
     free = (limits.low == limits.high) | (held.price > 0)
     total = jnp.where(free | (push * total > 0), total, 0)
     return jnp.where(weight > 0, jnp.maximum(jnp.stack([total, -total]), 0), sides)
 
 
 def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> Convex:
-    """The convex cost, the Hessian of the controls made definite at the expense of its
-    directions of negative curvature.
+    """The convex cost. If the Hessian of the controls is not positive definite, its
+    pivots are changed so that it is.
 
     Source: Verschueren et al., 2017 (the idea); Gill and Murray, 1974 (the pivots).
     """
@@ -175,7 +181,7 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
     xs = model.F, H[:-1], h[:-1], model.values.defects[1:]
     at_start, (H, h, Ps, ss, K, shift) = lax.scan(back, end, xs, reverse=True)
     if limits.free:
-        # The first state is in part chosen too, at the cost-to-go from it.
+        # The free part of the first state is also chosen, to minimise the cost-to-go.
         order = np.array([i for i in range(n) if i not in limits.free])
         given, order = len(order), np.array([*order, *limits.free], int)
         P, s = at_start[0][order][:, order], at_start[1][order]
@@ -192,9 +198,11 @@ def made_convex(limits: Limits, model: Model, held: Held, weights: Weights) -> C
 
 
 def _chosen(M: Array, g: Array, n: int) -> tuple[Any, Any, Array, Array]:
-    """Of the cost `1/2 z'M z + g'z`: what is left of it in the first `n` entries once
-    the others are chosen; the cost of another choice, convex; the gain; and the largest
-    that was added to a pivot."""
+    """Minimise the cost `1/2 z'M z + g'z` over all but the first `n` entries of `z`.
+
+    Returns the minimum as a cost of the first `n` entries; the convex cost of other
+    choices; the gain; and the largest number that was added to a pivot.
+    """
     Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
     solved, added = _definite(Quu, jnp.concatenate([Qux, Qu[:, None]], axis=1))
     K, k = solved[:, :n], solved[:, n]
@@ -206,8 +214,8 @@ def _chosen(M: Array, g: Array, n: int) -> tuple[Any, Any, Array, Array]:
 
 
 def _definite(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """`(matrix + diag(added))^-1 right` and `added`: each pivot is as large as its
-    magnitude, and well positive."""
+    """`(matrix + diag(added))^-1 right` and `added`. Each pivot becomes its absolute
+    value, and at least a small positive number."""
     m = matrix.shape[0]
     largest = jnp.max(jnp.abs(matrix), initial=0)
     least = jnp.finfo(matrix.dtype).eps ** 0.5 * jnp.where(largest > 0, largest, 1)

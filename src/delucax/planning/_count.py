@@ -104,8 +104,8 @@ class _Counted(AbstractWrapper):
 
 
 _report = Primitive("report")
-"""`report(x, where)` returns `x` and reports one evaluation. `where` is the value of the
-dynamics at this point, so that a derivative is batched and repeated like the value.
+"""`report(x, where)` returns `x` and reports one evaluation. `where` is the value of
+the dynamics at this point, so that a derivative is batched and repeated like the value.
 
 Each transformation has its own report, so that an evaluation counts only if it is run.
 """

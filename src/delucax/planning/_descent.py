@@ -343,8 +343,7 @@ def first_accepted(
 def directions(
     problem: Problem, stages: Stages, controls: Array, mu: Array, options: Options
 ) -> tuple[Policy, Array, Array]:
-    """The policy of the model, the residual, and whether the residual is small enough.
-    """
+    """The policy of the model, the residual, and whether it is small enough."""
     box, tolerance = problem.room(controls), options.tolerance
     if options.parallel:
         policy = in_parallel(stages, mu)

@@ -6,7 +6,7 @@ $p$. From these conditions, $g(z, p) = 0$, follows
 $$\mathrm{d}z = -\left(\frac{\partial g}{\partial z}\right)^{-1}
 \frac{\partial g}{\partial p}\, \mathrm{d}p.$$
 
-The matrix $\partial g / \partial z$ is that of a linear-quadratic problem with the exact
+The matrix $\partial g / \partial z$ is that of a linear-quadratic problem with exact
 second derivatives, so one such problem gives the derivative. The iteration is not
 differentiated: the derivative does not depend on the number of iterations or the start.
 """

@@ -1,4 +1,4 @@
-"""Iterative learning control, and its variant that learns within each run, too."""
+"""Iterative learning control, and a variant that also learns within each run."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -31,14 +31,14 @@ from ._problem import Problem, roll_out
 
 
 _MU_GROWTH, _MU_COUNT = 10.0, 18
-"""The growth of the regularisation per pass, until the problem is convex, from 0 and
-`LEAST_MU` to 1e10."""
+"""The regularisation is 0, then `LEAST_MU`, then grows by this factor until the problem
+is convex, at most 1e10. The count is the number of tries."""
 _RATE_DECAY = 0.01
 """The factor of the learning rate after a failed search of `igpc`."""
 
 
 class _Online(NamedTuple):
-    """The options of the online learning within a run of `igpc`."""
+    """The options of `igpc` for learning within a run."""
 
     memory: int
     horizon: int
@@ -56,39 +56,47 @@ def ilc(
     step: Any = 1.0,
     throw: bool = True,
 ) -> Plan:
-    """Iterative learning control: improve a plan by running it on the plant, and
-    changing it by the derivatives of a model that is not the plant.
+    r"""Iterative learning control: improve a plan by running it on the plant, with the
+    derivatives of a model.
 
-    Each iteration linearises the model along the last run of the plant, solves the
-    linear-quadratic problem, and runs `u - a k - K (x - x_last)` on the plant, for
-    `a = 1.1 a_last 1.1^(-j^2)`, `j = 0, ..., 9`, until a run costs no more than the
-    last one. If none does, it ends. It is [`delucax.planning.ilqr`][] in which only the
-    derivatives come from the model, so it ends near the best for the plant, at a
-    distance that grows with how wrong those are. Where the problem is not convex, the
-    control Hessian is regularised as much as that takes.
+    It works like [`delucax.planning.ilqr`][], but the states and the costs come from
+    runs of the plant, and only the derivatives come from the model. Each iteration
+
+    1. linearises the model along the last run $\bar x$, $\bar u$ of the plant,
+    2. solves the linear-quadratic problem,
+    3. runs $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ on the plant, where
+        the change $-d_k$ and the gain $K_k$ are from that solution, for
+        $\alpha = \alpha_\mathrm{last}\, 1.1^{1 - j^2}$ with $j = 0, \dots, 9$, until a
+        run costs at most as much as the last one.
+
+    It stops early if none of these runs does. The final plan is close to the optimal
+    one for the plant; the distance grows with the error of the model's derivatives. If
+    the problem is not convex, the control Hessian is regularised until it is.
 
     **Arguments:**
 
     - `plant`: the true dynamics, which are only run.
-    - `model`: the dynamics that are differentiated, of the same sizes.
+    - `model`: the dynamics to differentiate, with the same sizes of state and control.
     - `cost`: the stage and final cost.
-    - `plan`: where to start: a [`delucax.planning.Plan`][] made with the model. Its
-        first state, time and bounds are those of each run, and the first run follows
-        its feedback.
-    - `w`: disturbances of the plant, the same in each run, of which the model does not
-        know, shape `(T, k)`; zero by default.
-    - `iterations`: 40 by default.
-    - `step`: the first `a`, 1 by default.
-    - `throw`: raise if the first run diverges (default); if false, look at the
-        `result`.
+    - `plan`: the [`delucax.planning.Plan`][] to start from, made with the model. Each
+        run has its first state, time and bounds. The first run follows its feedback.
+    - `w`: disturbances of the plant, the same in each run and unknown to the model,
+        shape `(T, k)`; zero by default.
+    - `iterations`: the most iterations; 40 by default.
+    - `step`: the first $\alpha$; 1 by default.
+    - `throw`: if true (default), raise if the first run diverges. If false, check the
+        `result` yourself.
 
     **Returns:** a [`delucax.planning.Plan`][]: the best run of the plant, and feedback
-    about it. Its `rollouts` are the runs, the first one included; its `trace` the costs
-    of the first run and after each iteration; its `residual` the gradient by the model.
-    Its `result` is success if all iterations were taken, `no_descent` if a search
-    failed before, and `diverged` if the first run did.
+    about it.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, or out of its
+    - `rollouts`: the number of runs, with the first one.
+    - `trace`: the costs of the first run and after each iteration.
+    - `residual`: the largest entry of the gradient, by the model's derivatives.
+    - `result`: `successful` if all iterations were taken, `no_descent` if a search
+        failed before, `diverged` if the first run diverged.
+
+    **Raises:** `ValueError` if an argument has the wrong kind or shape or is out of its
     range; an error at run time as `throw` says.
 
     Source: Abbeel, Quigley and Ng, 2006; Agarwal, Hazan, Majumdar and Singh, 2021.
@@ -107,7 +115,11 @@ def ilc(
         learned = dlx.planning.ilc(
             plant.dynamics, model.dynamics, model.cost, plan, iterations=5
         )
-        learned.trace
+        learned.trace.round(1)
+        ```
+
+        ```text
+        Array([59.8, 52.2, 51.6, 51.5, 51.5, 51.5], dtype=float32)
         ```
     """
     given = plant, model, cost, plan, w, iterations, step
@@ -130,36 +142,42 @@ def igpc(
     anneal: bool = True,
     throw: bool = True,
 ) -> Plan:
-    """Iterative gradient perturbation control: iterative learning control in which each
-    run learns online, too, from the model mismatch:
+    r"""Iterative gradient perturbation control: iterative learning control that also
+    learns within each run, from the mismatch between plant and model.
 
-    `u_t = u_last - a k - K (x_t - x_last) + sum_{i=1..memory} E_i w_{t-i} + o`, with
-    `w_t = x_{t+1} - F(t, x_t, u_t)`, F being the model.
+    The control in a run is
 
-    E and o start at zero in each run. At step t they descend, with rate
-    `learning_rate / t`, along the gradient of a counterfactual cost: the last one of
-    `horizon` steps through the model, with the observed mismatch added. The next
-    iteration linearises along the run, so what was learned within it stays. Otherwise
-    it is identical to [`delucax.planning.ilc`][].
+    $$u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)
+    + \sum_{i=1}^M E_i\, w_{k-i} + o, \qquad w_k = x_{k+1} - F(t_k, x_k, u_k)$$
+
+    where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first terms are
+    those of [`delucax.planning.ilc`][].
+
+    $E$ and $o$ start at zero in each run. At step $k$ they move by a gradient step of
+    size `learning_rate` over $k$. It lowers a counterfactual cost: the stage cost at
+    the end of `horizon` steps of the model, had these parameters acted, with the
+    observed mismatch added. The next iteration linearises along this run and therefore
+    keeps what the run has learned.
 
     **Arguments:**
 
-    - `plant`, `model`, `cost`, `plan`, `w`, `iterations`, `step`, `throw`: as in
+    - `plant`, `model`, `cost`, `plan`, `w`, `iterations`, `step`, `throw`: as for
         [`delucax.planning.ilc`][].
-    - `learning_rate`: 0.001 by default.
-    - `memory`: the number of past disturbances, 3 by default.
-    - `horizon`: the steps of the counterfactual cost, 3 by default.
-    - `indices`: `"aligned"` (default), each disturbance at the step that it was met;
-        or `"deluca"`, for comparison: one step early, as in the original library.
+    - `learning_rate`: the learning rate, at least 0; 0.001 by default.
+    - `memory`: the number $M$ of past disturbances; 3 by default.
+    - `horizon`: the number of steps of the counterfactual cost; 3 by default.
+    - `indices`: `"aligned"` (default) uses each disturbance at the step at which it
+        acted; `"deluca"`, for comparison, one step early, as the original library does.
     - `anneal`: if true (default), a search tries up to 6 steps until one lowers the
-        cost, and divides the learning rate by 100 if none does. If false, it tries up
-        to 10 steps until one does not raise the cost, and stops if all do.
+        cost. If none does, it divides the learning rate by 100. If false, a search
+        tries up to 10 steps until one does not raise the cost. If none does, learning
+        stops.
 
-    **Returns:** a [`delucax.planning.Plan`][], as from [`delucax.planning.ilc`][]:
-    the best run of the plant, what was learned within it included, and feedback about
-    it.
+    **Returns:** a [`delucax.planning.Plan`][] with the fields of
+    [`delucax.planning.ilc`][]: the best run of the plant, with the controls as they
+    were applied, and feedback about it.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, or out of its
+    **Raises:** `ValueError` if an argument has the wrong kind or shape or is out of its
     range; an error at run time as `throw` says.
 
     Source: Agarwal, Hazan, Majumdar and Singh, 2021.
@@ -177,12 +195,16 @@ def igpc(
         learned = dlx.planning.igpc(
             heavier, env.dynamics, env.cost, plan, iterations=5
         )
-        learned.trace
+        learned.trace.round(3)
+        ```
+
+        ```text
+        Array([1.879, 1.871, 1.870, 1.870, 1.870, 1.870], dtype=float32)
         ```
     """
     where = "igpc"
     check_number(learning_rate, "learning_rate", where)
-    # A rate of zero is valid: only the feedback acts then.
+    # A rate of zero is valid: nothing is learned within a run.
     if not (isinstance(learning_rate, int | float) and learning_rate == 0):
         check_positive(learning_rate, "learning_rate", where)
     check_choice(indices, ("aligned", "deluca"), "indices", where)
@@ -199,7 +221,7 @@ def igpc(
 def _learned(
     where, plant, model, cost, plan, w, iterations, step, rate, online, anneal, throw
 ) -> Plan:
-    """Check what both kinds take, and iterate."""
+    """Check the arguments that `ilc` and `igpc` share, and iterate."""
     models = ("plant", plant), ("model", model)
     for name, dynamics in models:
         check_instance(dynamics, AbstractDynamics, name, where)
@@ -229,12 +251,14 @@ def _learned(
 
 
 class _Progress(NamedTuple):
+    """The state of the loop."""
+
     last: tuple[Array, Array, Array]
-    """States, controls and cost of the run to improve."""
+    """The states, the controls and the cost of the run to improve."""
     policy: Policy
-    """The policy by the model's derivatives along that run."""
+    """The policy from the model's derivatives along this run."""
     mu: Array
-    """The regularisation of that policy."""
+    """The regularisation of this policy."""
     step: Array
     rate: Array
     runs: Array
@@ -249,10 +273,9 @@ class _Progress(NamedTuple):
 def _iterate(
     plant, model, cost, plan, w, step, rate, iterations, online, anneal
 ) -> tuple[Plan, Result]:
-    """The plan after iterations from the first run, which follows the feedback of
-    `plan`; and whether that run diverged.
+    """The learned plan, and the result of the first run, which follows `plan`.
 
-    That a search failed is no failure here, but how learning usually ends.
+    The second result does not count a failed search, with which learning usually ends.
     """
     dtype = plan.controls.dtype
     zero, bounds = jnp.zeros((), dtype), None
@@ -263,14 +286,13 @@ def _iterate(
     given = cost, about[0][0], plan.t0.astype(dtype)
     plant = Problem(plant, *given, w, bounds, plan.difference)
     model = dataclasses.replace(plant, dynamics=model, w=None)
-    # The first run follows the plan's own feedback, without a change.
     unchanged = jnp.zeros_like(plan.controls)
     first = roll_out(plant, *about, unchanged, zero)[:3]
     lost = ~jnp.isfinite(first[2])
 
     def policy_of(states, controls, before) -> tuple[Array, Policy]:
-        """The regularisation and the policy by the model's derivatives along a run of
-        the plant, the least one tried that makes the problem convex."""
+        """The policy from the model's derivatives along a run, with the smallest
+        regularisation that makes the problem convex."""
         stages = local_model(model, states, controls, None, False)
         box = model.room(controls)
 
@@ -283,14 +305,16 @@ def _iterate(
         return first_accepted(trial, _MU_COUNT, before)[1]
 
     def body(now):
-        """A search along the last policy, and the policy about where it led. The first
-        pass has none to search along: the loop has one body, so that it is compiled
-        once."""
+        """Search along the last policy, then make the policy about the best run.
+
+        The first pass has no policy, so it does not search. It is part of the loop so
+        that this code is compiled once.
+        """
         (states, controls, cost), policy = now.last, now.policy
 
         def trial(tried):
-            # One try above the last step, then ever shorter ones: 1.1^(1 - j^2) for
-            # j = 0, 1, ... is 1.1, 1, 0.75, 0.47, ..., as in the original library.
+            # First try a longer step than the last one, then shorter ones: 1.1^(1 - j^2)
+            # is 1.1, 1, 0.75, 0.47, ... for j = 0, 1, ..., as in the original library.
             power = 1.0 - tried.astype(dtype) ** 2
             length = now.step * jnp.asarray(1.1, dtype) ** power
             if online is None:
@@ -321,7 +345,7 @@ def _iterate(
             trace=now.trace.at[iteration].set(after[2]),
             iteration=iteration,
             started=~lost,
-            # Without a rate to lower, a failed search would only fail again.
+            # Without a learning rate to lower, a failed search would fail again.
             done=ended if anneal else ended | failed,
         )
 
@@ -353,8 +377,10 @@ def _iterate(
 
 
 def _perturbed(plant, model, states, controls, policy, length, rate, online):
-    """A run of the plant under the policy and what is learned online; its states,
-    controls and cost, infinite if it diverged."""
+    """A run of the plant under the policy and the terms that are learned online.
+
+    Returns states, controls and cost, which is infinite if the run diverged.
+    """
     memory, horizon, aligned = online
     controls, K = controls - length * policy.k, policy.K
     T, m = controls.shape
@@ -362,15 +388,14 @@ def _perturbed(plant, model, states, controls, policy, length, rate, online):
     times = plant.times(T)
 
     def act(k, x, learned, w):
-        """The control at step k; `w` has the newest disturbance last."""
+        """The control at step k. The newest disturbance in `w` is the last."""
         E, o = learned
         u = controls[k] - matvec(K[k], plant.deviation(x, states[k]))
         return plant.clip(u + jnp.einsum("imn,in->m", E, w) + o)
 
     def last_cost(learned, x, first, w):
-        """The counterfactual cost: the last one of a rollout through the model, from
-        step `first`, as if `learned` had acted in it, with the observed disturbances.
-        """
+        """The counterfactual cost: the last stage cost of a rollout of the model from
+        step `first`, under the parameters `learned` and the observed disturbances."""
         cost = jnp.zeros((), dtype)
         for j in range(horizon):
             k = first + j
@@ -384,7 +409,7 @@ def _perturbed(plant, model, states, controls, policy, length, rate, online):
         k, w_k = inputs
         u = act(k, x, learned, disturbances[horizon:])
         after = plant.step(times[k], x, u, w_k)
-        # w_t = x_{t+1} - F(t, x_t, u_t): all that the model did not foresee.
+        # The mismatch w_k = x_{k+1} - F(t_k, x_k, u_k).
         left = plant.deviation(after, model.step(times[k], x, u, None))
         disturbances = jnp.concatenate([disturbances[1:], left[None]])
         visited = jnp.concatenate([visited[1:], x[None]])
@@ -392,7 +417,7 @@ def _perturbed(plant, model, states, controls, policy, length, rate, online):
         late = int(aligned)
         first = jnp.maximum(k - horizon + late, 0)
         slope = jax.grad(last_cost)(learned, visited[late], first, disturbances)
-        # Online gradient descent with steps of 1/t, from the first full history on.
+        # Online gradient descent with steps of 1/k, when the history is complete.
         size = jnp.where(k >= horizon, rate / jnp.maximum(k, 1), 0)
         learned = jax.tree.map(lambda p, g: p - size * g, learned, slope)
         return (after, learned, visited, disturbances), (x, u)

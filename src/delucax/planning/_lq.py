@@ -73,9 +73,9 @@ def model(
 ) -> Stages:
     """The linear-quadratic model of the problem about a trajectory.
 
-    With `second_order` it has the second derivatives of dynamics and constraints, unless
-    the traced flag `use_exact` is false. With a `spacing`, the dynamics are linearised by
-    central differences.
+    With `second_order` it has the second derivatives of dynamics and constraints,
+    unless the traced flag `use_exact` is false. With a `spacing`, the dynamics are
+    linearised by central differences.
     """
     size, times = states.shape[1], problem.times(controls.shape[0])
     t, end = times[:-1], times[-1]
@@ -250,10 +250,11 @@ def in_sequence(
 ) -> Policy:
     r"""Solve the problem by the regularised Riccati recursion, backwards in time.
 
-    The cost-to-go of the next state is $\tfrac12 x'V x + v'x$. Together with the cost of
-    the stage it is $\tfrac12 z'M z + g'z$, with $M = H + F'V F$ and $g = h + F'(v + V d)$.
-    With their blocks $Q_{uu}$, $Q_{ux}$ and $Q_u$, its minimum over the control is at
-    $-k - K \delta x$, with $k = Q_{uu}^{-1} Q_u$ and $K = Q_{uu}^{-1} Q_{ux}$.
+    The cost-to-go of the next state is $\tfrac12 x'V x + v'x$. Together with the cost
+    of the stage it is $\tfrac12 z'M z + g'z$, with $M = H + F'V F$ and
+    $g = h + F'(v + V d)$. With their blocks $Q_{uu}$, $Q_{ux}$ and $Q_u$, its minimum
+    over the control is at $-k - K \delta x$, with $k = Q_{uu}^{-1} Q_u$ and
+    $K = Q_{uu}^{-1} Q_{ux}$.
 
     `box` holds the bounds `(low, high)` of the changes of the controls, each of shape
     `(T, m)`. The boolean array `free`, shape `(T, m)`, says which controls may change.
@@ -284,8 +285,8 @@ def in_sequence(
         K, k = S[:, :n], S[:, n] if change is None else -change
         ok = ok & jnp.all(jnp.isfinite(k))
         K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
-        # These formulas hold for any K and k. The shorter ones hold only at the minimum,
-        # from which bounds and regularisation lead away.
+        # These formulas hold for any K and k. The shorter ones hold only at the
+        # minimum, from which bounds and regularisation lead away.
         Quu_k = apply(Quu, k)
         D = product(K.T, product(Quu, K) - Qux)
         V = M[:n, :n] + D - product(Qux.T, K)
@@ -363,7 +364,7 @@ def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Ar
 
 @full_precision
 def in_parallel(stages: Stages, mu: Array) -> Policy:
-    """Solve the problem by associative scans, whose depth is logarithmic in the horizon.
+    """Solve the problem by associative scans, in logarithmic depth in the horizon.
 
     The regularisation adds `mu |du|^2 / 2` to the cost of each stage.
 

@@ -66,8 +66,7 @@ def violated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
 
 
 class FreeStart(eqx.Module):
-    """The unknown entries of the first state, and their bounds, which may be infinite.
-    """
+    """The unknown entries of the first state, with their bounds (maybe infinite)."""
 
     low: Array
     high: Array

@@ -1,5 +1,6 @@
-"""The real-time iteration: one quadratic program in each sampling period, split into a
-preparation before the state is known and a feedback after.
+"""The real-time iteration: one quadratic program in each sampling period.
+
+It is split in two: the preparation runs before the state is known, the feedback after.
 
 Source: Diehl, Bock, Schloeder, Findeisen, Nagy and Allgoewer, 2002.
 """
@@ -29,12 +30,12 @@ from ._transcription import (
 
 
 _USABLE = 1e3
-"""A program is used if its errors are at most this multiple of the tolerance."""
+"""The solution is used if its errors are at most this multiple of the tolerance."""
 _REFINEMENTS = 2
 
 
 class Prepared(NamedTuple):
-    """What a step needs besides the state: the problem about the last trajectory."""
+    """The prepared step: the problem about the last trajectory."""
 
     at: Iterate
     model: Model
@@ -51,7 +52,7 @@ def prepared(problem: Problem, start: Start, second_order: bool) -> Prepared:
     model = expanded(problem, limits, at, second_order)
     held = held_rows(limits, at.sides, *rows_left(limits, model.values.rows))
     zero = jnp.zeros((), model.h.dtype)
-    # What is added does not change the solution to first order.
+    # No derivative, because the added terms do not change the solution to first order.
     fixed = lax.stop_gradient((model, held))
     _, weights = convexified(limits, *fixed, zero, zero)
     return Prepared(at, model, made_convex(limits, model, held, weights))
@@ -76,7 +77,7 @@ def fed_back(problem: Problem, ready: Prepared, max_steps: int) -> Plan:
     controls = controls if ends is None else jnp.clip(controls, *ends)
     p = qp.p - jnp.einsum("tij,tj->ti", convex.P, qp.x[:, :n]) - convex.s
     solved, bad, _ = qp.errors
-    # A NaN in the rows would be a row without bounds.
+    # The solver would take a row with NaN as a row without bounds.
     data = jnp.concatenate([jnp.ravel(a) for a in jax.tree.leaves(model)])
     posed = jnp.all(jnp.isfinite(data))
     usable = posed & jnp.all(jnp.isfinite(qp.x)) & (solved <= _USABLE)

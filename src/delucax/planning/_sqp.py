@@ -34,65 +34,76 @@ from ._unknowns import check_unknowns
 
 
 class SQP(AbstractPlanner):
-    r"""Controls that locally minimise the cost under hard constraints, by sequential
-    quadratic programming:
+    r"""Sequential quadratic programming: a locally optimal trajectory under hard
+    constraints, and feedback gains about it.
 
-    `minimise sum over k < T of c(t_k, x_k, u_k) + final(t_T, x_T)`, along
-    `x_{k+1} = F(t_k, x_k, u_k, w_k)`, under [`delucax.planning.Constraints`][].
+    It solves
 
-    The unknowns are the states and the controls (multiple shooting), so that an
-    unstable plant may start from a guess that does not follow the dynamics. Each
-    iteration solves the quadratic program about the current trajectory, as
-    [`delucax.qp.solve`][] does, first by guesses of the active sides. Its Hessian is
-    that of the cost far from a solution, and that of the Lagrangian from a relative
-    error of 0.01 on, or always if the Hessian of the cost alone has no unique minimum
-    along the dynamics. Where it is not convex along the dynamics, the squares of the
-    constraints that hold with equality are added, and then a multiple of the identity.
+    $$\min \sum_{k=0}^{T-1} c(t_k, x_k, u_k) + c_T(t_T, x_T)
+    \quad \text{subject to} \quad x_{k+1} = F(t_k, x_k, u_k, w_k)$$
 
-    A step `1, 1/2, ..., 1/2048` is accepted by a funnel: the sum of all violations
-    stays below its width, and either the cost falls by 1e-4 of the predicted decrease,
-    or the violations fall below 0.9 of the width, which then narrows.
-    Where the linearised constraints have no feasible point, the squares of their
-    violations are added to the cost instead, at a price. Near a stationary point the
-    constraints are tried again and the price rises; if no price makes them hold, the
+    and [`delucax.planning.Constraints`][], where $c_T$ is the final cost. The variables
+    are the states and the controls (multiple shooting). The initial guess of the states
+    need not follow the dynamics, which helps with unstable plants.
+
+    Each iteration solves a quadratic program about the current trajectory, as
+    [`delucax.qp.solve`][] does. Far from a solution, the Hessian of this program is
+    that of the cost. It is that of the Lagrangian from a relative error of 0.01 on, or
+    always if the program with the Hessian of the cost has no unique minimum. If the
+    Hessian is not convex along the dynamics, the squares of the active constraints are
+    added to it, and then a multiple of the identity.
+
+    The line search tries the steps 1, 1/2, ..., 1/2048. It accepts a step by a funnel:
+    the sum of all violations must stay below the width of the funnel. Also, either the
+    cost must fall by 1e-4 of the predicted decrease, or the violations must fall below
+    0.9 of the width. In the second case the funnel narrows.
+
+    If the linearised constraints have no feasible point, the squares of their
+    violations are added to the cost at a price. Near a stationary point, the
+    constraints are tried again and the price rises. If no price makes them hold, the
     result is `no_feasible_point`.
 
-    It has converged if the gradient of the Lagrangian and the complementarity are at
-    most `tolerance` times one plus the size of the terms that cancel in them, the
-    steps meet to that tolerance, and no constraint is violated by more than
-    `constraint_tolerance`.
+    The iteration has converged if three conditions hold. The gradient of the Lagrangian
+    and the error of complementarity are at most `tolerance` times one plus the size of
+    the terms that cancel in them. The states follow the dynamics to that tolerance. No
+    constraint is violated by more than `constraint_tolerance`.
 
     The states start from those that follow from the controls. If these violate the
-    constraints more than the first state held at every stage violates the dynamics, in
-    sum, they start from that instead. An earlier plan gives its multipliers too.
+    constraints too much, the first state at every stage is the guess instead: the guess
+    with the smaller sum of all violations is taken. If the planner starts from an
+    earlier plan, it also starts from its multipliers.
 
-    `plan.multipliers` are those of the solution. `plan.cost` leaves out the penalty of
-    violated soft constraints; `plan.trace` includes it.
+    `plan.multipliers` are those of the solution. `plan.cost` does not include the
+    penalty of violated soft constraints; `plan.trace` does.
 
-    The plan is differentiable in both modes with respect to every array in `dynamics`,
-    `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`, by the implicit function
-    theorem: one quadratic program at the solution, with exact second derivatives.
-    Derivatives are NaN unless the solution is a converged strict minimum whose active
-    constraints have positive multipliers and are independent. They are zero with
-    respect to `controls` and `states`, from which the iteration only starts.
+    You can differentiate the plan, in both modes, with respect to every array in
+    `dynamics`, `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`. The derivative
+    comes from the implicit function theorem: it takes one quadratic program at the
+    solution, with exact second derivatives. Derivatives are NaN unless the plan
+    converged to a strict minimum whose active constraints are independent and have
+    positive multipliers. With respect to `controls` and `states`, where the iteration
+    starts, they are zero.
 
-    Events of a hybrid plant are not followed from one iterate to the next: a plan at a
-    kink, where they change, does not converge, and is `not_converged` or `no_descent`.
+    The planner does not track the events of a hybrid plant. If the solution is at a
+    kink, where the events change, the result is `not_converged` or `no_descent`.
 
-    Under `jax.vmap` on CPU the plans of a batch are made one after the other, as by
-    [`delucax.planning.ILQR`][].
+    Under `jax.vmap` on CPU, the plans of a batch are computed one after the other, as
+    for [`delucax.planning.ILQR`][].
 
     **Arguments:**
 
-    - `max_iterations`: 200 by default.
-    - `tolerance`: the square root of the precision by default (1.5e-8 in float64).
-    - `constraint_tolerance`: a tenth of that by default.
-    - `second_order`: if true (default), with the Hessian of the Lagrangian near a
-        solution; if false, with that of the cost throughout (Gauss-Newton).
+    - `max_iterations`: the most iterations; 200 by default.
+    - `tolerance`: the relative tolerance of the optimality conditions; the square root
+        of the machine precision by default (1.5e-8 in float64).
+    - `constraint_tolerance`: by how much a constraint may be violated; a tenth of the
+        default `tolerance` by default.
+    - `second_order`: if true (default), use the Hessian of the Lagrangian near a
+        solution. If false, always use the Hessian of the cost (Gauss-Newton).
     - `states`: states to start from, shape `(T+1, n)`. `controls` must then be an
-        array, or the number of steps for the controls of the equilibrium.
+        array, or a number of steps, which holds the control of the equilibrium. By
+        default the states follow from `controls`.
 
-    **Raises:** `ValueError` on an option of the wrong kind or out of its range.
+    **Raises:** `ValueError` if an option is of the wrong kind or out of its range.
 
     Source: Nocedal and Wright, 2006, chapter 18; Kiessling, Leyffer and Vanaret, 2024
     (the funnel); Verschueren et al., 2017, and Waechter and Biegler, 2006 (convexity).
@@ -115,6 +126,10 @@ class SQP(AbstractPlanner):
             constraints=constraints,
         )
         jnp.min(plan.states[:, 1]), plan.iterations
+        ```
+
+        ```text
+        (Array(-1.500, dtype=float32), Array(3, dtype=int32))
         ```
     """
 
@@ -165,35 +180,47 @@ class SQP(AbstractPlanner):
         return _solve(problem, start, options)
 
     def prepare(self, problem: Problem, start: Start) -> PyTree:
-        """The first half of a real-time iteration: the quadratic program about the
-        states and controls of `start`, which need not follow the dynamics. It does not
-        depend on `problem.x0`.
+        """Do the first half of a real-time iteration: set up the quadratic program
+        about the states and controls of `start`, which need not follow the dynamics.
+
+        It does not depend on `problem.x0`, so you can call it before the state is
+        measured.
 
         **Arguments:**
 
-        - `problem`: a [`delucax.planning.Problem`][].
-        - `start`: one start, with states.
+        - `problem`: a [`delucax.planning.Problem`][], without unknowns.
+        - `start`: one [`delucax.planning.Start`][], with states.
 
-        **Returns:** what `feedback` takes, a pytree.
+        **Returns:** a pytree, to pass to `feedback`.
+
+        **Raises:** `ValueError` if `start` holds several starts or has no states, or
+        the problem has unknowns.
 
         Source: Diehl, Bock, Schloeder, Findeisen, Nagy and Allgoewer, 2002.
         """
         if start.states is None or start.controls.ndim != 2:
-            raise ValueError("SQP.prepare: start must be one start, with states.")
+            got = "no states" if start.states is None else f"{start.count} starts"
+            raise ValueError(
+                f"SQP.prepare: start must be one start with states, got {got}."
+            )
         if problem.unknowns is not None:
-            raise ValueError("SQP.prepare: problem must have no unknowns.")
+            raise ValueError(
+                "SQP.prepare: problem.unknowns must be None, because a real-time "
+                "iteration takes none."
+            )
         return prepared(problem, start, self.second_order)
 
     def feedback(self, problem: Problem, ready: PyTree, max_steps: int = 50) -> Plan:
-        """The second half: the plan from `problem.x0` after one full step.
+        """Do the second half of a real-time iteration: solve the quadratic program from
+        `problem.x0`, and take one full step.
 
         **Arguments:**
 
-        - `problem`: a [`delucax.planning.Problem`][].
-        - `ready`: what `prepare` returns.
-        - `max_steps`: the most linear systems to solve, 50 by default.
+        - `problem`: the [`delucax.planning.Problem`][] with the current state as `x0`.
+        - `ready`: what `prepare` returned.
+        - `max_steps`: the most linear systems to solve; 50 by default.
 
-        **Returns:** a [`delucax.planning.Plan`][], which is `successful` if the
+        **Returns:** a [`delucax.planning.Plan`][]. Its `result` is `successful` if the
         quadratic program was solved. `residual`, `violation` and `iterations` are those
         of the program.
         """
@@ -201,14 +228,14 @@ class SQP(AbstractPlanner):
 
 
 def _check_controls(problem: Problem, horizon: int) -> None:
-    """Raise if no control is between the bounds and those of the constraints."""
+    """Raise if the bounds of the planner and of the constraints do not overlap."""
     own = None if problem.constraints is None else problem.constraints.controls
     if own is None or problem.bounds is None or isinstance(own, Soft):
         return
     if not all(map(is_concrete, (*own, *problem.bounds))):
         return
     shape = horizon, problem.dynamics.control_size
-    # Shapes that do not fit are refused where the limits are made.
+    # `limits_of` raises on shapes that do not fit.
     if any(np.shape(end) not in ((), shape[1:], shape) for end in own):
         return
     low, high = (
@@ -220,9 +247,9 @@ def _check_controls(problem: Problem, horizon: int) -> None:
     if (low > high).any():
         k, i = np.argwhere(low > high)[0]
         raise ValueError(
-            "SQP: bounds and the bounds `controls` of the constraints must have a "
-            f"number between them, but those of entry {i} at stage {k} are at least "
-            f"{low[k, i]} and at most {high[k, i]}."
+            "SQP: bounds and the bounds `controls` of constraints must overlap, but "
+            f"the control in entry {i} at stage {k} must be at least {low[k, i]} and "
+            f"at most {high[k, i]}."
         )
 
 

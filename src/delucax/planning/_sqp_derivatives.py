@@ -1,6 +1,7 @@
-"""Derivatives of a plan by sequential quadratic programming, by the implicit function
-theorem: those of the quadratic program at the solution, with the exact second
-derivatives, whatever the iteration used.
+"""Derivatives of an SQP plan, by the implicit function theorem.
+
+They are the derivatives of the quadratic program at the solution, with exact second
+derivatives even if the iteration used none.
 """
 
 from typing import Any
@@ -27,8 +28,8 @@ def _tangents(
     """The tangents of the trajectory, the multipliers and the gains."""
     problem = given[0]
     converged = out.result == RESULTS.successful
-    # Derivatives at a failed outcome must be finite for the sake of other members of a
-    # batch, so they are taken at the first state.
+    # The derivatives of a failed plan are NaN. They are computed at the first state,
+    # because NaN inside would spoil the other members of a batch.
     safe = lambda a, b: jnp.where(converged & jnp.isfinite(a), a, b)
     at = Iterate(
         safe(out.at.states, problem.x0),
@@ -43,8 +44,8 @@ def _tangents(
     zero = jnp.zeros((), model.h.dtype)
     _, weights = convexified(limits, model, held, zero, zero)
 
-    # What changes with the problem at fixed variables and multipliers. The rest of the
-    # program, which is quadratic or multiplies a change of zero, does not matter.
+    # The terms of the program that change with the problem at the fixed solution. The
+    # others do not matter, because they multiply a change of zero.
     def terms(varied):
         problem = eqx.combine(varied, rest)
         own = limits_of(problem, T)
@@ -83,7 +84,8 @@ def _tangents(
     @full_precision
     @products_whole()
     def gains(given, tangents):
-        """The tangent of the gains, which depend on the problem and the solution."""
+        """The tangent of the gains, which only depend on the problem and the solution.
+        """
         varied, rest, at = given
 
         def after(varied, at):
@@ -93,7 +95,8 @@ def _tangents(
 
         return jax.jvp(after, (varied, at), tangents)[1]
 
-    # Few need it, and it takes the third derivatives of the problem.
+    # Deferred, because it needs the third derivatives of the problem and is rarely
+    # used.
     dK = deferred(gains, out.gains, (varied, rest, at), (change, moved))
     return dict(at=moved, gains=nan_tangent(dK, ok))
 

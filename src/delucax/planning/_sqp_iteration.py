@@ -1,10 +1,12 @@
-"""Sequential quadratic programming.
+"""The iteration of sequential quadratic programming.
 
-Each iteration solves the quadratic program about the present trajectory, and takes the
-longest step that a funnel accepts: all that is violated stays within its width, and
-either the cost falls enough or the width does. If the program has no feasible point,
-the next one has the squares of the violations in its cost in place of the constraints,
-at a price that rises until a program is feasible again or no price makes it so.
+Each iteration solves the quadratic program about the current trajectory, and takes the
+longest step that a funnel accepts: the violation stays below the width of the funnel,
+and either the cost or the width falls enough.
+
+If the program has no feasible point, the next program is elastic: the squared
+violations, times a price, are part of its cost. The price rises until a program without
+them is feasible, or no price makes the constraints hold.
 
 Source: Kiessling, Leyffer and Vanaret, 2024 (the funnel).
 """
@@ -53,27 +55,33 @@ from ._transcription import (
 
 HALVINGS = 12
 LEAST_SHARE = 1e-4
-"""Of the predicted decrease, the share that the cost falls by (Armijo)."""
+"""The Armijo constant: the least share of the predicted decrease."""
 WIDTH, TIMES = 1.0, 5.0
-"""The first width of the funnel: the first constant, or the second one times the first
-violation, whichever is larger."""
+"""The first width of the funnel is `max(WIDTH, TIMES * first violation)`."""
 SHRINK = 0.9
+"""A step that does not lower the cost must lower the violation to this share of the
+width."""
 NARROW = 0.9
+"""The share of the old width in the new width; the rest is the violation."""
 SWITCH = 1e-3
-"""The cost must fall where its predicted decrease is at least this share of the
-violation."""
+"""The cost must fall if its predicted decrease is at least this share of the violation.
+"""
 NEAR = 0.01
-"""At this error the Hessian of the cost gives way to that of the Lagrangian, the price
-of violations that are left rises, and the constraints are tried without them."""
+"""Below this error, the Hessian of the Lagrangian replaces that of the cost, the price
+rises, and an elastic program is followed by one with the constraints."""
 FIRST_PRICE = 10.0
+"""The first price, relative to the gradient of the cost."""
 MOST_PRICE = 1e7
+"""The largest price, relative to the gradient of the cost over the violation."""
 PATIENCE = 50
-"""Iterations after which violations at a price are no longer left to the funnel."""
+"""After this many iterations, elastic programs use a penalty function, not the funnel.
+"""
 GUESSES = 4
+"""How many guesses of the active constraints are tried for a quadratic program."""
 
 
 class Options(eqx.Module):
-    """The fields of `SQP`, defaults filled in."""
+    """The fields of `SQP` with their defaults filled in."""
 
     tolerance: Array
     constraint_tolerance: Array
@@ -101,25 +109,25 @@ class _Progress(NamedTuple):
 
     now: Outcome
     price: Array
-    """Of a squared violation; zero until a program had no feasible point."""
+    """The price of squared violations; zero until a program has no feasible point."""
     elastic: Array
-    """Whether the next program may violate constraints at that price."""
+    """Whether the next program may violate constraints at this price."""
     width: Array
-    """Of the funnel."""
+    """The width of the funnel."""
     shift: Array
     """The multiple of the identity that was last added to a Hessian."""
     near: Array
     """Whether the last error was small enough for the Hessian of the Lagrangian."""
     flat: Array
-    """Whether the Hessian of the cost was too flat to do without that."""
+    """Whether the program with the Hessian of the cost had no unique minimum."""
     stuck: Array
-    """Whether no step was accepted, however short."""
+    """Whether the regularisation reached its limit without an accepted step."""
     done: Array
 
 
 def gains_of(limits: Limits, at: Iterate, model: Model) -> Array:
-    """Feedback for small deviations, `u = u_planned - K (x - x_planned)`, that keeps
-    the rows that are held."""
+    """The gains `K` of the feedback `u = u_planned - K (x - x_planned)`, which keeps
+    the active rows active for small deviations."""
     zero = jnp.zeros((), model.h.dtype)
     firm = FIRM * jnp.max(jnp.abs(model.H))
     return made_convex(
@@ -130,8 +138,11 @@ def gains_of(limits: Limits, at: Iterate, model: Model) -> Array:
 def started(
     problem: Problem, limits: Limits, start: Start, options: Options
 ) -> Iterate:
-    """The trajectory to start from: that of the controls, or, where it runs away, the
-    first state held, whose steps do not meet. The one that violates less."""
+    """The trajectory to start from.
+
+    This is the trajectory of the controls or the first state at every stage, which does
+    not follow the dynamics. The one with the smaller violation is taken.
+    """
     if options.states is not None:
         controls = _clipped(limits, controls_of(start))
         states = options.states
@@ -152,6 +163,7 @@ def started(
 
 
 def _clipped(limits: Limits, controls: Array) -> Array:
+    """The controls, clipped to their hard bounds."""
     ends = limits.ends()
     return controls if ends is None else jnp.clip(controls, *ends)
 
@@ -179,14 +191,14 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
 
     def body(before: _Progress) -> _Progress:
         now = before.now
-        # Far from a solution the curvature of the constraints, weighted by multipliers
-        # that are far off too, is worse than none.
+        # Far from a solution the multipliers are wrong. The curvature of the
+        # constraints, which they weight, is then worse than none.
         share = jnp.where(before.near | before.flat, 1, 0).astype(dtype)
         model = expanded(problem, limits, now.at, options.second_order, share)
         gradient, slope, error, violation = optimality(limits, now.at, model)
         feasible = violation <= options.constraint_tolerance
         settled = error <= options.tolerance
-        # Close to a point that is stationary but not feasible the price was too low.
+        # Near a stationary point that is not feasible, the price is too low.
         most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h))) / violation
         low = (error <= NEAR) & ~feasible & before.elastic
         hopeless = settled & low & (before.price >= most)
@@ -198,9 +210,9 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         result = choose(lost, RESULTS.diverged, result)
         ended = (settled & feasible) | hopeless | lost | before.stuck
         ended = ended | (now.iterations >= options.max_iterations)
-        # The costates of the program are changes, so that rounding is that of a change.
+        # The costates of the program are changes, which have smaller rounding errors.
         h, model = model.h, model._replace(h=gradient)
-        # At the end the convex cost is that of the gains, in which hard rows are firm.
+        # At the end, the convex cost gives the gains, which must keep the hard rows.
         low, high = rows_left(limits, model.values.rows)
         payable = priced(limits, price, before.elastic & ~ended)
         held = held_rows(payable, now.at.sides, low, high)
@@ -226,7 +238,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         model, h, payable, low, high, held, convex, weights = program
         at, values = now.at, model.values
         form = form_of(limits, model, convex, low, high)
-        # The first multipliers are zero if none are given.
+        # Fewer guesses at first, because the first multipliers may be zero.
         guesses = jnp.where(now.iterations > 0, GUESSES, 2)
         qp = solved(form, at, guesses, jnp.asarray(eps**0.5 / 10, dtype))
         dz = qp.x
@@ -234,7 +246,6 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         dp = qp.p - jnp.sum(convex.P * dx[:, None], axis=2) - convex.s
         usable = jnp.all(jnp.isfinite(dz)) & (qp.errors[0] <= 1e3)
         impossible = ~usable & ~before.elastic
-        # The width of the funnel, and by how much the cost should fall.
         missed = infeasibility(limits, values)
         first = jnp.maximum(WIDTH, TIMES * missed)
         width = jnp.where(jnp.isfinite(before.width), before.width, first)
@@ -246,7 +257,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             axis=1,
         )
         sides = with_squares(limits, model, held, weights, qp.z, change)
-        # The funnel may cycle at a price; then a penalty function must fall.
+        # Elastic programs may cycle in the funnel. Later a penalty function must fall.
         elastic = before.elastic & (now.iterations >= PATIENCE)
         firm = jnp.where(elastic, 1.5 * jnp.max(jnp.abs(at.costates + dp)), 0)
 
@@ -287,8 +298,7 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         )
         pick = lambda new, old: jnp.where(accepted, new, old)
         scale = jnp.max(jnp.abs(model.H))
-        # Where constraints had to be paid for, a program that has a feasible point
-        # again may still lead nowhere.
+        # After elastic programs, a program that is feasible again may still fail.
         lost = ~accepted & ~before.elastic & (price > 0)
         failed = ~accepted & ~impossible & ~lost
         mu = now.regularisation
@@ -304,20 +314,20 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
             result=choose(stuck, failure, now.result),
         )
         start = FIRST_PRICE * (1 + jnp.max(jnp.abs(h)))
-        # In units of the constraints: little at first, as it only rises.
+        # In units of the constraints. It starts low, because it only rises.
         start = start / jnp.maximum(now.violation, 1)
         return before._replace(
             now=after,
             price=jnp.where(impossible & (price == 0), start, price),
-            # It pays until it is near a solution at that price: sooner the hard
-            # program is mostly not feasible, and with it the way there is longer.
+            # Stay elastic until the iterate is near a solution at this price. Before
+            # that, the hard program is mostly infeasible and takes more iterations.
             elastic=impossible | lost | (before.elastic & ~(accepted & before.near)),
             width=pick(narrowed, width),
             shift=jnp.where(weights.variables > 0, weights.variables, before.shift),
             stuck=stuck,
         )
 
-    # XLA loses what the call is beside arrays without entries.
+    # XLA fails on the added call next to empty arrays, such as those of no controls.
     loop = in_parts(body) if m else body
     out = lax.while_loop(lambda progress: ~progress.done, loop, first)
     now = out.now

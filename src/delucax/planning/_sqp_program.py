@@ -1,4 +1,4 @@
-"""The quadratic program of an iteration, and how far an iterate is from a solution."""
+"""The quadratic program of an SQP iteration, and the errors of an iterate."""
 
 from typing import Any
 
@@ -17,13 +17,13 @@ MAX_STEPS = 60
 
 
 def rows_left(limits: Limits, rows: Array) -> tuple[Array, Array]:
-    """The bounds of a change of the rows."""
+    """The bounds of the changes of the rows."""
     return limits.low - rows, limits.high - rows
 
 
 def priced(limits: Limits, price: Array, on: Array) -> Limits:
-    """The limits whose hard rows may be violated at a price where this is on; hard
-    bounds of controls and of unknowns may not."""
+    """The limits in which, if `on`, hard rows may be violated at a price. Hard bounds
+    of controls and of unknowns stay hard."""
     steps, size = limits.low.shape
     index, stage = jnp.arange(size), jnp.arange(steps)[:, None]
     elastic = ((index < limits.states) & (stage > 0)) | (index >= limits.own)
@@ -35,8 +35,8 @@ def priced(limits: Limits, price: Array, on: Array) -> Limits:
 
 
 def without(paid: Array, price: Array, held: Held, low: Array, high: Array):
-    """What holds, and the bounds, without the rows that are paid for; the squares of
-    those that are violated are in the cost."""
+    """Remove the bounds of the rows that are paid for. If such a row is violated, its
+    square is added to the cost."""
     over = paid & ((low > 0) | (high < 0))
     target = jnp.where(over, jnp.where(low > 0, low, high), held.target)
     held = Held(held.rows, target, jnp.where(over, price, 0))
@@ -46,7 +46,7 @@ def without(paid: Array, price: Array, held: Held, low: Array, high: Array):
 def form_of(
     limits: Limits, model: Model, convex: Convex, low: Array, high: Array
 ) -> StagedForm:
-    """The quadratic program."""
+    """The quadratic program in the form of the solver."""
     soft = None
     if limits.is_soft:
         v, W = limits.linear, limits.quadratic
@@ -66,15 +66,18 @@ def form_of(
 
 
 def infeasibility(limits: Limits, values: Any) -> Array:
-    """The sum of all that is violated."""
+    """The sum of all violations, of the dynamics and of the hard rows."""
     broken = jnp.sum(limits.broken(values.rows))
     return jnp.sum(jnp.abs(values.defects)) + broken
 
 
 def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
-    """The gradient of the Lagrangian without the rows, and its largest entry with them;
-    the largest relative error of the optimality conditions without the constraints; and
-    the largest violation."""
+    """The errors of an iterate.
+
+    Returns the gradient of the Lagrangian without the terms of the rows, the largest
+    entry of the whole gradient, the largest relative error of the optimality conditions
+    (without the violations of the rows), and the largest violation.
+    """
     n, rows = at.states.shape[1], model.values.rows
     p, z = at.costates, at.sides[0] - at.sides[1]
     first, last = limits.bounded
@@ -84,11 +87,11 @@ def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
     pushed = pushed.at[:, first:last].add(z[:, : limits.own])
     own = (model.h - pulled).at[:, :n].add(p)
     gradient = own + pushed
-    # The controls have no last row; that of the array is padding.
+    # The last row of the controls is padding.
     slope = jnp.max(jnp.abs(gradient.at[-1, n:].set(0)))
     scale = 1 + jnp.maximum(jnp.max(jnp.abs(model.h)), jnp.max(jnp.abs(pulled)))
-    # A multiplier is zero where there is slack, and the price where a soft row is
-    # violated.
+    # Complementarity: the multiplier of an inactive row is zero, that of a violated
+    # soft row is its price.
     slack = jnp.stack([limits.high - rows, rows - limits.low])
     slack = jnp.where(jnp.isfinite(slack), slack, 0)
     products = jnp.maximum(slack, 0) * at.sides
@@ -105,8 +108,8 @@ def optimality(limits: Limits, at: Iterate, model: Model) -> tuple[Array, ...]:
 def solved(
     form: StagedForm, at: Iterate, guesses: Array | int, tolerance: Array
 ) -> Solved:
-    """The solution of the program; the first guess of its active sides is that of the
-    multipliers."""
+    """The solution of the program. The multipliers of the iterate give the first guess
+    of the active constraints."""
     certificate = jnp.asarray(1e-6, form.q.dtype)
     method = Method.of(form, Tolerances(tolerance, tolerance, certificate))
     guess = warm(method, jnp.zeros_like(form.q), at.sides)
@@ -115,5 +118,5 @@ def solved(
 
 
 def curved(limits: Limits, at: Iterate, model: Model) -> Held:
-    """The rows that are held at an iterate."""
+    """The active rows at an iterate."""
     return held_rows(limits, at.sides, *rows_left(limits, model.values.rows))

@@ -1,6 +1,7 @@
-"""A plan as a nonlinear program, by multiple shooting: its unknowns are the states and
-the controls, its equations the steps of the dynamics, and its rows the bounds and the
-constraints.
+"""A planning problem as a nonlinear program, by multiple shooting.
+
+Its variables are the states and the controls, its equations the steps of the dynamics.
+Its rows are the bounds and the constraints.
 """
 
 from typing import Any, NamedTuple
@@ -20,40 +21,43 @@ from ._problem import Problem
 
 
 class Iterate(NamedTuple):
-    """A trajectory, which need not follow the dynamics, and its multipliers."""
+    """A trajectory, which need not follow the dynamics, with multipliers."""
 
     states: Array  # (T+1, n)
     controls: Array  # (T, m)
-    costates: Array  # (T+1, n), of x_0 = start and x_{k+1} = F(x_k, u_k)
-    sides: Array  # (2, T+1, rows), of the upper and the lower sides, not negative
+    costates: Array  # (T+1, n), multipliers of x_0 = start and x_{k+1} = F(x_k, u_k)
+    sides: Array  # (2, T+1, rows), multipliers >= 0 of the upper and the lower sides
 
 
 class Limits(NamedTuple):
-    """The rows of each stage are first some of the variables `(x, u)`, then the values
-    of the constraints. The two bounds of an equality are equal. A stage that lacks a
-    row has infinite bounds there."""
+    """The bounds and the weights of the rows.
+
+    The rows of a stage are some of its variables `(x, u)`, followed by the values of
+    the constraints. An equality has two equal bounds. All stages have the same number
+    of rows: a row that a stage does not need has infinite bounds.
+    """
 
     low: Array  # (T+1, rows)
     high: Array
-    linear: Array  # of a violation; infinite where a row is hard
+    linear: Array  # the weights of violations; infinite for hard rows
     quadratic: Array
     bounded: tuple[int, int]
-    """The first variable with a row, and the one after the last."""
+    """The variables that have rows, as a range: first, and last plus one."""
     is_soft: bool
     states: int
-    """How many rows are bounds of states."""
+    """The number of rows that are bounds of states."""
     free: tuple[int, ...] = ()
-    """The entries of the first state that are unknown."""
+    """The unknown entries of the first state."""
 
     @property
     def own(self) -> int:
-        """How many rows are bounds of variables."""
+        """The number of rows that are bounds of variables."""
         first, last = self.bounded
         return last - first
 
     @property
     def hard(self) -> Array:
-        """The rows that must hold."""
+        """Whether each row is hard."""
         return ~(jnp.isfinite(self.linear) & jnp.isfinite(self.quadratic))
 
     def over(self, rows: Array) -> Array:
@@ -71,7 +75,7 @@ class Limits(NamedTuple):
         return jnp.sum(t * (v + W * t / 2))
 
     def ends(self) -> tuple[Array, Array] | None:
-        """The bounds of the controls that must hold, shape `(T, m)`."""
+        """The hard bounds of the controls, each of shape `(T, m)`; `None` without."""
         if self.own == self.states:
             return None
         controls = slice(self.states, self.own)
@@ -81,25 +85,25 @@ class Limits(NamedTuple):
 
 
 class Values(NamedTuple):
-    """The problem at a trajectory."""
+    """The values of the problem at a trajectory."""
 
-    cost: Array  # without that of violated soft rows
+    cost: Array  # without the penalty of violated soft rows
     defects: Array  # (T+1, n), by how much each step misses the next state
     rows: Array  # (T+1, rows)
 
 
 class Model(NamedTuple):
-    """The problem and its derivatives, `z = (x, u)`."""
+    """The values of the problem, and its derivatives with respect to `z = (x, u)`."""
 
     values: Values
-    h: Array  # (T+1, N), of the cost
-    F: Array  # (T, n, N)
-    G: Array  # (T+1, p, N), of the constraints by functions
-    H: Array  # (T+1, N, N), of the Lagrangian
+    h: Array  # (T+1, N), the gradient of the cost
+    F: Array  # (T, n, N), the Jacobian of the dynamics
+    G: Array  # (T+1, p, N), the Jacobian of the constraints given by functions
+    H: Array  # (T+1, N, N), the Hessian of the Lagrangian, or of the cost
 
 
 def limits_of(problem: Problem, horizon: int) -> Limits:
-    """The rows of a problem."""
+    """The bounds and the weights of the rows of a problem."""
     n, m = problem.dynamics.state_size, problem.dynamics.control_size
     dtype, T, given = problem.x0.dtype, horizon, problem.constraints
     parts: list[tuple[Array, ...]] = []
@@ -141,8 +145,8 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
 
 
 def _from_start(problem: Problem, ends: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Bounds of the states at the stages, of the first state only where that is free;
-    those of unknowns are hard."""
+    """The bounds of the states. At the first stage only unknown entries have bounds,
+    which are hard."""
     none = -jnp.inf, jnp.inf, jnp.inf, jnp.inf
     if problem.free is None:
         return tuple(a.at[0].set(end) for a, end in zip(ends, none, strict=True))
@@ -156,7 +160,7 @@ def _from_start(problem: Problem, ends: tuple[Array, ...]) -> tuple[Array, ...]:
 
 
 def _functions(rows: list[Row], dtype: Any) -> Array:
-    """The bounds and the weights of the values of some functions, `(4, size)`."""
+    """The bounds and the weights of the values of functions, shape `(4, size)`."""
     columns = [jnp.zeros((4, 0), dtype)]
     for row in rows:
         weights = row.weights or (jnp.inf, jnp.inf)
@@ -167,7 +171,7 @@ def _functions(rows: list[Row], dtype: Any) -> Array:
 
 
 def _bounds(value: Any, name: str, T: int, size: int, dtype: Any) -> tuple[Array, ...]:
-    """The bounds and weights of the variables of one kind, each `(T+1, size)`."""
+    """The bounds and weights of the states or the controls, each `(T+1, size)`."""
     points = T + 1 if name == "states" else T
     soft = isinstance(value, Soft)
     if value is None:
@@ -178,8 +182,8 @@ def _bounds(value: Any, name: str, T: int, size: int, dtype: Any) -> tuple[Array
     for array in arrays:
         if array.shape not in shapes:
             raise ValueError(
-                f"Constraints: each of {name} must be a number or have shape "
-                f"{shapes[1]} or {shapes[2]}, got shape {array.shape}."
+                f"Constraints: the bounds (and weights) of {name} must be numbers or "
+                f"have shape {shapes[1]} or {shapes[2]}, got shape {array.shape}."
             )
     arrays = [jnp.broadcast_to(a, (points, size)) for a in arrays]
     if not soft:
@@ -195,7 +199,7 @@ def _bounds(value: Any, name: str, T: int, size: int, dtype: Any) -> tuple[Array
 
 
 def _joined(problem: Problem, limits: Limits, z: Array, stage: Array, final: Array):
-    """The rows along a trajectory, `z` of `(T+1, N)`."""
+    """The rows along a trajectory `z`, shape `(T+1, N)`, with values of constraints."""
     first, last = limits.bounded
     size = limits.low.shape[1] - limits.own
     pad = lambda c: jnp.pad(c, ((0, 0), (0, size - c.shape[1])))
@@ -204,11 +208,12 @@ def _joined(problem: Problem, limits: Limits, z: Array, stage: Array, final: Arr
 
 
 def _stacked(states: Array, controls: Array) -> Array:
+    """States and controls as one array, shape `(T+1, N)`; the last control is zero."""
     return jnp.concatenate([states, jnp.pad(controls, ((0, 1), (0, 0)))], axis=1)
 
 
 def measured(problem: Problem, limits: Limits, states: Array, controls: Array):
-    """The problem at a trajectory."""
+    """The values of the problem at a trajectory."""
     times = problem.times(controls.shape[0])
     reached = jax.vmap(problem.step)(times[:-1], states[:-1], controls, problem.w)
     defects = jax.vmap(problem.deviation)(reached, states[1:])
@@ -229,9 +234,11 @@ def expanded(
     second_order: bool,
     share: Array | float = 1.0,
 ):
-    """The problem and its derivatives at an iterate; the Hessian is that of the
-    Lagrangian if `second_order`, with a share of the multipliers, else that of the
-    cost."""
+    """The values and the derivatives of the problem at an iterate.
+
+    If `second_order`, the Hessian is that of the Lagrangian, with the multipliers times
+    `share`. If not, it is that of the cost.
+    """
     states, controls, costates, sides = at
     costates, sides = share * costates, share * sides
     n, T = states.shape[1], controls.shape[0]
@@ -263,7 +270,8 @@ def expanded(
     def stage(z, t, w, p, y):
         cost = lambda z: problem.cost(t, z[:n], z[n:]) + 0.0
 
-        # One pass of tangents gives all Jacobians, and of the gradient the Hessian.
+        # One forward pass differentiates everything: the Jacobian of the gradient is
+        # the Hessian.
         def terms(z):
             h = slope = jax.grad(cost)(z)
             if not second_order:
@@ -309,8 +317,9 @@ def expanded(
 
 
 def slopes(problem: Problem, limits: Limits, at: Iterate) -> tuple[Array, Array, Array]:
-    """The gradient of the Lagrangian without its costates' own terms, the defects and
-    the rows at fixed multipliers, to be differentiated with respect to the problem."""
+    """The gradient of the Lagrangian without the terms that are linear in the states,
+    the defects and the rows. The multipliers are fixed. Differentiate it with respect to
+    the problem."""
     states, controls, costates, sides = at
     times = problem.times(controls.shape[0])
     y = (sides[0] - sides[1])[:, limits.own :]
@@ -330,7 +339,7 @@ def slopes(problem: Problem, limits: Limits, at: Iterate) -> tuple[Array, Array,
 
 
 def multipliers_of(problem: Problem, limits: Limits, at: Iterate) -> Multipliers:
-    """The multipliers of an iterate, by their names."""
+    """The multipliers of an iterate, by the names of the constraints."""
     upper, lower = at.sides
     n, own, args = limits.states, limits.own, (problem.t0, problem.x0, at.controls[0])
     z = (upper - lower)[:, own:]
@@ -346,7 +355,7 @@ def multipliers_of(problem: Problem, limits: Limits, at: Iterate) -> Multipliers
 def with_multipliers(
     problem: Problem, limits: Limits, at: Iterate, given: Multipliers | None
 ) -> Iterate:
-    """The iterate with the given multipliers that fit, and zero for the others."""
+    """The iterate with the given multipliers. Those that do not fit become zero."""
     if given is None:
         return at
     blank = jnp.zeros_like(at.sides)
