@@ -366,10 +366,10 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
             dict(finite_difference=0.1, second_order=True),
             "finite_difference is incompatible",
         ),
-        (dict(fallback=3), "fallback must be a plan of"),
+        (dict(fallback=3), "fallback must be a Plan, or"),
         (
             dict(fallback=dlx.planning.Start(np.zeros((3, 1)))),
-            "fallback must be a plan",
+            "fallback must be a Plan",
         ),
         (dict(max_iterations=0), "max_iterations"),
         (dict(tolerance=-1.0), "tolerance must be at least 0"),

@@ -277,7 +277,9 @@ def test_bad_starts():
     ):
         with user_error(match=match):
             ilqr(UNSTABLE, CHEAP, x0, start)
-    with user_error(match="states go with an array of controls or a number of steps"):
+    with user_error(
+        match="must be an array or a number of steps if the planner has states"
+    ):
         dlx.planning.ILQR(states=jnp.zeros((9, 1)))(UNSTABLE, CHEAP, x0, law(1.0))
     with user_error(match="horizon must be a whole number"):
         dlx.planning.Start.default(UNSTABLE, CHEAP, 2.0)

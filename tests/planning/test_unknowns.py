@@ -145,5 +145,5 @@ def test_unknowns_that_are_not_there():
         dynamics = dlx.LinearDynamics(jnp.eye(2), jnp.ones((2, 1)), dt=0.1)
         given = LEAST_TIME, jnp.ones(2), jnp.zeros((5, 1))
         SQP()(dynamics, *given, unknowns=Unknowns(duration=(0.1, 1.0)))
-    with user_error(match="unknowns must be left to"):
+    with user_error(match="Only `delucax.planning.SQP` takes unknowns"):
         least_time(1.0, planner=dlx.planning.ILQR())

@@ -1,5 +1,8 @@
-"""Where guards cross zero within a step. A cubic through each guard detects a crossing;
-Newton's method on the length of the step locates it."""
+"""Find where guards cross zero within a step.
+
+A cubic through each guard detects a crossing. Newton's method on the length of the step
+locates it.
+"""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -191,7 +194,7 @@ def locate(
     eps = jnp.finfo(crossing.guess.dtype).eps
     # If several guards cross at the same time, the first in order of names is taken.
     start, event = least(jnp.where(crossing.expected, crossing.guess, 2.0))
-    # Checked again, because the caller's program may have rounded the guards otherwise.
+    # Checked again, because rounding of the guards may differ in the caller's program.
     active = active & any_of(crossing.expected)
     at_once = active & any_of(crossing.at_once)
     past_end = any_of(crossing.expected & crossing.past_end)

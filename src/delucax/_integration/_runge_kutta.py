@@ -116,8 +116,8 @@ def runge_kutta_step_in_loop(
     x: Array,
     h: RealScalar,
 ) -> Array:
-    """As `runge_kutta_step`, with the stages in a loop: slower to run, but quicker to
-    compile if the field is large."""
+    """Like `runge_kutta_step`, but with the stages in a loop. It runs more slowly, and
+    compiles faster if the field is large."""
     stages = max(np.flatnonzero(tableau.b_sol)) + 1
     A = np.zeros((stages, stages))
     for i, row in enumerate(tableau.a_lower[: stages - 1], 1):

@@ -114,7 +114,7 @@ def solve_result(solution: diffrax.Solution, controller: Any, dtype: Any) -> Res
         return result
     # The error estimate is itself rounded, to about eps times the state. With a smaller
     # tolerance, steps shrink without end. Most tolerances are Python numbers far above
-    # that, and need no program.
+    # eps, so that nothing is compiled here.
     is_fine = controller.rtol < 4 * float(jnp.finfo(dtype).eps)
     if is_fine is False:
         return result
@@ -152,7 +152,7 @@ class _Chord(diffrax.VeryChord):
     to take a shorter step. Fixed steps have no such controller.
     """
 
-    atol: Any  # one for each entry, where Diffrax has a number for all
+    atol: Any  # one for each entry; Diffrax has one number for all entries
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags

@@ -151,7 +151,7 @@ def igpc(
     + \sum_{i=1}^M E_i\, w_{k-i} + o, \qquad w_k = x_{k+1} - F(t_k, x_k, u_k)$$
 
     where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first terms are
-    those of [`delucax.planning.ilc`][].
+    those of [`delucax.planning.ilc`][]. The control is clipped to the bounds.
 
     $E$ and $o$ start at zero in each run. At step $k$ they move by a gradient step of
     size `learning_rate` over $k$. It lowers a counterfactual cost: the stage cost at
@@ -313,8 +313,8 @@ def _iterate(
         (states, controls, cost), policy = now.last, now.policy
 
         def trial(tried):
-            # First try a longer step than the last one, then shorter ones: 1.1^(1 - j^2)
-            # is 1.1, 1, 0.75, 0.47, ... for j = 0, 1, ..., as in the original library.
+            # First try a longer step than the last one, then shorter ones. The factor
+            # 1.1^(1 - j^2) is 1.1, 1, 0.75, 0.47, ..., as in the original library.
             power = 1.0 - tried.astype(dtype) ** 2
             length = now.step * jnp.asarray(1.1, dtype) ** power
             if online is None:

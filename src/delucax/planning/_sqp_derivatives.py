@@ -84,8 +84,7 @@ def _tangents(
     @full_precision
     @products_whole()
     def gains(given, tangents):
-        """The tangent of the gains, which only depend on the problem and the solution.
-        """
+        """The tangent of the gains, functions of the problem and the solution alone."""
         varied, rest, at = given
 
         def after(varied, at):

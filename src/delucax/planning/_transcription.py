@@ -317,9 +317,9 @@ def expanded(
 
 
 def slopes(problem: Problem, limits: Limits, at: Iterate) -> tuple[Array, Array, Array]:
-    """The gradient of the Lagrangian without the terms that are linear in the states,
-    the defects and the rows. The multipliers are fixed. Differentiate it with respect to
-    the problem."""
+    """The gradient of the part of the Lagrangian that depends on the problem, the
+    defects and the rows, at fixed multipliers. They are to be differentiated with
+    respect to the problem."""
     states, controls, costates, sides = at
     times = problem.times(controls.shape[0])
     y = (sides[0] - sides[1])[:, limits.own :]

@@ -26,7 +26,7 @@ class Inputs(eqx.Module):
     """
 
     system: AbstractSystem
-    start: TimeOffset  # the time at which the solve's own begins
+    start: TimeOffset  # the time at which the solve starts
     length: Array  # of the horizon
     intervals: int = eqx.field(static=True)
     source: Any  # a controller, or a function of time; None for an array
@@ -214,8 +214,8 @@ class Hold(AbstractForwardingSolver):
 
             held = lax.cond(switched, act, lambda held: held, held)
             args = eqx.tree_at(lambda a: a.u, args, held[0])
-        # A switch makes the field jump, after which a solver that keeps its last slope
-        # (first same as last) evaluates it anew.
+        # The field jumps at a switch. A solver that keeps its last slope (first same as
+        # last) must then evaluate it again.
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, made_jump | switched
         )

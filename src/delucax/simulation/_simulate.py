@@ -139,11 +139,11 @@ def simulate(
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
     adjoint that does not fit, on a controller that learns from costs, and on more than
-    2^22 steps in single precision, which is too coarse for their times. Also on systems
-    that one solve cannot integrate: those that override `project`, have a `diffusion`
-    or events, or have no `disturbance_names` although `w` is given. Use
-    [`delucax.Discretized`][] for these. An error at run time if the solve fails and
-    `throw` is true.
+    2^22 steps in single precision, which is too coarse for their times. It also raises
+    on systems that one solve cannot integrate: systems that override `project`, systems
+    with a `diffusion` or events, and systems without `disturbance_names` if `w` is
+    given. Use [`delucax.Discretized`][] for these. An error at run time if the solve
+    fails and `throw` is true.
 
     Source: Kidger, 2021 (Diffrax).
 

@@ -32,7 +32,7 @@ def check_system(system: Any, w: Any, where: str) -> None:
     else:
         return
     raise ValueError(
-        f"{where}: {reason}, which one solve cannot do. Use `delucax.open_loop` or "
+        f"{where}: {reason}. One solve cannot do this. Use `delucax.open_loop` or "
         "`delucax.rollout` with delucax.Discretized(system, dt)."
     )
 
