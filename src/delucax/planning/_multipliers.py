@@ -58,10 +58,6 @@ class Multipliers(eqx.Module):
         )
         plan.multipliers.stage["speed"].max()
         ```
-
-        ```text
-        Array(1.01, dtype=float32)
-        ```
     """
 
     stage: dict[str, Array]

@@ -78,6 +78,10 @@ class Plan(AbstractController):
         plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, 20)
         dlx.rollout(env, plan, key=jax.random.key(0), x0=x0 + 0.05).total_cost
         ```
+
+        ```text
+        Array(44.2, dtype=float32)
+        ```
     """
 
     states: Float[Array, "*batch T+1 n"] = parameter()

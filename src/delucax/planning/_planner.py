@@ -117,6 +117,10 @@ class AbstractPlanner(eqx.Module):
         x0 = jnp.array([0.5, 0.0])
         Shooting()(env.dynamics, env.cost, x0, 10, bounds=(-2.0, 2.0)).cost
         ```
+
+        ```text
+        Array(3.353, dtype=float32)
+        ```
     """
 
     is_stochastic: ClassVar[bool] = False

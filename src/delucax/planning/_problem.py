@@ -108,6 +108,10 @@ class Problem(eqx.Module):
         states, controls, cost = problem.roll_out(jnp.zeros((10, 1)))
         problem.plan(states, controls, cost).result
         ```
+
+        ```text
+        <RESULTS.successful>
+        ```
     """
 
     dynamics: AbstractDynamics
@@ -174,18 +178,18 @@ class Problem(eqx.Module):
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
 
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
-        """The values of the constraints of a step."""
+        """The values of the constraints of a step, at `t`, `x` and `u`."""
         assert self.constraints is not None
         return values_of(self.constraints, False, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
-        """The values of the constraints at the end."""
+        """The values of the constraints at the end, at `t` and `x`."""
         assert self.constraints is not None
         return values_of(self.constraints, True, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The values of the constraints along a trajectory: at each step, and at the
-        end."""
+        """The values of the constraints along the trajectory `states` and `controls`:
+        at each step, and at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
@@ -196,8 +200,8 @@ class Problem(eqx.Module):
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
-        """The cost of a step, with the terms of its constraints, which have the
-        multipliers `y`."""
+        """The cost of a step at `t`, `x` and `u`, with the terms of its constraints,
+        which have the multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
             # `+ 0.0`, because an integer has no gradient.
@@ -206,7 +210,7 @@ class Problem(eqx.Module):
         return cost + augmented(c, y, self.multipliers.rho, equal)
 
     def final_cost(self, t: Array, x: Array) -> Array:
-        """The cost at the end, with the terms of the final constraints."""
+        """The final cost at `t` and `x`, with the terms of the final constraints."""
         cost = jnp.asarray(self.cost.final(t, x) + 0.0)
         if self.multipliers is None:
             return cost

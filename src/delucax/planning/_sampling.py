@@ -195,6 +195,10 @@ class MPPI(AbstractSampler):
         plan = planner(env.dynamics, env.cost, x0, start, key=jax.random.key(0))
         plan.trace[0], plan.cost
         ```
+
+        ```text
+        (Array(111.5, dtype=float32), Array(1.96, dtype=float32))
+        ```
     """
 
     samples: int = eqx.field(default=256, static=True)
@@ -271,6 +275,10 @@ class CEM(AbstractSampler):
         x0, start = jnp.array([0.5, 0.0]), jnp.zeros((20, 1))
         plan = planner(env.dynamics, env.cost, x0, start, key=jax.random.key(0))
         plan.trace[0], plan.cost
+        ```
+
+        ```text
+        (Array(111.5, dtype=float32), Array(3.41, dtype=float32))
         ```
     """
 

@@ -127,10 +127,6 @@ class SQP(AbstractPlanner):
         )
         jnp.min(plan.states[:, 1]), plan.iterations
         ```
-
-        ```text
-        (Array(-1.500, dtype=float32), Array(3, dtype=int32))
-        ```
     """
 
     takes_unknowns: ClassVar[bool] = True

@@ -69,11 +69,7 @@ class Unknowns(eqx.Module):
             constraints=dlx.planning.Constraints(final_equality=lambda t, x: x),
             unknowns=dlx.planning.Unknowns(duration=(0.5, 10.0)),
         )
-        plan.duration  # full acceleration for 1 s, then full deceleration
-        ```
-
-        ```text
-        Array(2.000, dtype=float32)
+        plan.duration  # 2, by full acceleration, then full deceleration
         ```
     """
 

@@ -32,8 +32,8 @@ def check_system(system: Any, w: Any, where: str) -> None:
     else:
         return
     raise ValueError(
-        f"{where}: {reason}. One solve cannot do this. Use `delucax.open_loop` or "
-        "`delucax.rollout` with delucax.Discretized(system, dt)."
+        f"{where}: {reason}, so one solve cannot integrate it. Use `delucax.open_loop` "
+        "or `delucax.rollout` with delucax.Discretized(system, dt)."
     )
 
 

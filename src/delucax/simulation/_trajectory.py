@@ -348,6 +348,10 @@ class Trajectory(eqx.Module):
             batch = jax.vmap(run)(jax.random.split(jax.random.key(0), 100))
             batch.statistics()["50%"]
             ```
+
+            ```text
+            Array(1179.5, dtype=float32)
+            ```
         """
         total = self.total_cost
         finite = jnp.isfinite(total)
