@@ -30,18 +30,19 @@ from ._start import Start
 
 
 class ILQR(AbstractPlanner):
-    r"""The iterative linear-quadratic regulator: a locally optimal trajectory, and
-    feedback gains about it.
+    r"""The iterative linear-quadratic regulator (iLQR), a local trajectory optimiser.
 
-    It solves
+    It finds a trajectory that locally solves
 
     $$\min \sum_{k=0}^{T-1} c(t_k, x_k, u_k) + c_T(t_T, x_T)
     \quad \text{subject to} \quad
     x_{k+1} = F(t_k, x_k, u_k, w_k), \quad \mathrm{low} \le u_k \le \mathrm{high}$$
 
-    where $c_T$ is the final cost. Each iteration linearises the dynamics about the
-    current trajectory $\bar x$, $\bar u$, expands the cost to second order, cross terms
-    included, and solves this linear-quadratic problem. It then follows
+    where $c_T$ is the final cost, and feedback gains about this trajectory.
+
+    Each iteration linearises the dynamics about the current trajectory $\bar x$,
+    $\bar u$, expands the cost to second order, cross terms included, and solves this
+    linear-quadratic problem. It then follows
     $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ through the true dynamics,
     where the change $-d_k$ and the gain $K_k$ come from that solution.
 
@@ -113,10 +114,9 @@ class ILQR(AbstractPlanner):
         slowly. Take more if the start is near the solution, or if the cost is much
         larger than the violations.
 
-    **Raises:** `ValueError` if an option is of the wrong kind or out of its range; if
-    `parallel` is combined with `regularise="state"`, or `finite_difference` with
-    `second_order`; and, when the planner is called, if `parallel` is combined with
-    `bounds`.
+    **Raises:** `ValueError` if an option is of the wrong kind or out of its range, or
+    if `parallel` is combined with `regularise="state"` or `finite_difference` with
+    `second_order`. A call raises it if `parallel` is combined with `bounds`.
 
     Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
     Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
@@ -237,11 +237,10 @@ def ilqr(
     tolerance: Any = None,
     throw: bool = True,
 ) -> Plan:
-    r"""Plan a locally optimal trajectory, and feedback gains about it, by the iterative
-    linear-quadratic regulator.
+    r"""Plan a trajectory by the iterative linear-quadratic regulator (iLQR).
 
-    It is a short call of [`delucax.planning.ILQR`][], which describes the method and
-    has more options.
+    The plan is a locally optimal trajectory with feedback gains. `ilqr` is a short call
+    of [`delucax.planning.ILQR`][], which describes the method and has more options.
 
     **Arguments:**
 
@@ -268,7 +267,7 @@ def ilqr(
     **Returns:** a [`delucax.planning.Plan`][]. Its `result` is one of:
 
     - `successful`: the plan is stationary.
-    - `not_converged`: it took `max_iterations`.
+    - `not_converged`: `max_iterations` were not enough.
     - `no_descent`: no step lowered the cost.
     - `events_changed`: the events of a hybrid plant changed between iterates.
     - `no_feasible_point`: no penalty weight made the constraints hold.

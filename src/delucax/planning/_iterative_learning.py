@@ -56,8 +56,7 @@ def ilc(
     step: Any = 1.0,
     throw: bool = True,
 ) -> Plan:
-    r"""Iterative learning control: improve a plan by running it on the plant, with the
-    derivatives of a model.
+    r"""Iterative learning control: improve a plan by running it on the plant.
 
     It works like [`delucax.planning.ilqr`][], but the states and the costs come from
     runs of the plant, and only the derivatives come from the model. Each iteration
@@ -142,10 +141,9 @@ def igpc(
     anneal: bool = True,
     throw: bool = True,
 ) -> Plan:
-    r"""Iterative gradient perturbation control: iterative learning control that also
-    learns within each run, from the mismatch between plant and model.
+    r"""Iterative gradient perturbation control: `ilc` that also learns within a run.
 
-    The control in a run is
+    It learns from the mismatch between plant and model. The control in a run is
 
     $$u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)
     + \sum_{i=1}^M E_i\, w_{k-i} + o, \qquad w_k = x_{k+1} - F(t_k, x_k, u_k)$$

@@ -17,8 +17,9 @@ from ._multipliers import Multipliers
 
 
 class Plan(AbstractController):
-    r"""A planned trajectory with feedback gains. It is a controller that follows the
-    trajectory:
+    r"""A planned trajectory with feedback gains, and a controller that follows it.
+
+    The control is
 
     $$u = u_k - K_k\, (y - x_k), \qquad k = \mathrm{round}((t - t_0) / \Delta t)$$
 
@@ -116,10 +117,11 @@ class Plan(AbstractController):
 
     @property
     def is_usable(self) -> Array:
-        """Whether the plan can be followed: its controls are finite, and its result is
-        neither `diverged` nor `no_feasible_point`.
+        """Whether the plan can be followed.
 
-        A plan that did not converge is usable, because it is the best iterate so far.
+        Its controls must be finite, and its result neither `diverged` nor
+        `no_feasible_point`. A plan that did not converge is usable, because it is the
+        best iterate so far.
         """
         finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
         lost = self.result == RESULTS.diverged

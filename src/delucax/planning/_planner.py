@@ -132,13 +132,16 @@ class AbstractPlanner(eqx.Module):
 
     @property
     def starts_from_states(self) -> bool:
-        """Whether an option of the planner gives the states to start from. A call then
-        does not take a `Start` or a `Plan`."""
+        """Whether an option of the planner gives the states to start from.
+
+        A call then does not take a `Start` or a `Plan`.
+        """
         return False
 
     def first_multipliers(self, problem: Problem, horizon: int) -> Multipliers | None:
-        """Multipliers of zero, in the shapes that a plan of this planner has. The
-        default, for plans without multipliers, is `None`.
+        """Multipliers of zero, in the shapes that a plan of this planner has.
+
+        The default, for plans without multipliers, is `None`.
 
         **Arguments:**
 
@@ -150,8 +153,9 @@ class AbstractPlanner(eqx.Module):
 
     @abc.abstractmethod
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
-        """Solve a checked problem. Report a failure by the `result` of the plan, not by
-        an error.
+        """Solve a checked problem.
+
+        A failure is reported by the `result` of the plan, not by an error.
 
         **Arguments:**
 

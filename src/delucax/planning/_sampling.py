@@ -147,8 +147,9 @@ def average(weights: Array, samples: Array, otherwise: Array) -> Array:
 
 
 class MPPI(AbstractSampler):
-    r"""Model predictive path integral control: plan by sampling. The cost and the
-    dynamics need not be smooth.
+    r"""Model predictive path integral control (MPPI): plan by sampling.
+
+    The cost and the dynamics need not be smooth.
 
     Each iteration draws sequences $u^i$ of controls about the current mean $u$, and
     moves the mean to their weighted average:
@@ -229,8 +230,9 @@ class MPPI(AbstractSampler):
 
 
 class CEM(AbstractSampler):
-    r"""The cross-entropy method: plan by sampling. The cost and the dynamics need not
-    be smooth.
+    r"""The cross-entropy method (CEM): plan by sampling.
+
+    The cost and the dynamics need not be smooth.
 
     Each iteration draws sequences of controls with a mean $\mu_k$ and a standard
     deviation $\sigma_k$ at each step. Both move towards the mean

@@ -34,17 +34,17 @@ from ._unknowns import check_unknowns
 
 
 class SQP(AbstractPlanner):
-    r"""Sequential quadratic programming: a locally optimal trajectory under hard
-    constraints, and feedback gains about it.
+    r"""Sequential quadratic programming (SQP), a planner with hard constraints.
 
-    It solves
+    It finds a trajectory that locally solves
 
     $$\min \sum_{k=0}^{T-1} c(t_k, x_k, u_k) + c_T(t_T, x_T)
     \quad \text{subject to} \quad x_{k+1} = F(t_k, x_k, u_k, w_k)$$
 
-    and [`delucax.planning.Constraints`][], where $c_T$ is the final cost. The variables
-    are the states and the controls (multiple shooting). The initial guess of the states
-    need not follow the dynamics, which helps with unstable plants.
+    and [`delucax.planning.Constraints`][], where $c_T$ is the final cost. It also finds
+    feedback gains about this trajectory. The variables are the states and the controls
+    (multiple shooting). The initial guess of the states need not follow the dynamics,
+    which helps with unstable plants.
 
     Each iteration solves a quadratic program about the current trajectory, as
     [`delucax.qp.solve`][] does. Far from a solution, the Hessian of this program is
@@ -176,11 +176,11 @@ class SQP(AbstractPlanner):
         return _solve(problem, start, options)
 
     def prepare(self, problem: Problem, start: Start) -> PyTree:
-        """Do the first half of a real-time iteration: set up the quadratic program
-        about the states and controls of `start`, which need not follow the dynamics.
+        """Prepare a real-time iteration: set up its quadratic program.
 
-        It does not depend on `problem.x0`, so you can call it before the state is
-        measured.
+        The program is about the states and controls of `start`, which need not follow
+        the dynamics. It does not depend on `problem.x0`, so you can prepare it before
+        the state is measured.
 
         **Arguments:**
 
@@ -207,8 +207,9 @@ class SQP(AbstractPlanner):
         return prepared(problem, start, self.second_order)
 
     def feedback(self, problem: Problem, ready: PyTree, max_steps: int = 50) -> Plan:
-        """Do the second half of a real-time iteration: solve the quadratic program from
-        `problem.x0`, and take one full step.
+        """Finish a real-time iteration: solve the prepared quadratic program.
+
+        The plan starts from `problem.x0` and takes the full step of the program.
 
         **Arguments:**
 

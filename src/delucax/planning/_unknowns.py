@@ -29,10 +29,10 @@ def _as_bounds(value: Any) -> Any:
 
 
 class Unknowns(eqx.Module):
-    """Unknowns that [`delucax.planning.SQP`][] chooses together with the controls: the
-    first state, parameters and the duration.
+    """Unknowns of a plan besides the controls: first state, parameters and duration.
 
-    Each unknown has bounds `(low, high)`, which may be infinite. The iteration starts
+    [`delucax.planning.SQP`][] chooses them together with the controls. Each unknown has
+    bounds `(low, high)`, which may be infinite. The iteration starts
     from the values in the problem, clipped to the bounds.
 
     **Arguments:**
