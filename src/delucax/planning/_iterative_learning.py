@@ -68,9 +68,10 @@ def ilc(
         $\alpha = \alpha_\mathrm{last}\, 1.1^{1 - j^2}$ with $j = 0, \dots, 9$, until a
         run costs at most as much as the last one.
 
-    It stops early if none of these runs does. The final plan is close to the optimal
-    one for the plant; the distance grows with the error of the model's derivatives. If
-    the problem is not convex, the control Hessian is regularised until it is.
+    If none of these runs does, learning stops early. The final plan is close to the
+    optimal plan of the plant. The distance between them grows with the error of the
+    model's derivatives. If the problem is not convex, the control Hessian is
+    regularised until it is.
 
     **Arguments:**
 
@@ -151,11 +152,11 @@ def igpc(
     where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first terms are
     those of [`delucax.planning.ilc`][]. The control is clipped to the bounds.
 
-    $E$ and $o$ start at zero in each run. At step $k$ they move by a gradient step of
-    size `learning_rate` over $k$. It lowers a counterfactual cost: the stage cost at
-    the end of `horizon` steps of the model, had these parameters acted, with the
-    observed mismatch added. The next iteration linearises along this run and therefore
-    keeps what the run has learned.
+    $E$ and $o$ start at zero in each run. At step $k$ they take a gradient step of size
+    `learning_rate` over $k$. The gradient is that of a counterfactual cost: the last
+    stage cost of `horizon` steps of the model under these parameters, with the observed
+    mismatch added. The next iteration linearises along this run, and therefore keeps
+    what the run has learned.
 
     **Arguments:**
 

@@ -179,7 +179,7 @@ class Start(eqx.Module):
         def roll(start):
             states, gains = start.states, start.gains
             states, controls, cost = problem.roll_out(start.controls, states, gains)
-            # The controls along a start that diverges may be NaN, but not the given.
+            # If a start diverges, its controls may be NaN. The given ones are finite.
             given = jax.vmap(problem.clip)(start.controls)
             return states, jnp.where(jnp.isfinite(cost), controls, given), cost
 

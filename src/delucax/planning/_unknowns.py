@@ -50,8 +50,8 @@ class Unknowns(eqx.Module):
         The stage cost is not multiplied by the step. Not an unknown by default.
 
     **Raises:** `ValueError` if nothing is unknown, bounds are not a pair of numbers
-    with `low <= high`, or a duration may be zero or negative; and, when the planner is
-    called, if a name does not exist or a parameter has no finite value to start from.
+    with `low <= high`, or a duration may be zero or negative. A call of the planner
+    raises it if a name does not exist or a parameter has no finite value to start from.
 
     !!! example
 

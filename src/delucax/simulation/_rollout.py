@@ -103,13 +103,13 @@ def rollout(
         values and computes nothing again.
     - `gradient_decay`: a factor on the gradient that passes back through the state at
         each step. 1 (default) gives the true gradient. 0.9 damps exploding gradients
-        over a long, unstable horizon. To forget over a time `tau` whatever `dt` is, use
-        `exp(-dt / tau)`.
+        over a long, unstable horizon. To forget over a fixed time `tau` for any `dt`,
+        use `exp(-dt / tau)`.
     - `truncate`: cut the gradient before every `truncate`-th step, in the state and in
         the memory of the controller (truncated back-propagation). Never by default.
     - `throw`: whether to raise if a step fails, the states become NaN or infinite, or a
-        learner refuses an update; true by default. With `throw=False`, look at
-        `trajectory.result`.
+        learner refuses an update; true by default. With `throw=False`, check
+        `trajectory.result` yourself.
 
     **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first of these that
     applies: the first failure of a step; `diverged`; `update_refused`, if the update of

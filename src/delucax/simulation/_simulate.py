@@ -129,8 +129,8 @@ def simulate(
         interpolated.
     - `key`: a random key for the controller's `init`; none by default.
     - `progress_meter`: such as `diffrax.TqdmProgressMeter()`; none by default.
-    - `throw`: whether to raise if the solve fails or the state becomes NaN or infinite,
-        true by default. With `throw=False`, look at `trajectory.result`.
+    - `throw`: whether to raise if the solve fails or the state becomes NaN or infinite;
+        true by default. With `throw=False`, check `trajectory.result` yourself.
 
     **Returns:** a [`delucax.Trajectory`][] at the saved times. Its `controls` and
     `disturbances` are those that act just before each time, from the second on. With
