@@ -88,13 +88,11 @@ _FUNCTIONS = "inequality", "equality", "final_inequality", "final_equality"
 
 
 class Constraints(eqx.Module):
-    r"""Constraints of a plan, at each step $k < T$ and at the end:
+    """Constraints of a plan, at each step and at the end.
 
-    $$c_\mathrm{in}(t_k, x_k, u_k) \le 0, \quad c_\mathrm{eq}(t_k, x_k, u_k) = 0, \quad
-    d_\mathrm{in}(t_T, x_T) \le 0, \quad d_\mathrm{eq}(t_T, x_T) = 0$$
-
-    These are the functions `inequality`, `equality`, `final_inequality` and
-    `final_equality`. Bounds on states and controls may be added.
+    At each step they are `inequality(t, x, u) <= 0` and `equality(t, x, u) = 0`. At the
+    end they are `final_inequality(t, x) <= 0` and `final_equality(t, x) = 0`. Bounds on
+    states and controls may be added.
 
     Each function returns a number or a vector. To give several functions, use a
     dictionary. Its keys name them in messages and in
