@@ -68,10 +68,6 @@ def count_evaluations(
         )
         evaluations
         ```
-
-        ```text
-        Evaluations(primal=60, tangent=0, cotangent=60)
-        ```
     """
     where = "count_evaluations"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
