@@ -59,8 +59,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     not_converged = "The iteration did not converge within its step limit."
     unexciting = (
         "The data do not identify all parameters: there are too few, or they excite "
-        "the system too little. With throw=False you get the fit, which shows the "
-        "direction that is not identifiable."
+        "the system too little."
     )
     no_descent = (
         "No step lowered the cost, although the gradient is not zero. The problem may "
@@ -233,14 +232,14 @@ def raise_on_failure(
     solution: Any,
     where: str,
     throw: bool = True,
-    it: str = "the solution",
+    it: str | None = "the solution",
     facts: Callable[[], str] = lambda: "",
 ) -> Any:
     """`solution`, or if `throw` is true, an error if its `result` is a failure: now if
     that is concrete, else at run time.
 
-    `it` names the solution in the error. `facts` adds details if the result is
-    concrete.
+    `it` names the solution in the error; it is None if the caller has no `throw`.
+    `facts` adds details if the result is concrete.
     """
     if not throw:
         return solution
@@ -255,7 +254,7 @@ def raise_on_failure(
         words = (
             f"{where}: {RESULTS[result]}",
             facts(),
-            f"Pass throw=False to look at {it}.",
+            it and f"Pass throw=False to look at {it}.",
         )
         raise RuntimeError(" ".join(filter(None, words)))
     return solution

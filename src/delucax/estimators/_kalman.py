@@ -196,7 +196,7 @@ def _steady_state(A, C, E, W, V, mean) -> tuple[Array, Array, Array]:
     # of the measurement update, not A L, the gain of the predictor.
     solution = filter_dare(A, C, noise_of_state(E, W), V, throw=False)
     what = "KalmanFilter: there is no steady state. For A' and C' in place of A and B"
-    solution = raise_on_failure(solution, what, facts=solution._facts)
+    solution = raise_on_failure(solution, what, it=None, facts=solution._facts)
     covariance = symmetric(solution.X).astype(mean.dtype)
     joint = Joint(C @ mean, None, C, covariance, V)
     L = joint.gain()

@@ -11,7 +11,14 @@ from jaxtyping import Array, Bool, Float
 
 from ..._check import check_range, is_concrete
 from ..._module import as_float_array
-from ..._results import choose, first_failure, promote, Result, RESULTS
+from ..._results import (
+    choose,
+    first_failure,
+    promote,
+    raise_on_failure,
+    Result,
+    RESULTS,
+)
 
 
 CORRELATED = 4.0
@@ -153,13 +160,9 @@ def checked(fit: Identified, throw: bool, where: str) -> Identified:
     judged = lambda fit: [*intervals(fit), fit.identifiable, fit.result]
     given = fit.estimate, fit.identifiable, fit.result, intervals(fit)
     fit = eqx.tree_at(judged, fit, _judged(*given))
-    result: Any = fit.result
-    if not throw:
-        return fit
-    if is_concrete(fit.estimate) and result != RESULTS.successful:
-        # The table names the directions that are not identifiable.
-        raise RuntimeError(f"{where}: {RESULTS[result]}\n\n{fit.report()}")
-    return result.error_if(fit, result != RESULTS.successful)
+    # The table names the directions that are not identifiable.
+    facts = lambda: f"\n\n{fit.report()}\n\n"
+    return raise_on_failure(fit, where, throw, "the fit", facts)
 
 
 @eqx.filter_jit
