@@ -124,3 +124,20 @@ def test_numpy_is_enough():
     table = {"level": np.arange(4.0), "pump": np.ones(4)}
     record = sysid.from_frame(table, outputs="level", controls="pump", dt=0.5)
     assert len(record) == 4
+
+
+@needs_x64
+def test_a_parameter_that_is_zero_has_an_interval():
+    """An offset has no size to compare its uncertainty with."""
+    rng = np.random.default_rng(5)
+    system = dlx.systems.MassSpringDamper()
+    u = np.repeat(rng.normal(size=(30, 1)), 5, axis=0)
+    x = np.asarray(dlx.open_loop(dlx.Discretized(system, 0.05), [0.5, 0.0], u))
+    log = sysid.Record(x + [0.2, 0.0] + 0.01 * rng.normal(size=x.shape), u / 2, dt=0.05)
+    rig = dlx.systems.Calibrated(system, output_offset=[0.0, 0.0])
+    names = ["system.control_scale", "system.output_offset"]
+    fit = sysid.physical(dlx.Discretized(rig, 0.05), log, names, x0=[0.0, 0.0])
+    truth = np.array([2.0, 0.2, 0.0])
+    assert np.all(np.asarray(fit.identifiable))
+    assert np.all((fit.low < truth) & (truth < fit.high))
+    assert np.all(fit.high - fit.low < 0.1) and fit.low[2] < 0 < fit.high[2]

@@ -35,8 +35,10 @@ class Identified(eqx.Module):
     of changes in units of the size of the regressors). The directions are the singular
     vectors of the sensitivity of the data to such changes. The spread of a direction is
     the standard deviation of the estimate along it. A direction is not identifiable if
-    its spread is as large as the parameters themselves, or if the data do not depend on
-    it: the parameters can then move along it together, and the data hardly change.
+    the data do not depend on it, or if its spread is as large as the parameters
+    themselves: they can then move along it together, and the data hardly change. A
+    parameter without a constraint may be zero, so its size does not count for this; if
+    it is near zero, its change is in units of a hundred standard deviations.
 
     Printing the object prints the table of `report`.
 
@@ -187,10 +189,13 @@ class Certainty(NamedTuple):
     std: Float[Array, "*outputs p"]
 
     @staticmethod
-    def of(sensitivity: Array, sigma: Array, worst: Any) -> "Certainty":
+    def of(
+        sensitivity: Array, sigma: Array, worst: Any, relative: Any = True
+    ) -> "Certainty":
         """The certainty if the scaled residuals have the standard deviation `sigma`.
 
-        A direction is unknown if its spread is at least `worst`.
+        A direction is unknown if its spread along the parameters that are `relative`,
+        those that cannot be zero, is at least `worst`.
         """
         rows, p = sensitivity.shape
         # With fewer rows than parameters, the remaining directions have size zero.
@@ -203,8 +208,9 @@ class Certainty(NamedTuple):
         eps = jnp.finfo(sensitivity.dtype).eps
         sensitive = size > 10 * max(rows, p) * eps * size[0]
         spread = jnp.where(sensitive, sigma / jnp.where(sensitive, size, 1), jnp.inf)
-        known = sensitive & (spread < worst)
         share = jnp.abs(directions)
+        reach = jnp.linalg.norm(jnp.where(relative, share, 0), axis=1)
+        known = sensitive & (jnp.where(sensitive, spread, 0) * reach < worst)
         # The variance of a parameter is the sum of the shares of all directions.
         added = (share * jnp.where(known, spread, 0)[:, None]) ** 2
         unknown = jnp.where(share > _LOADS, jnp.inf, 0)

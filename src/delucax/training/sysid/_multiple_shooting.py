@@ -8,6 +8,7 @@ import jax.flatten_util
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._results import choose, Result, RESULTS
@@ -17,6 +18,8 @@ from ._sampled import Sampling
 from ._windows import Windows
 
 
+_CLEAR = 100.0
+"""A change of so many standard deviations of the noise is clear."""
 _NEAR = 0.05
 """A fit has converged within this many standard deviations of the minimum."""
 
@@ -46,6 +49,7 @@ class Solution(NamedTuple):
     values: dict[str, Array]
     starts: Float[Array, "windows n"]
     estimate: Float[Array, " p"]
+    unit: Float[Array, " p"]
     certainty: Certainty
     noise: Float[Array, " y"]
     correlation: Float[Array, ""]
@@ -145,16 +149,19 @@ def solve(
     values = unravel(theta)
     # The estimate is not more certain than the given noise or rounding allows.
     sigma = jnp.maximum(sigma, 1)
-    slope = by_theta[:, :p] * units[0] * per_relative_change(assembly, values)
-    certainty = Certainty.of(slope, sigma, 1.0)
+    estimate, rate = constrained_with_rate(assembly, values)
+    slope = by_theta[:, :p] * units[0] / rate
+    relative = _cannot_be_zero(assembly, values)
+    unit = _unit(estimate, slope, sigma, relative)
+    certainty = Certainty.of(slope * unit, sigma, 1.0, relative)
     longest = jnp.max(jnp.linalg.norm(on_starts[..., p], axis=1))
     settled = jnp.maximum(longest, jnp.linalg.norm(on_theta)) <= _NEAR * sigma
     result = choose(count <= max_steps, RESULTS.no_descent, RESULTS.not_converged)
     result = choose(settled, RESULTS.successful, result)
     result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
-    estimate = flat_constrained(assembly, values)
     noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return Solution(values, starts, estimate, certainty, noise, correlation, result)
+    known = estimate, unit, certainty
+    return Solution(values, starts, *known, noise, correlation, result)
 
 
 def _levenberg_marquardt(
@@ -264,17 +271,32 @@ def flat_constrained(
     return jax.flatten_util.ravel_pytree(assembly.constrained(values))[0]
 
 
-def relative_unit(estimate: Float[Array, " p"]) -> Float[Array, " p"]:
-    """The unit of a relative change: the constrained value itself, or 1 if it is 0."""
-    return jnp.where(estimate == 0, 1, estimate)
-
-
-def per_relative_change(
+def constrained_with_rate(
     assembly: Assembly, values: dict[str, Array]
-) -> Float[Array, " p"]:
-    """The change of each unconstrained value for a relative change of 1 of the
-    constrained value."""
+) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """The constrained values, and their derivatives by the unconstrained ones."""
     tangent = jax.tree.map(jnp.ones_like, values)
     flat = lambda values: flat_constrained(assembly, values)
-    estimate, rate = jax.jvp(flat, (values,), (tangent,))
-    return relative_unit(estimate) / rate
+    return jax.jvp(flat, (values,), (tangent,))
+
+
+def _cannot_be_zero(assembly: Assembly, values: dict[str, Array]) -> Any:
+    """Whether each value has a constraint."""
+    return np.concatenate(
+        [
+            np.full(value.size, path in assembly.constraints)
+            for path, value in sorted(values.items())
+        ]
+    )
+
+
+def _unit(
+    estimate: Float[Array, " p"], slope: Array, sigma: Array, relative: Any
+) -> Float[Array, " p"]:
+    """The unit of a change of each constrained value: the value itself, or 1 if it is
+    zero. A value without a constraint may be near zero; its unit is then a change that
+    the data show clearly."""
+    unit = jnp.where(estimate == 0, 1, estimate)
+    size = jnp.linalg.norm(slope, axis=0)
+    clear = jnp.where(size > 0, _CLEAR * sigma / jnp.where(size > 0, size, 1), 0)
+    return jnp.where(relative | (jnp.abs(unit) >= clear), unit, clear)

@@ -23,9 +23,8 @@ from ...dynamics import AbstractDynamics
 from .._trainable import Assembly, partition_trainable
 from ._identified import Certainty, checked, CORRELATED, Identified, quantile
 from ._multiple_shooting import (
+    constrained_with_rate,
     flat_constrained,
-    per_relative_change,
-    relative_unit,
     Solution,
     solve,
 )
@@ -266,22 +265,21 @@ def _intervals(
     certainty = solution.certainty
     std = certainty.std
     known = certainty._replace(
-        std=std * jnp.abs(relative_unit(solution.estimate)),
+        std=std * jnp.abs(solution.unit),
         identifiable=certainty.identifiable & (not few),
     )
-    below, above = (
-        _ends(assembly, solution.values, d) for d in (-reach * std, reach * std)
-    )
+    below, above = (_ends(assembly, solution, d) for d in (-reach * std, reach * std))
     low, high = jnp.minimum(below, above), jnp.maximum(below, above)
     return low, high, known, solution.starts[firsts]
 
 
 def _ends(
-    assembly: Assembly, values: dict[str, Array], reach: Float[Array, " p"]
+    assembly: Assembly, solution: Solution, reach: Float[Array, " p"]
 ) -> Float[Array, " p"]:
-    """The constrained values at a relative distance `reach` from the estimate."""
-    flat, unravel = jax.flatten_util.ravel_pytree(values)
-    step = reach * per_relative_change(assembly, values)
+    """The constrained values at a distance of `reach` units from the estimate."""
+    flat, unravel = jax.flatten_util.ravel_pytree(solution.values)
+    _, rate = constrained_with_rate(assembly, solution.values)
+    step = reach * solution.unit / rate
     end = flat_constrained(assembly, unravel(flat + step))
     # A constraint keeps values away from the ends of its set, but an interval may reach
     # them.
