@@ -20,46 +20,52 @@ def dare(
     *,
     throw: bool = True,
 ) -> RiccatiSolution:
-    r"""The stabilising solution of the discrete-time algebraic Riccati equation,
+    r"""The stabilising solution $X$ of the discrete-time algebraic Riccati equation.
 
-    `A'XA - E'XE - (A'XB + S) (R + B'XB)^-1 (B'XA + S') + Q = 0`,
+    $$A^\top X A - E^\top X E - (A^\top X B + S) (R + B^\top X B)^{-1}
+    (B^\top X A + S^\top) + Q = 0$$
 
-    whose gain `K = (R + B'XB)^-1 (B'XA + S')` minimises the sum of
-    `x'Qx + 2 x'Su + u'Ru` over all time along `E x_next = A x + B u`, at cost
-    `(Ex)' X (Ex)` from `x`.
+    The gain $K = (R + B^\top X B)^{-1} (B^\top X A + S^\top)$ gives the optimal control
+    $u_k = -K x_k$ of $E x_{k+1} = A x_k + B u_k$ over an infinite horizon. It minimises
 
-    Structure-preserving doubling of the Riccati recursion from a positive final cost,
-    followed by Newton steps while the residual is large. It takes products and solves
-    alone, no eigenvalues, which suits accelerators and `jax.vmap`; in a batch, a member
-    that fails does not affect the others. It is differentiable to any order, in either
-    mode, by the implicit function theorem.
+    $$\sum_{k=0}^\infty x_k^\top Q x_k + 2 x_k^\top S u_k + u_k^\top R u_k,$$
 
-    If `(A, Q)` is not detectable, the stabilising solution is not the minimal one: no
-    control at all would cost less, and the state would grow.
+    and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
+
+    The solver doubles the horizon of the Riccati recursion, in a form that keeps its
+    structure, from a positive final cost. It then takes Newton steps while the residual
+    is large. Both need only products and linear solves, no eigenvalues, which suits
+    accelerators and `jax.vmap`. In a batch, a member that fails does not affect the
+    others. Derivatives follow from the implicit function theorem, to any order and in
+    either mode.
+
+    If $(A, Q)$ is not detectable, the stabilising solution is not the minimal solution
+    of the equation: a control that lets the state grow costs less.
 
     **Arguments:**
 
-    - `A`: shape `(n, n)`. Real, or complex, as all others; then `'` is the conjugate
+    - `A`: shape `(n, n)`. All matrices may be complex. Then $^\top$ is the conjugate
         transpose.
     - `B`: shape `(n, m)`.
-    - `Q`: state weight, shape `(n, n)`, symmetric. An indefinite one is accepted.
-    - `R`: control weight, shape `(m, m)`, symmetric, positive semidefinite. May be
-        singular, and zero.
+    - `Q`: state weight, shape `(n, n)`, symmetric. It may be indefinite.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive semidefinite. It may be
+        singular, even zero.
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
-    - `throw`: raise unless there is a stabilising solution (default); if false,
-        check `result`.
+    - `throw`: raise an error unless there is a stabilising solution (default). If
+        false, check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
-    closed loop is stable, and the residual after diagonal balancing of the states is at
-    most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding of
-    `X` alone may cause it. Else `result` is one of `RESULTS.not_stabilisable`,
-    `not_stabilising` (no such solution), `on_boundary` (eigenvalues on the unit circle,
-    or so close that rounding of the data removes the stabilising solution),
-    `not_converged` and `ill_posed`.
+    closed loop is stable and the relative residual, after diagonal balancing of the
+    states, is at most 1e-12 (1e-5 in single precision). A residual of up to a hundred
+    times that is accepted if rounding of $X$ alone may cause it. Else `result` is one
+    of `RESULTS.not_stabilisable`, `not_stabilising` (there is no stabilising solution),
+    `on_boundary` (eigenvalues on the unit circle, or so close that rounding of the data
+    removes the stabilising solution), `not_converged` and `ill_posed`.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
-    symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
+    **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `Q` or
+    `R` is not symmetric, or if `R` is not semidefinite. With `throw`, an error at run
+    time if the solve fails.
 
     Source: Chu, Fan, Lin and Wang, 2004 (doubling); Benner, 2001 (balancing).
 
@@ -71,7 +77,11 @@ def dare(
 
         A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
         B = jnp.array([[0.0], [1.0]])
-        K = dlx.riccati.dare(A, B, jnp.eye(2), jnp.eye(1)).K  # [[0.4221, 1.2439]]
+        dlx.riccati.dare(A, B, jnp.eye(2), jnp.eye(1)).K
+        ```
+
+        ```text
+        Array([[0.422, 1.244]], dtype=float32)
         ```
     """
     data = riccati_arguments("dare", A, B, Q, R, S, E, definite=False)
@@ -89,28 +99,34 @@ def care(
     *,
     throw: bool = True,
 ) -> RiccatiSolution:
-    r"""The stabilising solution of the continuous-time algebraic Riccati equation,
+    r"""The stabilising solution $X$ of the continuous-time algebraic Riccati equation.
 
-    `A'XE + E'XA - (E'XB + S) R^-1 (B'XE + S') + Q = 0`,
+    $$A^\top X E + E^\top X A - (E^\top X B + S) R^{-1} (B^\top X E + S^\top) + Q = 0$$
 
-    whose gain `K = R^-1 (B'XE + S')` minimises the integral of
-    `x'Qx + 2 x'Su + u'Ru` over all time along `E dx/dt = A x + B u`, at cost
-    `(Ex)' X (Ex)` from `x`.
+    The gain $K = R^{-1} (B^\top X E + S^\top)$ gives the optimal control $u = -K x$ of
+    $E \dot{x} = A x + B u$ over an infinite horizon. It minimises
 
-    The scaled sign iteration of the Hamiltonian matrix; if that fails, once more in a
-    unit of `X` for weak controls. Newton steps, accelerators, batches, derivatives and
-    undetectable modes: as of [`delucax.riccati.dare`][].
+    $$\int_0^\infty x^\top Q x + 2 x^\top S u + u^\top R u \,\mathrm{d}t,$$
 
-    **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as of
-    [`delucax.riccati.dare`][];
+    and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 
-    - `R`: control weight, shape `(m, m)`, symmetric, positive definite: with a singular
-        one the control may be an impulse, and there is no such gain.
+    The solver is the scaled sign iteration of the Hamiltonian matrix. If it fails, the
+    solver starts once more in a unit of $X$ that suits weak controls. What
+    [`delucax.riccati.dare`][] says about Newton steps, accelerators, batches,
+    derivatives and undetectable modes also holds here.
 
-    **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
-    is judged as there, with the imaginary axis for the unit circle.
+    **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as in
+    [`delucax.riccati.dare`][].
 
-    **Raises:** as there, and `ValueError` on an `R` that is only semidefinite.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive definite. With a singular
+        weight the optimal control may be an impulse, which no gain gives.
+
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. The
+    criteria and the values of `result` are those of [`delucax.riccati.dare`][], with
+    the imaginary axis instead of the unit circle.
+
+    **Raises:** as in [`delucax.riccati.dare`][], and `ValueError` if `R` is only
+    semidefinite.
 
     Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Kleinman, 1968 (Newton);
     Benner, 2001 (balancing).
@@ -124,7 +140,11 @@ def care(
         A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
         B = jnp.array([[0.0], [1.0]])
         solution = dlx.riccati.care(A, B, jnp.eye(2), jnp.eye(1))
-        solution.K, solution.spectral_abscissa  # [[1.0, 1.7321]], -0.866
+        solution.K, solution.spectral_abscissa
+        ```
+
+        ```text
+        (Array([[1.   , 1.732]], dtype=float32), Array(-0.866, dtype=float32))
         ```
     """
     data = riccati_arguments("care", A, B, Q, R, S, E, definite=True)
@@ -141,16 +161,21 @@ def filter_dare(
     *,
     throw: bool = True,
 ) -> RiccatiSolution:
-    r"""The stationary covariance of a one-step prediction, in discrete time,
+    r"""The stationary covariance and gain of the one-step Kalman predictor.
 
-    `A X A' - X - (A X C' + S) (V + C X C')^-1 (C X A' + S') + W = 0`,
+    $$A X A^\top - X - (A X C^\top + S) (V + C X C^\top)^{-1} (C X A^\top + S^\top)
+    + W = 0$$
 
-    and the gain `K = (A X C' + S) (V + C X C')^-1` of the predictor
-    `x_next = A x + K (y - C x)` of `x_next = A x + w`, `y = C x + v`, where `w` and `v`
-    are white with covariances `W`, `V` and `S = E[w v']`.
+    The system is $x_{k+1} = A x_k + w_k$, $y_k = C x_k + v_k$. The noises $w$ and $v$
+    are white, with covariances $W$ and $V$ and cross-covariance
+    $S = \mathrm{E}[w_k v_k^\top]$. The predictor is
 
-    `X` is the covariance of the state given all measurements before it; the gain of the
-    measurement update is `X C' (V + C X C')^-1`. This is the equation of
+    $$\hat{x}_{k+1} = A \hat{x}_k + K (y_k - C \hat{x}_k), \qquad
+    K = (A X C^\top + S) (V + C X C^\top)^{-1}.$$
+
+    $X$ is the covariance of the prediction error: of $x_k$ given all measurements
+    before time $k$. The gain of the measurement update of a Kalman filter is
+    $X C^\top (V + C X C^\top)^{-1}$. The equation is that of
     [`delucax.riccati.dare`][] for the transposed system.
 
     **Arguments:**
@@ -160,17 +185,18 @@ def filter_dare(
     - `W`: covariance of the process noise, shape `(n, n)`, symmetric.
     - `V`: covariance of the measurement noise, shape `(p, p)`, symmetric, positive
         semidefinite.
-    - `S`: their cross-covariance, shape `(n, p)`; zero by default.
-    - `throw`: raise unless there is a stabilising solution (default); if false,
-        check `result`.
+    - `S`: cross-covariance of the two noises, shape `(n, p)`; zero by default.
+    - `throw`: raise an error unless there is a stabilising solution (default). If
+        false, check `result`.
 
-    **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
-    `closed_loop = A - K C`, the matrix of the prediction error. Its `result` is that of
-    the transposed system: `RESULTS.not_stabilisable` means that `(A, C)` is not
-    detectable.
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][]. `K` has the shape `(n, p)`.
+    `closed_loop` is $A - K C$, the matrix of the prediction error. `result` is the
+    status for the transposed system: `RESULTS.not_stabilisable` means that $(A, C)$ is
+    not detectable.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
-    symmetric or (`V`) not semidefinite; an error at run time as `throw` says.
+    **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `W` or
+    `V` is not symmetric, or if `V` is not semidefinite. With `throw`, an error at run
+    time if the solve fails.
 
     Source: Kalman, 1960.
 
@@ -182,8 +208,11 @@ def filter_dare(
 
         A = jnp.array([[1.0, 0.1], [0.0, 1.0]])
         C = jnp.array([[1.0, 0.0]])
-        prediction = dlx.riccati.filter_dare(A, C, 0.01 * jnp.eye(2), jnp.eye(1))
-        prediction.X, prediction.K
+        dlx.riccati.filter_dare(A, C, 0.01 * jnp.eye(2), jnp.eye(1)).K
+        ```
+
+        ```text
+        TODO1
         ```
     """
     return _filter(True, "filter_dare", A, C, W, V, S, throw)
@@ -199,27 +228,31 @@ def filter_care(
     *,
     throw: bool = True,
 ) -> RiccatiSolution:
-    r"""The stationary covariance of the estimate of the Kalman-Bucy filter,
+    r"""The stationary covariance and gain of the Kalman-Bucy filter.
 
-    `A X + X A' - (X C' + S) V^-1 (C X + S') + W = 0`,
+    $$A X + X A^\top - (X C^\top + S) V^{-1} (C X + S^\top) + W = 0$$
 
-    and the gain `K = (X C' + S) V^-1` of `dx/dt = A x + K (y - C x)`, for
-    `dx/dt = A x + w`, `y = C x + v`, where `w` and `v` are white with intensities `W`,
-    `V` and cross-intensity `S`.
+    The system is $\dot{x} = A x + w$, $y = C x + v$. The noises $w$ and $v$ are white,
+    with intensities $W$ and $V$ and cross-intensity $S$. $X$ is the covariance of the
+    estimation error. The filter is
 
-    This is the equation of [`delucax.riccati.care`][] for the transposed system.
+    $$\dot{\hat{x}} = A \hat{x} + K (y - C \hat{x}), \qquad
+    K = (X C^\top + S) V^{-1}.$$
 
-    **Arguments:** `A`, `C`, `S` and `throw`: as of [`delucax.riccati.filter_dare`][],
-    with intensities for covariances;
+    The equation is that of [`delucax.riccati.care`][] for the transposed system.
+
+    **Arguments:** `A`, `C`, `S` and `throw`: as in [`delucax.riccati.filter_dare`][],
+    with intensities instead of covariances.
 
     - `W`: intensity of the process noise, shape `(n, n)`, symmetric.
     - `V`: intensity of the measurement noise, shape `(p, p)`, symmetric, positive
         definite.
 
-    **Returns:** as there, with a `spectral_abscissa`; `closed_loop` is the matrix of
-    the estimation error.
+    **Returns:** as in [`delucax.riccati.filter_dare`][], with a `spectral_abscissa`.
+    `closed_loop` is the matrix of the estimation error.
 
-    **Raises:** as there, and `ValueError` on a `V` that is only semidefinite.
+    **Raises:** as in [`delucax.riccati.filter_dare`][], and `ValueError` if `V` is only
+    semidefinite.
 
     Source: Kalman and Bucy, 1961.
 
@@ -231,15 +264,18 @@ def filter_care(
 
         A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
         C = jnp.array([[1.0, 0.0]])
-        estimate = dlx.riccati.filter_care(A, C, 0.01 * jnp.eye(2), jnp.eye(1))
-        estimate.X, estimate.K
+        dlx.riccati.filter_care(A, C, 0.01 * jnp.eye(2), jnp.eye(1)).K
+        ```
+
+        ```text
+        TODO2
         ```
     """
     return _filter(False, "filter_care", A, C, W, V, S, throw)
 
 
 def _filter(discrete, where, A, C, W, V, S, throw) -> RiccatiSolution:
-    """The filter's solution, by that of control for the transposed system."""
+    """The solution of a filter equation: that of control for the transposed system."""
     A, C = as_matrix(A, "A", where), as_matrix(C, "C", where)
     transposed = A.conj().T, C.conj().T, W, V, S, None
     data = riccati_arguments(

@@ -1,4 +1,4 @@
-"""Checks and conversions of the arguments of matrix equations."""
+"""Check and convert the arguments of matrix equations."""
 
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ class RiccatiData(NamedTuple):
 
 
 def square_matrix(value: Any, name: str, where: str) -> Array:
-    """`value` as a square matrix of finite entries, checked."""
+    """Check that `value` is a square matrix of finite entries, and convert it."""
     matrix = as_matrix(value, name, where)
     if matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
         raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
@@ -39,14 +39,14 @@ def square_matrix(value: Any, name: str, where: str) -> Array:
 
 
 def hermitian_matrix(value: Any, name: str, where: str) -> Array:
-    """`value` as a matrix that is its own conjugate transpose, checked.
+    """Check that `value` equals its conjugate transpose, and convert it.
 
-    An asymmetry of the size of rounding is averaged away. While it is being traced, a
-    larger one makes it NaN.
+    An asymmetry of the size of rounding is averaged away. A larger one is an error, or
+    makes a traced matrix NaN.
     """
     matrix = square_matrix(value, name, where)
     transposed = matrix.conj().T
-    # As large as products such as C'WC may leave by rounding.
+    # Rounding of a product such as C'WC may leave an asymmetry of this size.
     slack = 100 * xp.finfo(matrix.dtype).eps * xp.max(xp.abs(matrix))
     wrong = xp.max(xp.abs(matrix - transposed)) > slack
     if is_concrete(wrong) and wrong:
@@ -60,11 +60,11 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
 def riccati_arguments(
     where: str, A, B, Q, R, S, E, *, definite: bool, names="ABQRSE", dual=False
 ) -> RiccatiData:
-    """The arguments as matrices of one precision that fit each other.
+    """Check that the arguments fit each other, and convert them to one precision.
 
-    `R` must be positive `definite`, or else semidefinite. `names` are the letters that
-    the caller's arguments have. With `dual`, `A`, `B` are the transposes of what the
-    caller gave, and errors speak of what was given.
+    `R` must be positive definite if `definite`, else semidefinite. `names` are the
+    names of the caller's arguments. With `dual`, `A` and `B` are the transposes of the
+    caller's arguments, and error messages name the shapes that the caller gave.
     """
     n_A, n_B, n_Q, n_R, n_S, n_E = names
     A, B = square_matrix(A, n_A, where), as_matrix(B, n_B, where)
@@ -97,11 +97,10 @@ def _check_shape(shape: tuple, wanted: tuple, name: str, where: str, to_fit: str
 
 
 def where_solved(ok: Array, zeroed: Any, units: Any) -> tuple[Any, Any]:
-    """Trees of matrices where `ok`, one flag or one for each step; elsewhere zeros for
-    the first, identities for the second.
+    """Replace the matrices of failed problems: `zeroed` by zeros, `units` by identities.
 
-    So no derivative of a problem that failed meets a matrix that is not finite, or that
-    cannot be solved with: a NaN would survive being multiplied by zero afterwards.
+    `ok` is one flag, or one for each step. Without this, the derivative of a failed
+    problem would be NaN, even if it were multiplied by zero afterwards.
     """
     ok = ok[:, None, None] if ok.ndim else ok
     eye = lambda M: xp.eye(M.shape[-1], dtype=M.dtype)
@@ -112,12 +111,12 @@ def where_solved(ok: Array, zeroed: Any, units: Any) -> tuple[Any, Any]:
 
 
 def is_complex(*matrices: Array | None) -> bool:
-    """Whether any of the matrices is."""
+    """Whether any of the matrices is complex."""
     return any(map(xp.iscomplexobj, jax.tree.leaves(matrices)))
 
 
 def real_form(M: Array) -> Array:
-    """`[[Re M, -Im M], [Im M, Re M]]`, which adds and multiplies as `M` does."""
+    """The real matrix `[[Re M, -Im M], [Im M, Re M]]`; it adds and multiplies as `M`."""
     return xp.block([[M.real, -M.imag], [M.imag, M.real]])
 
 
@@ -125,18 +124,18 @@ def complex_form(M: Array) -> Array:
     """The matrix whose real form is `M`."""
     n, m = M.shape[0] // 2, M.shape[1] // 2
     upper, lower = M[:n], M[n:]
-    # Rounding has made the two copies of each part differ: their averages.
+    # The two copies of each part differ by rounding, so take their average.
     return ((upper[:, :m] + lower[:, m:]) + 1j * (lower[:, :m] - upper[:, m:])) / 2
 
 
 _AXES = dict(A="nn", B="nm", D="nk", Q="nn", R="mm", S="nm", d="n", q="n", r="m")
-"""The axes of each argument, an axis being named by its size."""
+"""The axes of each argument. An axis has the name of its size."""
 
 
 def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
-    """Each argument with a leading time axis, in one precision. What is `None` is zero.
+    """Give each argument a leading time axis and one precision. `None` becomes zero.
 
-    The sizes are those of the first argument that has them.
+    The first argument with an axis determines its size.
     """
     arrays, sizes, steps = {}, {}, {}
     for name, value in given.items():
@@ -149,14 +148,14 @@ def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
             is_stack = eqx.is_array(value) and value.ndim == 3
             value = symmetric_matrix(value, name, where, ndim=3 if is_stack else 2)
         shape = ", ".join(axes) + ("," if ndim == 1 else "")
-        rule = f"have shape ({shape}), or that with a leading time axis"
+        rule = f"have shape ({shape}), or this shape with a leading time axis"
         fits = lambda shape, ndim=ndim: len(shape) in (ndim, ndim + 1)
         arrays[name] = array = as_finite(value, name, where, rule, fits)
         _check_sizes(where, name, array.shape[array.ndim - ndim :], sizes)
         if array.ndim > ndim:
             steps[name] = array.shape[0]
     T, dtype = _length(where, horizon, steps), _real_dtype(where, arrays)
-    # Constant arguments are repeated: one scan serves both kinds.
+    # Constant arguments are repeated, so one scan serves both kinds.
     zero = xp.zeros((), dtype)
     shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
     return {
@@ -166,7 +165,7 @@ def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
 
 
 def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
-    """The given matrices in one precision, checked to fit each other."""
+    """Check that the matrices fit each other, and convert them to one precision."""
     arrays, sizes = {}, {}
     for name, value in given.items():
         if value is not None:
@@ -178,7 +177,7 @@ def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
 
 
 def _real_dtype(where: str, given: dict[str, Array]):
-    """The real precision that all can be held in."""
+    """The common real precision of the given arrays."""
     dtype = xp.result_type(*given.values())
     if not xp.issubdtype(dtype, xp.floating):
         raise ValueError(f"{where}: {', '.join(given)} must be real, got {dtype}.")
@@ -195,18 +194,18 @@ def _check_sizes(where, name, shape, sizes):
 
 
 def _length(where, horizon, steps):
-    """The number of steps, on which all that have a time axis must agree."""
+    """The number of steps. All arguments with a time axis must have the same."""
     if horizon is not None:
         horizon = check_count(horizon, "horizon", where)
     if len(set(steps.values())) > 1 or 0 in steps.values():
         raise ValueError(
-            f"{where}: leading time axes must have one length of at least 1, got "
-            f"{steps}."
+            f"{where}: all leading time axes must have the same length of at least 1, "
+            f"got {steps}."
         )
     name, T = next(iter(steps.items()), (None, horizon))
     if T is None:
         raise ValueError(
-            f"{where}: horizon must be given where no argument has a time axis."
+            f"{where}: horizon must be given if no argument has a time axis."
         )
     if horizon not in (None, T):
         raise ValueError(
@@ -217,7 +216,7 @@ def _length(where, horizon, steps):
 
 
 def final_weight(value: Any, A: Array, where: str) -> Array:
-    """The final weight, checked; zero by default."""
+    """Check the final weight; zero by default."""
     shape = A.shape[-2:]
     if value is None:
         return xp.zeros(shape, A.dtype)
@@ -227,7 +226,7 @@ def final_weight(value: Any, A: Array, where: str) -> Array:
 
 
 def increasing_times(times: Any, where: str) -> Array:
-    """`times` as an increasing vector of at least two, checked."""
+    """Check that `times` is an increasing vector of at least two numbers."""
     fits = lambda shape: len(shape) == 1 and shape[0] >= 2
     array = as_finite(times, "times", where, "be at least two numbers", fits)
     if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):

@@ -16,12 +16,12 @@ _SIGN_STEPS = 60
 
 
 def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
-    """A solution by doubling about `X0 = height I`, and the doublings taken."""
-    # X0 > 0 makes R + B'X0 B invertible, and excludes the fixed points that leave an
-    # undetectable unstable mode unstable.
+    """A solution by doubling from `X0 = height I`, and the number of doublings."""
+    # X0 > 0 makes R + B'X0 B invertible. It also excludes fixed points whose closed
+    # loop leaves an undetectable unstable mode unstable.
     A, B, Q, R, S, _ = data
     X0 = height * xp.eye(A.shape[0], dtype=A.dtype)
-    # The data of the equation of H = X - X0.
+    # The data of the equation for H = X - X0.
     cross = height * matmul(A.T, B) + S
     weight = symmetric(R + height * matmul(B.T, B))
     linear = height * matmul(A.T, A) - X0
@@ -30,12 +30,12 @@ def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
 
 
 def continuous_start(data: RiccatiData, kind: Scalar) -> tuple[Array, Array, Array]:
-    """A solution by the sign iteration, for this kind of attempt; the size of
-    `B R^-1 B'`; and the steps taken."""
+    """A solution by the sign iteration, the size of `B R^-1 B'`, and the number of
+    steps."""
     A, G, Q = without_cross_weight(*data[:5])
     size_A, size_G, size_Q = (one_if_zero(size(M)) for M in (A, G, Q))
-    # In a unit of X that makes the two quadratic blocks alike. If that fails, in the
-    # size of X where the control is weak, and set by the unstable modes alone.
+    # The first unit of X makes the two quadratic blocks equally large. The second is
+    # the size of X for a weak control, which the unstable modes alone determine.
     unit = xp.where(kind == SECOND, size_A / size_G, xp.sqrt(size_Q / size_G))
     unit = xp.where(kind == UNIT, 1, one_if_zero(unit))
     X, steps = _by_sign(A, unit * G, Q / unit)
@@ -45,8 +45,9 @@ def continuous_start(data: RiccatiData, kind: Scalar) -> tuple[Array, Array, Arr
 def _by_sign(A, G, Q):
     """`X` from the sign of the Hamiltonian matrix `H = [[A, -G], [-Q, -A']]`.
 
-    With `J = [[0, I], [-I, 0]]`, the iteration `H <- (H + H^-1) / 2` is one of the
-    symmetric `W = JH`: `W <- (W + J W^-1 J) / 2`. It keeps the eigenvalues in pairs.
+    With `J = [[0, I], [-I, 0]]` the matrix `W = JH` is symmetric, and the iteration
+    `H <- (H + H^-1) / 2` becomes `W <- (W + J W^-1 J) / 2`. In this form the
+    eigenvalues stay in pairs.
 
     Source: Roberts, 1971; Byers, 1987 (the symmetric form and the scaling).
     """
@@ -65,14 +66,15 @@ def _by_sign(A, G, Q):
         W, before, _, k = carry
         turned = J(solve(W, J(both)))
         ratio = largest(turned) / largest(W)
-        # Scaling speeds up the way to the neighbourhood of the limit, where it would
-        # keep the iteration from settling.
+        # Scaling speeds up the iteration far from the limit. Near the limit it would
+        # prevent convergence.
         scale = xp.where(before < 1e-2, 1, xp.sqrt(ratio))
         new = symmetric(scale * W + turned / scale) / 2
         change = largest(new - W) / largest(new)
-        # Convergence is quadratic: a small change that is not halved is rounding.
+        # Because convergence is quadratic, a small change that is not halved is
+        # rounding.
         stalled = (change < 1e-6) & (change > before / 2)
-        # A NaN compares false: at a singular W the iteration ends.
+        # At a singular W the iteration ends, because NaN compares false.
         new = xp.where(change < xp.inf, new, W)
         going = (change > 10 * eps) & ~stalled
         return new, change, going, k + 1
@@ -80,18 +82,17 @@ def _by_sign(A, G, Q):
     W = xp.block([[-Q, -A.T], [-A, G]])
     start = (W, xp.asarray(xp.inf, dtype), xp.asarray(True), xp.asarray(0))
     W, *_, iterations = while_loop(more, body, start)
-    # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W. M alone may be
-    # singular, so that X is computed by least squares from all 2n columns.
+    # I - sign(H) = [I; X] M projects onto the stable subspace, and H = J'W. M may be
+    # singular, so X is computed by least squares from all 2n columns.
     upper = xp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
     lower = xp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
     return symmetric(factorised(upper.T, lx.QR())(lower.T).T), iterations
 
 
 def double(element: Element, X0: Square) -> tuple[Array, Array]:
-    """The limit of joining an interval's element to itself, as `J`, and the doublings
-    taken.
+    """The limit `J` of composing an element with itself, and the number of doublings.
 
-    `X0` is what `J` is a correction to, for its size alone.
+    `J` is a correction of `X0`. Only the size of `X0` is used, by the stopping test.
     """
     eps, n = xp.finfo(X0.dtype).eps, len(X0)
     eye = xp.eye(n, dtype=X0.dtype)
@@ -102,20 +103,20 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
 
     def body(carry):
         (A, C, J), _, k = carry
-        # As of `composed`. Small matrices are eliminated once, for both right sides; of
-        # large ones products with the inverse take less time than solves.
+        # As in `composed`. Small matrices are factorised once for both right sides. For
+        # large ones products with the inverse are faster than solves.
         right = xp.concatenate([A, C], axis=1) if n <= SMALL else eye
         inverse = solve(eye + matmul(C, J), right)
         solved = inverse[:, :n] if n <= SMALL else matmul(inverse, A)
         change = symmetric(matmul(A.T, matmul(J, solved)))
         after, J_after = matmul(A, solved), J + change
-        # In units of X = X0 + J, of which J may be a small part.
+        # Relative to X = X0 + J, because J may be a small part of it.
         sizes = largest_of_each(change, J_after, X0 + J_after, after)
         changed, whole, size_X, size_A = sizes
         # The next change is at most |A|^2 |J|.
         relative = xp.minimum(changed, (n * size_A) ** 2 * whole) / one_if_zero(size_X)
-        # An overflow ends the iteration at the last finite step, whose closed loop is
-        # not stable, which the caller checks. A NaN compares false.
+        # An overflow or NaN (which compares false) ends the iteration at the last
+        # finite step. Its closed loop is not stable, which the caller checks.
         finite = (whole < xp.inf) & (size_A < xp.inf)
         relative = xp.where(finite, relative, 0)
 
@@ -123,7 +124,7 @@ def double(element: Element, X0: Square) -> tuple[Array, Array]:
             spread = inverse[:, n:] if n <= SMALL else matmul(inverse, C)
             return C + symmetric(matmul(matmul(A, spread), A.T))
 
-        # The last doubling is one of J alone. A small one is compiled without branches.
+        # The last doubling needs J alone. Small problems are compiled without branches.
         C = joined(C) if n <= SMALL else if_true(relative > eps, joined, C)
         return (after, C, xp.where(finite, J_after, J)), relative, k + 1
 

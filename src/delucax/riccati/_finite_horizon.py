@@ -29,24 +29,27 @@ from ._recursion import (
 
 
 class FiniteHorizonSolution(eqx.Module):
-    """The optimal control over a finite horizon.
+    r"""The optimal control of a linear-quadratic problem over a finite horizon.
 
-    The least cost from state `x` at step `t` is `x'X[t]x + 2 p[t]'x + s[t]`, and the
-    control that attains it is `u = -K[t] x - k[t]`. In continuous time the least cost
-    from `x` at `times[i]` is `x'X[i]x`, attained by `u = -K[i] x`.
+    In discrete time the minimal cost from state $x$ at step $t$ is
+    $x^\top X_t x + 2 p_t^\top x + s_t$. The control $u = -K_t x - k_t$ attains it. In
+    continuous time the minimal cost from $x$ at `times[i]` is $x^\top X_i x$, and the
+    control $u = -K_i x$ attains it.
 
     **Attributes:**
 
-    - `X`: at each step and at the end, shape `(T+1, n, n)`, symmetric; in continuous
-        time at each point of the grid, shape `(N, n, n)`.
-    - `K`: the gains, shape `(T, m, n)`, or `(N, m, n)`.
-    - `closed_loop`: the matrices `A - B K`, shape `(T, n, n)`, or `(N, n, n)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `p`: the linear part of the cost-to-go, shape `(T+1, n)`; zero if the problem has
-        no linear terms, as are `s` and `k`. `None` in continuous time, as are they.
-    - `s`: its constant part, shape `(T+1,)`.
+    - `X`: the quadratic part of the cost-to-go, symmetric. In discrete time at each
+        step and at the end, shape `(T+1, n, n)`; in continuous time at each point of
+        the grid, shape `(N, n, n)`.
+    - `K`: the gains, shape `(T, m, n)`, or `(N, m, n)` in continuous time.
+    - `closed_loop`: the matrices $A - B K$, shape `(T, n, n)`, or `(N, n, n)` in
+        continuous time.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `p`: the linear part of the cost-to-go, shape `(T+1, n)`. `p`, `s` and `k` are
+        zero if the problem has no linear terms, and `None` in continuous time.
+    - `s`: the constant part of the cost-to-go, shape `(T+1,)`.
     - `k`: the feed-forward controls, shape `(T, m)`.
-    - `times`: in continuous time the grid, shape `(N,)`; `None` in discrete time.
+    - `times`: the grid in continuous time, shape `(N,)`; `None` in discrete time.
 
     !!! example
 
@@ -57,7 +60,11 @@ class FiniteHorizonSolution(eqx.Module):
         A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
         B = jnp.array([[0.0], [1.0]])
         solution = dlx.riccati.dre(A, B, jnp.eye(2), jnp.eye(1), horizon=10)
-        solution.K[0], solution.X[0]
+        solution.K[0]
+        ```
+
+        ```text
+        TODO1
         ```
     """
 
@@ -90,41 +97,52 @@ def dre(
     parallel: bool = False,
     throw: bool = True,
 ) -> FiniteHorizonSolution:
-    r"""The discrete-time Riccati recursion, back from `X_T = final`:
+    r"""The discrete-time Riccati recursion: linear-quadratic control over a finite
+    horizon.
 
-    `X_t = Q + A'X A - (A'X B + S) K_t`, `K_t = (R + B'X B)^-1 (B'X A + S')`
+    It runs backwards in time, from $X_T = X_f$ (`final`):
 
-    with `X = X_{t+1}`. The controls `u = -K_t x - k_t` minimise, along
-    `x_next = A x + B u + d`, the sum of `x'Qx + 2 x'Su + u'Ru + 2 q'x + 2 r'u` over
-    steps `t < T`, plus `x_T' final x_T + 2 final_q'x_T`. To track references `x_ref`
-    and `u_ref`, give `q = -Q x_ref`, `r = -R u_ref` and `final_q = -final x_ref_T`.
+    $$K_t = (R + B^\top X_{t+1} B)^{-1} (B^\top X_{t+1} A + S^\top), \qquad
+    X_t = Q + A^\top X_{t+1} A - (A^\top X_{t+1} B + S) K_t$$
 
-    Any argument of the stage may vary in time. It is differentiable to any order, in
-    either mode, and the memory of a gradient is that of `X`.
+    For the system $x_{t+1} = A x_t + B u_t + d$, the controls $u_t = -K_t x_t - k_t$
+    minimise
+
+    $$\sum_{t=0}^{T-1} \left( x_t^\top Q x_t + 2 x_t^\top S u_t + u_t^\top R u_t
+    + 2 q^\top x_t + 2 r^\top u_t \right) + x_T^\top X_f x_T + 2 q_f^\top x_T.$$
+
+    To track references $x^*$ and $u^*$, give $q = -Q x^*$, $r = -R u^*$ and
+    $q_f = -X_f x_T^*$.
+
+    All arguments except `final` and `final_q` may vary in time. The solution is
+    differentiable to any order, in either mode. A gradient needs as much memory as $X$.
 
     **Arguments:**
 
     - `A`: shape `(n, n)`, or `(T, n, n)`.
     - `B`: shape `(n, m)`, or `(T, n, m)`.
     - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
-    - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric. May be singular.
+    - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric. It may be
+        singular.
     - `S`: cross weight, shape `(n, m)`, or `(T, n, m)`; zero by default.
-    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
-    - `horizon`: the number of steps `T`; needed if no argument has a time axis.
-    - `d`: what is added to the next state, shape `(n,)`, or `(T, n)`; zero by default.
+    - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
+    - `horizon`: the number of steps $T$; needed if no argument has a time axis.
+    - `d`: an offset of the next state, shape `(n,)`, or `(T, n)`; zero by default.
     - `q`: linear cost of the state, shape `(n,)`, or `(T, n)`; zero by default.
     - `r`: linear cost of the control, shape `(m,)`, or `(T, m)`; zero by default.
-    - `final_q`: linear cost of the final state, shape `(n,)`; zero by default.
-    - `parallel`: if true, in parallel over time, by associative scans of logarithmic
-        depth, which pays on accelerators; in sequence by default.
-    - `throw`: raise if a step has no minimum (default); if false, check `result`.
+    - `final_q`: linear cost $q_f$ of the final state, shape `(n,)`; zero by default.
+    - `parallel`: if true, compute all steps in parallel, by associative scans of
+        logarithmic depth. This is faster on accelerators. False by default.
+    - `throw`: raise an error if a step has no minimum (default). If false, check
+        `result`.
 
-    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at a step
-    where `R + B'XB` is not positive definite, and at all before it, as there is no
-    minimum then.
+    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. If
+    $R + B^\top X_{t+1} B$ is not positive definite at a step, this step and all steps
+    before it have no minimum, and the solution is NaN there.
 
-    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
-    not symmetric, or if there is no horizon; an error at run time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
+    weight is not symmetric, or if there is no horizon. With `throw`, an error at run
+    time if a step has no minimum.
 
     Source: Bertsekas, 2017; Sarkka and Garcia-Fernandez, 2023 (in parallel).
 
@@ -139,17 +157,21 @@ def dre(
         Q, R = jnp.eye(2), jnp.eye(1)
         ramp = jnp.stack([0.1 * jnp.arange(50), jnp.ones(50)], axis=1)
         plan = dlx.riccati.dre(A, B, Q, R, q=-ramp @ Q, parallel=True)
-        u0 = -plan.K[0] @ jnp.zeros(2) - plan.k[0]
+        -plan.K[0] @ jnp.zeros(2) - plan.k[0]
+        ```
+
+        ```text
+        TODO2
         ```
     """
     where = "dre"
-    # NumPy gains nothing from the longer way that is parallel.
+    # The parallel form takes more work, and NumPy runs it in sequence.
     parallel = bool(parallel) and not on_host()
     stage = stage_arguments(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
     A = stage["A"]
     final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
-    # Without linear terms p, s and k are zero, and are not computed.
+    # Without linear terms, p, s and k are zero and are not computed.
     final_q = xp.zeros(n) if final_q is None else final_q
     final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(*stage.values(), final, final_q, is_affine, parallel)
@@ -179,8 +201,8 @@ def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parall
 
 def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     """The linear and constant parts of the cost-to-go, and the feed-forward."""
-    # With V(x) = x'Xx + 2 p'x + s at the next step, the control of x meets
-    # X (A x + B u + d) + p: the derivative in u is zero at u = -K x - k.
+    # V(x) = x'Xx + 2 p'x + s at the next step. The cost-to-go as a function of u has
+    # the derivative zero at u = -K x - k.
     pushed = xp.einsum("tij,tj->ti", after, d)
     added = xp.einsum("tji,tj->ti", loop, pushed) + q
     added = added - xp.einsum("tji,tj->ti", K, r)
@@ -189,7 +211,7 @@ def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     push = r + xp.einsum("tji,tj->ti", B, ahead)
     pivot = R + xp.swapaxes(B, 1, 2) @ after @ B
     k = vmap(solve)(pivot, push[..., None])[..., 0]
-    # What d adds to the cost-to-go, less what the feed-forward saves of it.
+    # d adds to the cost-to-go, and the feed-forward reduces it.
     gained = xp.sum(d * (p[1:] + ahead), axis=1) - xp.sum(k * push, axis=1)
     s = xp.cumsum(gained[::-1])[::-1]
     return p, xp.concatenate([s, xp.zeros(1, s.dtype)]), k
@@ -207,18 +229,25 @@ def cre(
     final: Numbers | None = None,
     throw: bool = True,
 ) -> FiniteHorizonSolution:
-    r"""The Riccati differential equation, back from `X(t_1) = final`:
+    r"""The Riccati differential equation: linear-quadratic control over a finite
+    horizon.
 
-    `-dX/dt = A'X + XA - (XB + S) R^-1 (B'X + S') + Q`.
+    It runs backwards in time, from $X(t_1) = X_f$ (`final`), with $t_1$ the last of
+    `times`:
 
-    The control `u = -K(t) x`, `K = R^-1 (B'X + S')`, minimises the integral of
-    `x'Qx + 2 x'Su + u'Ru` along `dx/dt = A x + B u` up to `t_1`, the last of `times`,
-    plus `x(t_1)' final x(t_1)`.
+    $$-\dot{X} = A^\top X + X A - (X B + S) R^{-1} (B^\top X + S^\top) + Q$$
 
-    It is exact but for rounding, however stiff the equation and coarse the grid: the
-    flow is linear in `[I; X]`, so that it is known over a short time, and intervals are
-    composed, doubling their length each time, in a form that does not grow. It is
-    differentiable to any order, in either mode.
+    For the system $\dot{x} = A x + B u$, the control $u = -K(t)\, x$ with
+    $K = R^{-1} (B^\top X + S^\top)$ minimises
+
+    $$\int^{t_1} x^\top Q x + 2 x^\top S u + u^\top R u \,\mathrm{d}t
+    + x(t_1)^\top X_f\, x(t_1).$$
+
+    The solution is exact except for rounding, for stiff equations and coarse grids too.
+    The flow of $[I; X]$ is linear, so a matrix exponential gives it over a short
+    interval. Intervals are then composed, which doubles their length each time, in a
+    form whose terms do not grow. The solution is differentiable to any order, in either
+    mode.
 
     **Arguments:**
 
@@ -227,15 +256,18 @@ def cre(
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
     - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
-    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
-    - `throw`: raise if there is no minimum (default); if false, check `result`.
+    - `times`: the times at which $X$ is computed, increasing, at least two, shape
+        `(N,)`.
+    - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
+    - `throw`: raise an error if there is no minimum (default). If false, check
+        `result`.
 
-    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at the
-    times from which there is no minimum.
+    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at the times
+    from which the cost has no minimum.
 
-    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
-    not symmetric, or times that do not increase; an error at run time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
+    weight is not symmetric, or if the times do not increase. With `throw`, an error at
+    run time if there is no minimum.
 
     Source: Davison and Maki, 1973 (the linear flow).
 
@@ -248,7 +280,11 @@ def cre(
         A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
         B = jnp.array([[0.0], [1.0]])
         times = jnp.array([0.0, 100.0])
-        K = dlx.riccati.cre(A, B, jnp.eye(2), jnp.eye(1), times=times).K[0]
+        dlx.riccati.cre(A, B, jnp.eye(2), jnp.eye(1), times=times).K[0]
+        ```
+
+        ```text
+        TODO3
         ```
     """
     where = "cre"
@@ -260,7 +296,7 @@ def cre(
     solution = _continuous_solution(*(given[M] for M in "ABQRS"), final, times)
     point = lambda: (
         "There is no solution over the time from point "
-        f"{failed_step(solution.X)} of the grid."
+        f"{failed_step(solution.X)} of the grid (times) to its end."
     )
     return raise_on_failure(solution, where, throw, facts=point)
 
@@ -268,7 +304,7 @@ def cre(
 @compiled_unless_on_host
 @full_precision
 def _continuous_solution(A, B, Q, R, S, final, times):
-    # Without a definite R the Hamiltonian has no minimum, whatever X is.
+    # If R is not definite, the Hamiltonian has no minimum for any X.
     definite = is_clearly_definite(R)
     safe = xp.where(definite, R, xp.eye(R.shape[0], dtype=R.dtype))
     X = flow_values(*without_cross_weight(A, B, Q, safe, S), final, times, False)
