@@ -1,7 +1,8 @@
 """The stationary H-infinity games.
 
-A game is the Riccati equation of the joint control `[u; w]`, with an indefinite weight:
-`R` for the control, `-gamma^2 I` for the disturbance, which maximises.
+The Riccati equation of a game is that of control for the joint control `[u; w]`. Its
+weight is indefinite: `R` for the control, and `-gamma^2 I` for the disturbance, which
+maximises the cost.
 """
 
 import functools
@@ -63,46 +64,52 @@ def hinf_dare(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The stationary H-infinity game in discrete time,
+    r"""The stationary H-infinity control in discrete time, as the solution of a game.
 
-    `X = Q + A' X (I + (B R^-1 B' - gamma^-2 D D') X)^-1 A`,
+    $$X = Q + A^\top X M^{-1} A, \qquad
+    M = I + (B R^{-1} B^\top - \gamma^{-2} D D^\top) X$$
 
-    whose control `u = -K x` keeps the sum of `x'Qx + u'Ru` below `gamma^2` times that
-    of `w'w`, from rest, for every disturbance `w` along `x_next = A x + B u + D w`:
+    For the system $x_{k+1} = A x_k + B u_k + D w_k$ with $x_0 = 0$, the control
+    $u = -K x$, $K = R^{-1} B^\top X M^{-1} A$, ensures for every disturbance $w$ that
 
-    `K = R^-1 B' X M^-1 A`, `M = I + (B R^-1 B' - gamma^-2 D D') X`,
+    $$\sum_{k=0}^\infty x_k^\top Q x_k + u_k^\top R u_k \le
+    \gamma^2 \sum_{k=0}^\infty w_k^\top w_k.$$
 
-    while the worst disturbance is `w = gamma^-2 D' X M^-1 A x`. The control does not
-    know `w`, and `gamma^2 I - D'XD` must be positive definite.
+    The worst disturbance is $w = \gamma^{-2} D^\top X M^{-1} A x$. The control does not
+    know $w$, and $\gamma^2 I - D^\top X D$ must be positive definite.
 
-    Doubling, then Newton steps on the equation; the conditions of a solution
-    (`X` positive semidefinite, that of a saddle point, stability) are checked at the
-    end, as the equation alone also has solutions that solve no game. At a given `gamma`
-    it is differentiable to any order, in either mode, by the implicit function theorem.
+    The solver is doubling, followed by Newton steps. The equation also has solutions
+    that do not solve the game. Therefore the solver checks at the end that $X$ is
+    positive semidefinite, that the game has a saddle point, and that the closed loop is
+    stable. At a given `gamma` the solution is differentiable to any order, in either
+    mode, by the implicit function theorem.
 
-    Without `gamma`, secants and bisection find the least one, which has first
-    derivatives. All else is then differentiated at that level, held fixed, and is steep
-    where the saddle point vanishes just below it. Use
-    `gamma=1.05 * hinf_dare(...).gamma` for a design with derivatives that follow the
-    level.
+    Without `gamma`, secants and bisection find the smallest level that a controller can
+    attain. It has first derivatives only. The other results are then differentiated
+    with the level held fixed, and these derivatives may be large, because the saddle
+    point vanishes just below the level. For a design whose derivatives follow the
+    level, give `gamma=1.05 * hinf_dare(...).gamma`.
 
     **Arguments:**
 
     - `A`: shape `(n, n)`.
     - `B`: shape `(n, m)`.
-    - `D`: how the disturbance enters, shape `(n, k)`; `None` for the identity.
+    - `D`: the input matrix of the disturbance, shape `(n, k)`; `None` for the identity.
     - `Q`: state weight, shape `(n, n)`, symmetric, positive semidefinite.
     - `R`: control weight, shape `(m, m)`, symmetric.
-    - `gamma`: the level, a positive number; by default the least that is attainable.
-    - `tolerance`: how close to the least level, relatively; by default 16 rounding
-        units.
-    - `throw`: raise unless the game is solved (default); if false, check `result`.
+    - `gamma`: the level $\gamma$, a positive number. By default the smallest level that
+        a controller can attain.
+    - `tolerance`: the relative tolerance of the smallest level; by default 16 times
+        machine epsilon.
+    - `throw`: raise an error unless the game is solved (default). If false, check
+        `result`.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
-    no solution, as when `gamma` is below the least attainable level.
+    no solution, for example because `gamma` is below the smallest attainable level.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite or not
-    symmetric, or a level that is not positive; an error at run time as `throw` says.
+    **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `Q` or
+    `R` is not symmetric, if `Q` is not semidefinite, or if `gamma` or `tolerance` is
+    not positive. With `throw`, an error at run time if the game is not solved.
 
     Source: Basar and Bernhard, 1995.
 
@@ -115,7 +122,11 @@ def hinf_dare(
         A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
         B = jnp.array([[0.0], [1.0]])
         solution = dlx.riccati.hinf_dare(A, B, jnp.eye(2), jnp.eye(2), jnp.eye(1))
-        solution.gamma, solution.K  # 2.9563, [[0.7129, 1.7128]]
+        solution.gamma, solution.K
+        ```
+
+        ```text
+        (Array(2.956, dtype=float32), Array([[0.713, 1.713]], dtype=float32))
         ```
     """
     where = "hinf_dare"
@@ -135,32 +146,38 @@ def hinf_care(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    """The stationary H-infinity game in continuous time,
+    r"""The stationary H-infinity control in continuous time, as the solution of a game.
 
-    `A'X + XA - X (B R^-1 B' - gamma^-2 D D') X + Q = 0`,
+    $$A^\top X + X A - X (B R^{-1} B^\top - \gamma^{-2} D D^\top) X + Q = 0$$
 
-    whose control `u = -K x`, `K = R^-1 B' X`, keeps the integral of `x'Qx + u'Ru` below
-    `gamma^2` times that of `w'w`, from rest, for every disturbance `w` along
-    `dx/dt = A x + B u + D w`. The worst is `w = gamma^-2 D' X x`.
+    For the system $\dot{x} = A x + B u + D w$ with $x(0) = 0$, the control $u = -K x$,
+    $K = R^{-1} B^\top X$, ensures for every disturbance $w$ that
 
-    Doubling of the flow of the Riccati differential equation, then Newton steps on the
-    equation; the conditions of a solution (`X` positive semidefinite, stability) are
-    checked at the end. Derivatives are those of [`delucax.riccati.hinf_dare`][]: to any
-    order at a given `gamma`; of the least `gamma`, the first, and of all else at that
-    level, held fixed. As `gamma` falls to the least level `X` may grow without bound:
-    take a few percent more for a controller.
+    $$\int_0^\infty x^\top Q x + u^\top R u \,\mathrm{d}t \le
+    \gamma^2 \int_0^\infty w^\top w \,\mathrm{d}t.$$
 
-    **Arguments:** `A`, `B`, `D`, `Q`, `gamma` and `throw`: as of
-    [`delucax.riccati.hinf_dare`][];
+    The worst disturbance is $w = \gamma^{-2} D^\top X x$.
+
+    The solver doubles the interval of the Riccati differential equation, and then takes
+    Newton steps. At the end it checks that $X$ is positive semidefinite and that the
+    closed loop is stable. The derivatives are as in [`delucax.riccati.hinf_dare`][]: of
+    any order at a given `gamma`; without `gamma`, the first of the smallest level, and
+    all others with the level held fixed. As `gamma` approaches the smallest level, $X$
+    may grow without bound: for a controller, take a `gamma` a few percent higher.
+
+    **Arguments:** `A`, `B`, `D`, `Q`, `gamma` and `throw`: as in
+    [`delucax.riccati.hinf_dare`][].
 
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
-    - `tolerance`: how close to the least level, relatively; by default 1e-6, and 1e-3
-        in float32. Where `X` grows without bound, the least level is the least at which
-        its digits suffice to tell that it is a solution, some 1e-5 above.
+    - `tolerance`: the relative tolerance of the smallest level; by default 1e-6, or
+        1e-3 in float32. If $X$ grows without bound, the result is the smallest level at
+        which $X$ has enough correct digits to be accepted, about 1e-5 above the exact
+        one.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][], NaN as there.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
+    no solution.
 
-    **Raises:** as there.
+    **Raises:** as in [`delucax.riccati.hinf_dare`][].
 
     Source: Basar and Bernhard, 1995; Doyle, Glover, Khargonekar and Francis, 1989.
 
@@ -174,7 +191,11 @@ def hinf_care(
         B = jnp.array([[0.0], [1.0]])
         Q, R = jnp.eye(2), jnp.eye(1)
         least = dlx.riccati.hinf_care(A, B, B, Q, R).gamma
-        solution = dlx.riccati.hinf_care(A, B, B, Q, R, gamma=1.1 * least)
+        dlx.riccati.hinf_care(A, B, B, Q, R, gamma=1.1 * least).K
+        ```
+
+        ```text
+        TODO1
         ```
     """
     where = "hinf_care"
@@ -183,7 +204,7 @@ def hinf_care(
 
 
 def checked_game(where: str, A: Any, B: Any, D: Any, Q: Any, R: Any) -> tuple:
-    """The matrices of a stationary game, in one precision, that fit each other."""
+    """Check the matrices of a stationary game, and convert them to one precision."""
     given = constant_matrices(where, A=A, B=B, D=D, Q=Q, R=R)
     check_definite(given["Q"], "Q", where, False)
     given.setdefault("D", xp.eye(len(given["A"]), dtype=given["A"].dtype))
@@ -203,17 +224,18 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     )
     game = end.game
     X = _with_implicit_derivative(discrete, problem, level, game)
-    # An unsolved game is replaced by a trivial one, which keeps NaN out of derivatives.
+    # An unsolved game is replaced by a trivial one, so that derivatives are not NaN.
     (A, B, D, Q, X), R = where_solved(game.good, (*problem[:4], X), problem[4])
     K = joint_gain(discrete, joint((A, B, D, Q, R), level), X)
     m = B.shape[1]
     loop = A - B @ K[:m]
     bound = spectral_radius if discrete else spectral_abscissa
     masked = lambda M: xp.where(game.good, M, xp.nan)
-    # A little below the least level the equation nearly has a solution.
+    # Just below the smallest level the equation nearly has a solution.
     near = game.residual < 100 * _rounding(len(X), X.dtype)
     failure = choose(game.holds & near, RESULTS.not_converged, RESULTS.infeasible)
-    # Without a disturbance it is the control problem: no level is to blame.
+    # Without a disturbance the game is the control problem. If that has no solution,
+    # the level is not the reason.
     failure = choose(end.solvable, failure, RESULTS.not_stabilising)
     bound = masked(bound(stop_gradient(loop)))
     return GameSolution(
@@ -230,20 +252,20 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
 
 
 def _rounding(n: int, dtype) -> float:
-    """The relative residual that counts as solved."""
+    """The largest relative residual of a solved equation."""
     return 1000 * n * float(xp.finfo(dtype).eps)
 
 
 def _game_start(discrete: bool, problem: tuple) -> Square:
-    """The starting point without a disturbance: not 0, which is a fixed point if
-    `(A, Q)` is not detectable."""
+    """The starting point without a disturbance. It is not 0, because 0 is a fixed point
+    if `(A, Q)` is not detectable."""
     A, B, _, Q, R = problem
     if discrete:
         scale = xp.linalg.norm(Q)
         scale = one_if_zero(xp.where(scale > 0, scale, xp.linalg.norm(R)))
     else:
         control = symmetric(B @ solve(R, B.T))
-        # With Q = 0 the unstable modes alone set the size of X, |A|^2 / |B R^-1 B'|.
+        # If Q = 0, the unstable modes alone set the size of X, |A|^2 / |B R^-1 B'|.
         tiny = xp.finfo(A.dtype).tiny ** 0.5
         unseen = xp.linalg.norm(A) ** 2 / xp.maximum(xp.linalg.norm(control), tiny)
         Q = xp.where(xp.linalg.norm(Q) > 0, Q, shifted(unseen, Q))
@@ -252,17 +274,17 @@ def _game_start(discrete: bool, problem: tuple) -> Square:
 
 
 def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Game:
-    """The stabilising solution of the game equation, with the conditions under which it
-    is a saddle point."""
+    """The stabilising solution of the game equation, and whether it is a saddle
+    point."""
     A, B, D, _, R = problem
     (n, m), eps = B.shape, xp.finfo(A.dtype).eps
     data = joint(problem, gamma)
-    # Doubling of the equation of X - X0, from below the solution, to which it rises.
+    # Doubling for X - X0. X0 is below the solution, so the iterates increase to it.
     element, unit = _element(discrete, data, problem, gamma, X0)
     J, iterations = double(element, X0 / unit)
     left = newton_refine(
         lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
-        # The next step corrects what this one leaves: no refinement.
+        # No refinement: the next Newton step corrects the error of this one.
         lambda *at: _correction(discrete, *at, 0),
         X0 + unit * J,
         controls=data.B.shape[1],
@@ -270,7 +292,7 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
         to_working_precision=True,
     )
     X = left.X
-    # Both loops must be stable: against the worst disturbance, and without any.
+    # The loop must be stable with the worst disturbance and without a disturbance.
     _, _, weight = stationary(discrete, data, X)
     alone = A - B @ left.K[:m]
     loops = xp.stack([left.closed_loop, alone])
@@ -281,19 +303,19 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
         margin = n * eps * xp.linalg.norm(A)
         decided = is_clearly_definite(R)
     stable = vmap(lambda loop: is_stable(discrete, loop, margin))(loops)
-    # The equation alone also has solutions above the level of any controller, at which
-    # X is not semidefinite or a loop not stable (Doyle et al., 1989).
+    # The equation also has solutions at levels that no controller attains. Then X is
+    # not semidefinite, or a loop is not stable (Doyle et al., 1989).
     holds = is_semidefinite(X, 1000) & decided & xp.all(stable)
     solved = left.relative < _rounding(n, A.dtype)
-    # In discrete time the worth of the disturbance falls to zero, in continuous time
-    # the solution grows.
+    # At the smallest level, I - D'XD / gamma^2 becomes singular in discrete time, and X
+    # may grow without bound in continuous time.
     growing = inverse_margin(D, X, gamma) if discrete else X
     distance = 1 / largest_eigenvalue(growing)
     return Game(X, left.bounds[0], holds, solved, iterations, distance)
 
 
 def _element(discrete, data, problem, gamma, X0):
-    """The element of a step of the equation of `X - X0`, and the unit of `X`."""
+    """The element of one step of the equation for `X - X0`, and the unit of `X`."""
     A, B, D, Q, R = problem
     if discrete:
         moved, cross, weight = stationary(True, data, X0)
@@ -301,7 +323,7 @@ def _element(discrete, data, problem, gamma, X0):
         return without_cross_weight(A, data.B, linear, weight, cross, Q), 1.0
     # In continuous time a step is the flow over a short interval.
     G = symmetric(B @ solve(R, B.T) - D @ D.T / gamma**2)
-    # The flow of the correction, in the unit that makes its parts alike.
+    # The flow of the correction, in the unit that makes its parts equally large.
     moved = X0 @ A
     constant = Q + moved + moved.T - X0 @ G @ X0
     unit = scale_of(G, constant)
@@ -312,14 +334,14 @@ def _element(discrete, data, problem, gamma, X0):
 def _correction(discrete, X, loop, error, *refinements):
     """The Newton step for an `error` of the equation.
 
-    In continuous time it is solved in coordinates in which `X` is the identity: near
-    the least level `X` is large in some directions, and the loop far from normal.
+    In continuous time it is solved in coordinates in which `X` is the identity. Near
+    the smallest level `X` is large in some directions, and the loop is far from normal.
     """
     if discrete:
         return lyapunov(True, loop, error)
     eye = shifted(1, X)
-    # With X = root root', loop and error become root' loop root'^-1, root^-1 error
-    # root'^-1; a singular X is shifted by its rounding.
+    # With X = root root', the loop becomes root' loop root'^-1, and the error becomes
+    # root^-1 error root'^-1. A singular X is shifted by its rounding.
     slack = xp.finfo(X.dtype).eps * one_if_zero(size(X))
     root = stop_gradient(cholesky(X + slack * eye))
     root = xp.where(xp.all(xp.isfinite(root)), root, eye)
@@ -333,7 +355,7 @@ def _correction(discrete, X, loop, error, *refinements):
 def _with_implicit_derivative(
     discrete: bool, problem: tuple, gamma: Scalar, game: Game
 ) -> Square:
-    """`X` of a solved game with its implicit derivatives; zero of an unsolved one."""
+    """`X` of a solved game with its implicit derivatives; zero for an unsolved game."""
     del discrete, problem, gamma
     return xp.where(game.good, game.X, 0)
 
@@ -345,10 +367,10 @@ def _implicit_derivative_jvp(discrete, primals, tangents):
     problem, gamma, game = primals
     (A, *others), R = where_solved(game.good, problem[:4], problem[4])
     if not discrete:
-        # The trivial game has A = 0, which is not stable: it is given A = -I.
+        # `where_solved` sets A = 0, which is not stable. A = -I is.
         A = A - shifted(xp.where(game.good, 0, 1), A)
     gamma = xp.where(game.good, gamma, 1)
-    # By the implicit function theorem, as for the equation of control.
+    # By the implicit function theorem, as for the control equation.
     _, error, loop = jax.jvp(
         lambda *at: left_side(discrete, X, joint(*at)),
         ((A, *others, R), gamma),
@@ -359,7 +381,7 @@ def _implicit_derivative_jvp(discrete, primals, tangents):
 
 
 def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
-    """A barrier function, whose slope diverges at the least level."""
+    """A barrier function. Its slope diverges at the smallest level."""
     start = _game_start(discrete, problem)
     solve_game = functools.partial(_solve_game, discrete)
     end, _ = bisect_level(solve_game, problem, start, gamma)

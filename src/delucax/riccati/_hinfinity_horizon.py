@@ -28,7 +28,7 @@ from ._stabilising import shifted
 
 
 def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
-    """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
+    """`X` at each step or time of the game `(A, B, D, Q, R, final, *times)`."""
     A, B, D, Q, R, final, *times = problem
     if discrete:
         both, weight = joint_inputs(B, D, R, gamma)
@@ -36,7 +36,7 @@ def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
         return values(A, both, Q, weight, S, final, D.shape[-1], False)
     definite = is_clearly_definite(R)
     safe = xp.where(definite, R, shifted(1, R))
-    # The quadratic term of both players, which flows like that of control alone.
+    # The quadratic term of both players. The flow has the same form as for control.
     G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
     X = flow_values(A, G, Q, final, *times, True)
     return xp.where(definite, X, xp.nan)
@@ -56,40 +56,51 @@ def hinf_dre(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The H-infinity game over a finite horizon, back from `X_T = final`:
+    r"""H-infinity control over a finite horizon in discrete time, as the solution of a
+    game.
 
-    `X_t = Q + A' X (I + (B R^-1 B' - gamma^-2 D D') X)^-1 A`, with `X = X_{t+1}`.
+    The recursion runs backwards in time, from $X_T = X_f$ (`final`):
 
-    The controls `u = -K_t x` keep the sum of `x'Qx + u'Ru` over steps `t < T`, plus
-    `x_T' final x_T`, below `gamma^2` times that of `w'w`, from rest, for every
-    disturbance `w` along `x_next = A x + B u + D w`. The control does not know `w`, and
-    `gamma^2 I - D'XD` must be positive definite at each step.
+    $$X_t = Q + A^\top X_{t+1}
+    \left( I + (B R^{-1} B^\top - \gamma^{-2} D D^\top) X_{t+1} \right)^{-1} A$$
 
-    Any argument of the stage may vary in time. Derivatives are those of
-    [`delucax.riccati.hinf_dare`][]: to any order at a given `gamma`; of the least
-    `gamma`, the first, and of all else at that level, held fixed.
+    For the system $x_{t+1} = A x_t + B u_t + D w_t$ with $x_0 = 0$, the controls
+    $u_t = -K_t x_t$ ensure for every disturbance $w$ that
+
+    $$\sum_{t=0}^{T-1} \left( x_t^\top Q x_t + u_t^\top R u_t \right)
+    + x_T^\top X_f x_T \le \gamma^2 \sum_{t=0}^{T-1} w_t^\top w_t.$$
+
+    The control does not know $w$, and $\gamma^2 I - D^\top X_{t+1} D$ must be positive
+    definite at each step.
+
+    All matrices except `final` may vary in time. The derivatives are as in
+    [`delucax.riccati.hinf_dare`][]: of any order at a given `gamma`; without `gamma`,
+    the first of the smallest level, and all others with the level held fixed.
 
     **Arguments:**
 
     - `A`: shape `(n, n)`, or `(T, n, n)`.
     - `B`: shape `(n, m)`, or `(T, n, m)`.
-    - `D`: how the disturbance enters, shape `(n, k)`, or `(T, n, k)`; `None` for the
-        identity.
+    - `D`: the input matrix of the disturbance, shape `(n, k)`, or `(T, n, k)`; `None`
+        for the identity.
     - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric.
-    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
-    - `horizon`: the number of steps `T`; needed if no argument has a time axis.
-    - `gamma`: the level, a positive number; by default the least that is attainable.
-    - `tolerance`: how close to the least level, relatively; by default 16 rounding
-        units.
-    - `throw`: raise unless the game is solved (default); if false, check `result`.
+    - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
+    - `horizon`: the number of steps $T$; needed if no argument has a time axis.
+    - `gamma`: the level $\gamma$, a positive number. By default the smallest level that
+        a controller can attain.
+    - `tolerance`: the relative tolerance of the smallest level; by default 16 times
+        machine epsilon.
+    - `throw`: raise an error unless the game is solved (default). If false, check
+        `result`.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][]. It is NaN at a step that
-    has no saddle point, as where `gamma` is too low, and at all before it.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. If a step has no saddle point,
+    for example because `gamma` is too low, the solution is NaN at this step and at all
+    steps before it.
 
-    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
-    not symmetric, if there is no horizon, or the level is not positive; an error at run
-    time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
+    weight is not symmetric, if there is no horizon, or if `gamma` or `tolerance` is not
+    positive. With `throw`, an error at run time if the game is not solved.
 
     Source: Basar and Bernhard, 1995.
 
@@ -102,7 +113,11 @@ def hinf_dre(
         A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
         B = jnp.array([[0.0], [1.0]])
         Q, R = jnp.eye(2), jnp.eye(1)
-        dlx.riccati.hinf_dre(A, B, None, Q, R, final=Q, horizon=20).gamma  # 2.9563
+        dlx.riccati.hinf_dre(A, B, None, Q, R, final=Q, horizon=20).gamma
+        ```
+
+        ```text
+        Array(2.956, dtype=float32)
         ```
     """
     where = "hinf_dre"
@@ -129,32 +144,39 @@ def hinf_cre(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The H-infinity game over a finite horizon of continuous time, back from
-    `X(t_1) = final`:
+    r"""H-infinity control over a finite horizon in continuous time, as the solution of
+    a game.
 
-    `-dX/dt = A'X + XA - X (B R^-1 B' - gamma^-2 D D') X + Q`.
+    The equation runs backwards in time, from $X(t_1) = X_f$ (`final`), with $t_1$ the
+    last of `times`:
 
-    The control `u = -K(t) x`, `K = R^-1 B' X`, keeps the integral of `x'Qx + u'Ru` up
-    to `t_1`, the last of `times`, plus `x(t_1)' final x(t_1)`, below `gamma^2` times
-    that of `w'w`, from rest, for every disturbance `w` along `dx/dt = A x + B u + D w`.
+    $$-\dot{X} = A^\top X + X A - X (B R^{-1} B^\top - \gamma^{-2} D D^\top) X + Q$$
 
-    It is exact but for rounding, as [`delucax.riccati.cre`][] is. Derivatives are those
-    of [`delucax.riccati.hinf_dare`][]: to any order at a given `gamma`; of the least
-    `gamma`, the first, and of all else at that level, held fixed. As `gamma` falls to
-    the least level, `X` grows without bound at the first time: take a few percent more
-    for a controller.
+    For the system $\dot{x} = A x + B u + D w$, which starts at $x = 0$, the control
+    $u = -K(t)\, x$ with $K = R^{-1} B^\top X$ ensures for every disturbance $w$ that
 
-    **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as of
-    [`delucax.riccati.hinf_care`][];
+    $$\int^{t_1} x^\top Q x + u^\top R u \,\mathrm{d}t + x(t_1)^\top X_f\, x(t_1)
+    \le \gamma^2 \int^{t_1} w^\top w \,\mathrm{d}t.$$
 
-    - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
-    - `final`: final weight, shape `(n, n)`, symmetric, positive semidefinite; zero by
-        default.
+    The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. The
+    derivatives are as in [`delucax.riccati.hinf_dare`][]: of any order at a given
+    `gamma`; without `gamma`, the first of the smallest level, and all others with the
+    level held fixed. As `gamma` approaches the smallest level, $X$ grows without bound
+    at the first time: for a controller, take a `gamma` a few percent higher.
+
+    **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as in
+    [`delucax.riccati.hinf_care`][].
+
+    - `times`: the times at which $X$ is computed, increasing, at least two, shape
+        `(N,)`.
+    - `final`: final weight $X_f$, shape `(n, n)`, symmetric, positive semidefinite;
+        zero by default.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. It is NaN at the times from which
-    there is no solution, as where `gamma` is too low.
+    there is no solution, for example because `gamma` is too low.
 
-    **Raises:** as there, and on times that do not increase.
+    **Raises:** as in [`delucax.riccati.hinf_care`][], and `ValueError` if the times do
+    not increase.
 
     Source: Basar and Bernhard, 1995; Davison and Maki, 1973.
 
@@ -167,7 +189,11 @@ def hinf_cre(
         A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
         B = jnp.array([[0.0], [1.0]])
         Q, R, times = jnp.eye(2), jnp.eye(1), jnp.linspace(0.0, 5.0, 11)
-        solution = dlx.riccati.hinf_cre(A, B, B, Q, R, times=times, gamma=3.0)
+        dlx.riccati.hinf_cre(A, B, B, Q, R, times=times, gamma=3.0).K[0]
+        ```
+
+        ```text
+        TODO1
         ```
     """
     where = "hinf_cre"
@@ -185,7 +211,7 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     points = times[0].shape[0] if times else A.shape[0] + 1
 
     def solve_game(problem, gamma, _) -> Game:
-        # There is no equation to be solved: all that can fail is that X is not finite.
+        # The recursion always gives an X. It is not finite if the game has no solution.
         X = _values(discrete, problem, gamma)
         zero, yes = xp.zeros((), X.dtype), xp.ones((), bool)
         if discrete:
@@ -210,7 +236,7 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     masked = lambda M: xp.where(good[:, None, None], M, xp.nan)
     m = B.shape[-1]
     if discrete:
-        # X[t+1] decides the gains of step t, which exist where X[t] does.
+        # The gains of step t follow from X[t+1]. They exist if X[t] exists.
         good = good[:-1]
         both, weight = joint_inputs(B, D, R, level)
         (A, both, after), weight = where_solved(good, (A, both, X[1:]), weight)

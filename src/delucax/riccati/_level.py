@@ -1,4 +1,4 @@
-"""A game at a level, or at the least one, and the level's derivative."""
+"""Games at a given level or at the smallest level, and the derivative of that level."""
 
 import functools
 from collections.abc import Callable
@@ -20,45 +20,47 @@ from ._residual import stationary
 
 
 _LOOSE = {4: 1e-3, 8: 1e-6}
-"""Default tolerance of a level by the bytes of a number, where `X` has a pole at it."""
+"""The default tolerance of a level at which `X` has a pole, by the bytes of a number."""
 _WIDEST = 1e18
-"""The search gives up this factor away from where it starts."""
+"""The search gives up this factor away from its start."""
 _FACTOR = 4.0
 _MAX_TRIALS = 200
 _SQUARINGS = 3
 _AWAY = (1.0, 4.0, 16.0, 64.0)
 _WEIGHTS = (64 / 21, -8 / 3, 2 / 3, -1 / 21)
-"""Of the polynomial through values at the roots of the above, at 0."""
+"""The weights of values at distances proportional to `_AWAY`, in the extrapolation to
+distance 0 by a polynomial in the square root of the distance."""
 
 
 class GameSolution(eqx.Module):
-    """The saddle point of a game, stationary or over a finite horizon.
+    r"""The saddle point of an H-infinity game, stationary or over a finite horizon.
 
-    Over a horizon the matrices have a leading axis for the steps `t` (or the points of
-    the grid), and from state `x` at step `t` the worst cost is `x'X[t]x`, less
-    `gamma^2` times that of the disturbance.
+    From state $x$ at step $t$, the cost minus $\gamma^2$ times the sum of
+    $w^\top w$ is at most $x^\top X_t x$, and the worst disturbance attains this bound.
+    Over a finite horizon the matrices have a leading axis: over the $T$ steps in
+    discrete time, over the $N$ points of the grid in continuous time.
 
     **Attributes:**
 
-    - `X`: the solution of the game equation, shape `(n, n)`, symmetric; over a horizon
-        at each step and at the end, shape `(T+1, n, n)`, or in continuous time at each
-        point of the grid, shape `(N, n, n)`.
-    - `K`: the gain of the control `u = -K x`, shape `(m, n)`; over a horizon
+    - `X`: the solution of the game equation, symmetric, shape `(n, n)`. Over a horizon
+        at each step and at the end, shape `(T+1, n, n)`, or at each point of the grid,
+        shape `(N, n, n)`.
+    - `K`: the gain of the control $u = -K x$, shape `(m, n)`; over a horizon
         `(T, m, n)`, or `(N, m, n)`.
-    - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`; over a horizon
+    - `L`: the gain of the worst disturbance $w = L x$, shape `(k, n)`; over a horizon
         `(T, k, n)`, or `(N, k, n)`.
-    - `gamma`: the level that is attained.
-    - `closed_loop`: the matrix `A - B K`, shape `(n, n)`; over a horizon `(T, n, n)`,
+    - `gamma`: the level $\gamma$ that the control attains.
+    - `closed_loop`: the matrix $A - B K$, shape `(n, n)`; over a horizon `(T, n, n)`,
         or `(N, n, n)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms: an upper bound, with rounding of its own evaluation counted. `None` over
-        a horizon, as are those below.
-    - `iterations`: doublings taken at `gamma`.
-    - `spectral_radius`: in discrete time, an upper bound on that of `closed_loop`,
-        close to it. `None` in continuous time.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `residual`: an upper bound on the relative residual: the norm of the residual of
+        the equation, divided by the sum of the norms of its terms. The bound includes
+        the rounding of its own evaluation. `None` over a horizon.
+    - `iterations`: the number of doublings at `gamma`. `None` over a horizon.
+    - `spectral_radius`: in discrete time, a close upper bound on the spectral radius of
+        `closed_loop`. `None` in continuous time and over a horizon.
     - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
-        `closed_loop`, up to rounding. `None` in discrete time.
+        `closed_loop`, up to rounding. `None` in discrete time and over a horizon.
 
     `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
     gradient.
@@ -73,7 +75,11 @@ class GameSolution(eqx.Module):
         B = jnp.array([[0.0], [1.0]])
         Q, R = jnp.eye(2), jnp.eye(1)
         solution = dlx.riccati.hinf_dare(A, B, None, Q, R, gamma=5.0)
-        solution.K, solution.L, solution.spectral_radius
+        solution.K, solution.L
+        ```
+
+        ```text
+        TODO1
         ```
     """
 
@@ -92,7 +98,7 @@ class GameSolution(eqx.Module):
 
 
 def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
-    """`[B D]`, and the weight of the joint control `[u; w]`."""
+    """`[B D]`, the input matrix of the joint control `[u; w]`, and its weight."""
     m, k = B.shape[-1], D.shape[-1]
     nothing = xp.zeros((*R.shape[:-2], m, k), R.dtype)
     # gamma^2 w'w is subtracted from the cost.
@@ -116,8 +122,8 @@ def joint_gain(discrete: bool, data: RiccatiData, X: Square) -> Array:
 
 
 def at_level(solver, where, discrete, problem, gamma, tolerance, throw) -> GameSolution:
-    """The checked call of `solver(discrete, problem, gamma, tolerance)`: the game at a
-    given level, or at the least one to within a tolerance."""
+    """Check `gamma` and `tolerance`, and call `solver`, with the game at a given level
+    or at the smallest level."""
     dtype = problem[0].dtype
     if tolerance is None:
         tolerance = 16 * xp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
@@ -131,14 +137,14 @@ def at_level(solver, where, discrete, problem, gamma, tolerance, throw) -> GameS
 
 
 class Game(NamedTuple):
-    """A solution of the equation of a game, and the conditions of a saddle point."""
+    """A solution of a game equation, and whether it is a saddle point."""
 
     X: Array
     residual: Array
     holds: Array  # whether all conditions but the equation hold
     solved: Array  # whether the equation is solved
     iterations: Array
-    distance: Array  # a number that falls to zero at the least level
+    distance: Array  # a number that decreases to zero at the smallest level
 
     @property
     def good(self) -> Array:
@@ -146,15 +152,15 @@ class Game(NamedTuple):
 
 
 class Bisection(NamedTuple):
-    """The state of the bisection of the least level.
+    """The state of the bisection for the smallest level.
 
-    A point is `gamma^-2` and the distance of a feasible level.
+    A point is `gamma^-2` and the `distance` at a feasible level.
     """
 
     low: Array
     high: Array
     point: Float[Array, "2"]  # at the upper end
-    estimate: Array  # of the least level, by the last two points
+    estimate: Array  # of the smallest level, from the last two points
     error: Array  # of the estimate
     width_before: Array  # of the bracket, before the last trial
     start: Array
@@ -167,8 +173,8 @@ class Bisection(NamedTuple):
 
 Barrier = Callable[[tuple, Array], Array]
 Solve = Callable[[tuple, Array, Array], Game]
-"""`(A, B, D, Q, R, *others)`, `gamma` and `X0` to the game's solution. `X0` is a point
-below the solution, from which the iteration rises to it."""
+"""A function `((A, B, D, Q, R, *others), gamma, X0) -> game`. `X0` is below the
+solution, and the iteration increases from it to the solution."""
 
 
 def bisect_level(
@@ -178,12 +184,12 @@ def bisect_level(
     gamma: Array | None = None,
     tolerance: Array | float = 0.0,
 ) -> tuple[Bisection, Array]:
-    """The game at `gamma`, or at the least level; and the level. No derivatives.
+    """The game at `gamma` or at the smallest level, and the level, without derivatives.
 
-    The first trial is without a disturbance, from `start`. It tells whether any level
-    is feasible and gives the scale of the bracket; the other trials start at its
-    solution. The level is the upper, feasible end of a bracket of relative width
-    `tolerance`, and 0 where no disturbance has any effect.
+    The first trial starts at `start` and has no disturbance. It shows whether any level
+    is feasible, and gives the scale of the bracket. The other trials start at its
+    solution. The level is the upper end of a bracket of relative width `tolerance`,
+    which is feasible. It is 0 if the disturbance has no effect on the cost.
     """
     problem, start, gamma = stop_gradient((problem, start, gamma))
     A, B, D, *others = problem
@@ -192,7 +198,7 @@ def bisect_level(
     def more(now):
         if gamma is not None:
             return (now.trials == 0) | (now.solvable & (now.trials < 2))
-        # Until both ends are known the bracket grows, within limits; then it shrinks.
+        # The bracket grows, within limits, until both ends are known. Then it shrinks.
         open_end = xp.isinf(now.high) | (now.low == 0)
         wide = now.high > now.low * (1 + tolerance)
         near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
@@ -202,8 +208,8 @@ def bisect_level(
     def body(now):
         first = now.trials == 0
         if gamma is None:
-            # Up by factors until feasible, down until not, and then into the middle, of
-            # the logarithms: the level may have any size.
+            # Increase the level until it is feasible, decrease it until it is not, then
+            # bisect. Factors and the mean of logarithms, as the level has any size.
             known = xp.where(xp.isinf(now.high), 1, now.high)
             up = xp.where(now.low == 0, now.start, _FACTOR * now.low)
             down = xp.where(now.low == 0, known / _FACTOR, _within(now, tolerance))
@@ -215,8 +221,8 @@ def bisect_level(
         game = solve_game(tried, trial, now.base)
         good = game.good
         point = xp.stack([xp.where(first, 0, trial**-2.0), game.distance])
-        # The cost of a unit disturbance, trace D'XD: the square of a typical level, at
-        # which the bracket starts.
+        # The bracket starts at a typical level. Its square is trace D'XD, the cost of a
+        # unit disturbance.
         X = game.X[1:] if D.ndim == 3 else game.X
         effect = xp.sum(D * (X @ D))
         size = xp.linalg.norm(X) * xp.sum(D**2)
@@ -229,16 +235,17 @@ def bisect_level(
             game=game,
             point=point,
         )
-        # Between neighbouring floating-point numbers the bracket closes.
+        # No number is left between the ends, so the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
-        # The distance is nearly linear in gamma^-2, along the secant.
+        # The distance is nearly linear in gamma^-2, so take the secant.
         place, value = point
         slope = (now.point[1] - value) / (now.point[0] - place)
         estimate = (place - value / slope) ** -0.5
-        # That of the last estimate is the change. It falls as the distance does.
+        # The change is the error of the last estimate. The new error is smaller by the
+        # ratio of the distances.
         error = xp.abs(estimate - now.estimate) * (value / now.point[1])
-        # Of a search the best game is kept, at a given level the one that was solved.
+        # A search keeps the best game. At a given level the game is kept in any case.
         keep = better if gamma is None else xp.ones((), bool)
         later = now._replace(
             low=xp.where(stuck, now.high, xp.where(good, now.low, trial)),
@@ -274,18 +281,18 @@ def bisect_level(
 
 
 def _within(now: Bisection, tolerance: Array | float) -> Array:
-    """The next level within the bracket.
+    """The next level to try, within the bracket.
 
-    It is a little above or below the estimate of the least level, by as much as that is
-    uncertain: where more of the bracket is cut off.
+    It is above or below the estimate of the smallest level by the uncertainty of the
+    estimate, on the side that cuts off more of the bracket.
     """
     low, high, estimate = now.low, now.high, now.estimate
     width, middle = high - low, xp.sqrt(low * high)
     error = xp.maximum(4 * now.error, tolerance * estimate / 4)
     above, below = estimate + error, estimate - error
     trial = xp.where(high - above > below - low, above, below)
-    # Bisection is as good if less than half is cut off, and better if the last trial
-    # had not done that.
+    # Bisection is better if this cuts off less than half, or if the last trial did not
+    # shrink the bracket enough.
     good = xp.maximum(high - above, below - low) > width / 2
     good = good & (estimate > low) & (estimate < high)
     good = good & (trial > low) & (trial < high) & (width < 0.7 * now.width_before)
@@ -295,8 +302,8 @@ def _within(now: Bisection, tolerance: Array | float) -> Array:
 def game_at_level(
     solve_game: Solve, barrier: Barrier, problem, start, gamma, tolerance
 ) -> tuple[Bisection, Array, Array]:
-    """The game at `gamma`, or at the least level; that level, or 1 if it is 0; and the
-    level as it is, with its derivatives."""
+    """The game at `gamma` or at the smallest level, the level (1 instead of 0), and the
+    level itself with its derivatives."""
     end, level = bisect_level(solve_game, problem, start, gamma, tolerance)
     if gamma is None:
         attained = with_derivative(barrier, problem, level)
@@ -311,10 +318,10 @@ def _where(condition, first, second):
 
 @functools.partial(custom_jvp, nondiff_argnums=(0,))
 def with_derivative(barrier: Barrier, problem: tuple, level: Array):
-    """The least level, with its derivative in the problem.
+    """The smallest level, with its derivative with respect to the problem.
 
-    `barrier(problem, gamma)` is any function whose value or slope diverges at the least
-    level: its level sets move with the problem as the least level does.
+    `barrier(problem, gamma)` is any function whose value or slope diverges at the
+    smallest level. Its level sets move with the problem as the smallest level does.
     """
     del barrier, problem
     return level
@@ -323,12 +330,12 @@ def with_derivative(barrier: Barrier, problem: tuple, level: Array):
 @with_derivative.defjvp
 @full_precision
 def _with_derivative_jvp(barrier, primals, tangents):
-    # By implicit differentiation of barrier(problem, gamma) = constant a little above
-    # the level: at it both slopes are infinite, and their quotient has a limit.
+    # Implicit differentiation of barrier(problem, gamma) = constant just above the
+    # level. At the level both slopes are infinite, but their quotient has a limit.
     problem, level = primals
     level = once_differentiable(level)
     problem = jax.tree.map(once_differentiable, problem)
-    # d gamma = -(d barrier / d problem) / (d barrier / d gamma), at some distances.
+    # d gamma = -(d barrier / d problem) / (d barrier / d gamma).
     still = jax.tree.map(xp.zeros_like, problem)
     attained = level > 0
     safe = xp.where(attained, level, 1)
@@ -339,8 +346,9 @@ def _with_derivative_jvp(barrier, primals, tangents):
         _, change = along((tangents[0], xp.zeros_like(safe)))
         return -change / xp.where(slope != 0, slope, 1)
 
-    # The error is a series in the root of the distance, as two eigenvalues may meet on
-    # the boundary. Extrapolation from four distances removes its first terms.
+    # The error is a series in the square root of the distance, because two eigenvalues
+    # may meet on the boundary. Extrapolation from four distances removes its first
+    # terms.
     away = xp.finfo(level.dtype).eps ** (3 / 8) * xp.asarray(_AWAY, level.dtype)
     tangent = vmap(at_distance)(away) @ xp.asarray(_WEIGHTS, level.dtype)
     return primals[1], xp.where(attained, tangent, 0)
@@ -348,10 +356,10 @@ def _with_derivative_jvp(barrier, primals, tangents):
 
 @custom_jvp
 def once_differentiable(x: Array) -> Array:
-    """`x`, which cannot be differentiated twice.
+    """Return `x`, and raise an error at a second differentiation.
 
-    The slope of the barrier diverges in the limit: its own derivative would be rounding
-    alone.
+    The slope of the barrier diverges in the limit, so its derivative would be rounding
+    error.
     """
     return x
 
@@ -359,8 +367,8 @@ def once_differentiable(x: Array) -> Array:
 @once_differentiable.defjvp
 def _once_differentiable_jvp(primals, tangents):
     raise NotImplementedError(
-        "The least attainable gamma has first derivatives only. Give gamma as an "
-        "argument for higher ones."
+        "The smallest attainable gamma has first derivatives only. For higher "
+        "derivatives of the solution, give gamma as an argument."
     )
 
 
@@ -371,7 +379,7 @@ def inverse_margin(D: Array, X: Square, gamma: Scalar) -> Array:
 
 
 def largest_eigenvalue(X: Square) -> Scalar:
-    """About the largest eigenvalue of a semidefinite matrix, from above."""
+    """A close upper bound on the largest eigenvalue of a semidefinite matrix."""
     unit = size(X)
     power = X / unit
     for _ in range(_SQUARINGS):
@@ -382,9 +390,9 @@ def largest_eigenvalue(X: Square) -> Scalar:
 def inverse_margins(
     D: Float[Array, "T n k"], X: Float[Array, "T n n"], gamma: Scalar
 ) -> Scalar:
-    """The traces of `(gamma^2 I - D'XD)^-1`, summed, in a unit that fits."""
+    """The sum of the traces of `(gamma^2 I - D'XD)^-1`, in the unit of `X`."""
     eye = xp.eye(D.shape[-1], dtype=D.dtype)
     margins = gamma**2 * eye - xp.swapaxes(D, 1, 2) @ X @ D
     inverses = vmap(lambda M: xp.trace(solve(M, eye)))(margins)
-    # In the unit of X, so that the sum may be added to its trace.
+    # In the unit of X, because the sum is added to the trace of X.
     return stop_gradient(gamma**2 * xp.linalg.norm(X)) * xp.sum(inverses)

@@ -1,4 +1,4 @@
-"""The Lyapunov, Stein and Sylvester equations, for spectra that need not be stable."""
+"""Lyapunov, Stein and Sylvester equations. The matrices need not be stable."""
 
 import functools
 from typing import NamedTuple
@@ -27,24 +27,25 @@ from ._spectrum import spectral_abscissa
 
 
 _DENSE = 256
-"""Up to as many unknowns the equation may be solved as one linear system."""
+"""The largest number of unknowns for a solve as one linear system."""
 _DIRECT, _SHIFTED, _DENSE_SOLVE, _DONE = range(4)
-"""The kinds of attempt: with the spectra as they are, shifted, as one linear system."""
+"""The kinds of attempt: with the given spectra, with shifted spectra, and as one linear
+system."""
 
 
 class MatrixSolution(eqx.Module):
-    """The solution of a linear matrix equation.
+    r"""The solution of a linear matrix equation.
 
     **Attributes:**
 
-    - `X`: the solution.
-    - `residual`: the norm of the equation's residual over `(|A| + |B|) |X| + |C|`, in
-        discrete time over `(|A| |B| + 1) |X| + |C|`: the relative change of the data
-        that would make `X` exact.
-    - `iterations`: doublings, or steps of the sign iteration, taken.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `X`: the solution, shape `(n, n)`, or `(n, m)` of a Sylvester equation.
+    - `residual`: the norm of the residual of the equation, divided by
+        $(|A| + |B|)\, |X| + |C|$, or in discrete time by $(|A|\, |B| + 1)\, |X| + |C|$.
+        It is the relative change of the data that would make $X$ exact.
+    - `iterations`: the number of doublings, or of steps of the sign iteration.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
-    `X` is differentiable; where the solve failed, its derivatives are zero.
+    `X` is differentiable. If the solve failed, its derivatives are zero.
 
     !!! example
 
@@ -54,7 +55,11 @@ class MatrixSolution(eqx.Module):
 
         A = jnp.array([[-1.0, 1.0], [0.0, -2.0]])
         solution = dlx.riccati.lyap(A, jnp.eye(2))
-        solution.X, solution.residual
+        solution.X
+        ```
+
+        ```text
+        TODO1
         ```
     """
 
@@ -72,31 +77,32 @@ class MatrixSolution(eqx.Module):
 
 @host_unless_traced
 def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
-    r"""The continuous-time Lyapunov equation
+    r"""The solution $X$ of the continuous-time Lyapunov equation.
 
-    `A X + X A' + Q = 0`,
+    $$A X + X A^\top + Q = 0$$
 
-    whose solution is, for a stable `A`, the covariance of `dx/dt = A x` driven by white
-    noise of intensity `Q`.
+    If $A$ is stable, $X$ is the stationary covariance of $\dot{x} = A x$ driven by
+    white noise of intensity $Q$.
 
-    Solved by the sign iteration if all eigenvalues of `A` are on one side
-    of the imaginary axis. Otherwise a unique solution is still found, in one dense
-    solve, up to `n = 16`; beyond it `result` is `RESULTS.not_separated`.
+    The solver is the sign iteration if all eigenvalues of $A$ are on one side of the
+    imaginary axis. Otherwise it solves the equation as one dense linear system up to
+    $n = 16$. For a larger $n$, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
-    - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
+    - `A`: shape `(n, n)`. `A` and `Q` may be complex. Then $^\top$ is the conjugate
         transpose.
     - `Q`: shape `(n, n)`, not necessarily symmetric.
-    - `throw`: raise unless the equation is solved (default); if false, check `result`.
+    - `throw`: raise an error unless the equation is solved (default). If false, check
+        `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
-    `RESULTS.not_separated`, or `RESULTS.ill_posed` where two eigenvalues of `A` sum to
+    `residual` is at most 1e-12 (1e-5 in single precision). Else `result` is
+    `RESULTS.not_separated`, or `RESULTS.ill_posed` if two eigenvalues of $A$ sum to
     zero.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
-    error at run time as `throw` says.
+    **Raises:** `ValueError` if a matrix has the wrong shape or is not finite. With
+    `throw`, an error at run time if the solve fails.
 
     Source: Roberts, 1971.
 
@@ -107,7 +113,11 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
         import jax.numpy as jnp
 
         A = jnp.array([[0.0, 1.0], [-1.0, -0.5]])
-        covariance = dlx.riccati.lyap(A, jnp.eye(2)).X
+        dlx.riccati.lyap(A, jnp.eye(2)).X
+        ```
+
+        ```text
+        TODO2
         ```
     """
     return _equation("lyap", False, A, None, Q, throw)
@@ -115,23 +125,23 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
 
 @host_unless_traced
 def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
-    r"""The discrete-time Lyapunov equation
+    r"""The solution $X$ of the discrete-time Lyapunov equation.
 
-    `A X A' - X + Q = 0`,
+    $$A X A^\top - X + Q = 0$$
 
-    whose solution is, for a stable `A`, the covariance of `x_next = A x` driven by
-    white noise of covariance `Q`.
+    If $A$ is stable, $X$ is the stationary covariance of $x_{k+1} = A x_k$ driven by
+    white noise of covariance $Q$.
 
-    Solved by doubling if all eigenvalues of `A` are on one side of the unit circle.
-    Otherwise a unique solution is still found, in one dense solve, up to `n = 16`;
-    beyond it `result` is `RESULTS.not_separated`.
+    The solver is doubling if all eigenvalues of $A$ are on one side of the unit circle.
+    Otherwise it solves the equation as one dense linear system up to $n = 16$. For a
+    larger $n$, `result` is `RESULTS.not_separated`.
 
-    **Arguments:** `A`, `Q` and `throw`: as of [`delucax.riccati.lyap`][].
+    **Arguments:** `A`, `Q` and `throw`: as in [`delucax.riccati.lyap`][].
 
-    **Returns:** as there; `RESULTS.ill_posed` where two eigenvalues of `A` have the
-    product one.
+    **Returns:** as in [`delucax.riccati.lyap`][], but `result` is `RESULTS.ill_posed`
+    if the product of two eigenvalues of $A$ is one.
 
-    **Raises:** as there.
+    **Raises:** as in [`delucax.riccati.lyap`][].
 
     Source: Smith, 1968.
 
@@ -142,7 +152,11 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
         import jax.numpy as jnp
 
         A = jnp.array([[0.9, 0.1], [0.0, 0.5]])
-        covariance = dlx.riccati.dlyap(A, jnp.eye(2)).X
+        dlx.riccati.dlyap(A, jnp.eye(2)).X
+        ```
+
+        ```text
+        TODO3
         ```
     """
     return _equation("dlyap", True, A, None, Q, throw)
@@ -152,29 +166,29 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
 def sylvester(
     A: Numbers, B: Numbers, C: Numbers, *, throw: bool = True
 ) -> MatrixSolution:
-    r"""The Sylvester equation
+    r"""The solution $X$ of the Sylvester equation.
 
-    `A X + X B = C`.
+    $$A X + X B = C$$
 
-    Solved by a shift and the sign iteration if a line `Re(z) = s` has the
-    eigenvalues of `A` on one side and those of `-B` on the other. Otherwise a unique
-    solution is still found, in one dense solve, up to 256 unknowns; beyond it `result`
-    is `RESULTS.not_separated`.
+    The solver is a shift followed by the sign iteration if a vertical line
+    $\mathrm{Re}\, z = s$ separates the eigenvalues of $A$ from those of $-B$. Otherwise
+    it solves the equation as one dense linear system up to 256 unknowns. For more
+    unknowns, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
-    - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
+    - `A`: shape `(n, n)`. All matrices may be complex.
     - `B`: shape `(m, m)`.
     - `C`: shape `(n, m)`.
-    - `throw`: raise unless the equation is solved (default); if false, check `result`.
+    - `throw`: raise an error unless the equation is solved (default). If false, check
+        `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
-    `RESULTS.not_separated`, or `RESULTS.ill_posed` where `A` and `-B` share an
-    eigenvalue.
+    `residual` is at most 1e-12 (1e-5 in single precision). Else `result` is
+    `RESULTS.not_separated`, or `RESULTS.ill_posed` if $A$ and $-B$ share an eigenvalue.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
-    error at run time as `throw` says.
+    **Raises:** `ValueError` if a matrix has the wrong shape or is not finite. With
+    `throw`, an error at run time if the solve fails.
 
     Source: Roberts, 1971.
 
@@ -185,7 +199,11 @@ def sylvester(
         import jax.numpy as jnp
 
         A, B = jnp.array([[1.0, 2.0], [0.0, 3.0]]), jnp.array([[4.0]])
-        X = dlx.riccati.sylvester(A, B, jnp.ones((2, 1))).X
+        dlx.riccati.sylvester(A, B, jnp.ones((2, 1))).X
+        ```
+
+        ```text
+        TODO4
         ```
     """
     return _equation("sylvester", False, A, B, C, throw)
@@ -195,21 +213,22 @@ def sylvester(
 def dsylvester(
     A: Numbers, B: Numbers, C: Numbers, *, throw: bool = True
 ) -> MatrixSolution:
-    r"""The Stein equation, which is the Sylvester equation of discrete time,
+    r"""The solution $X$ of the Stein equation, the discrete-time Sylvester equation.
 
-    `A X B - X + C = 0`.
+    $$A X B - X + C = 0$$
 
-    Solved by doubling if the spectral radii of `A` and `B` have a product below one; by
-    a Cayley transform if both spectra lie outside the unit circle.
-    Otherwise a unique solution is still found, in one dense solve, up to 256 unknowns;
-    beyond it `result` is `RESULTS.not_separated`.
+    The solver is doubling if the product of the spectral radii of $A$ and $B$ is below
+    one, and a Cayley transform if both spectra are outside the unit circle. Otherwise
+    it solves the equation as one dense linear system up to 256 unknowns. For more
+    unknowns, `result` is `RESULTS.not_separated`.
 
-    **Arguments:** `A`, `B`, `C` and `throw`: as of [`delucax.riccati.sylvester`][].
+    **Arguments:** `A`, `B`, `C` and `throw`: as in [`delucax.riccati.sylvester`][].
 
-    **Returns:** as there; `RESULTS.ill_posed` where an eigenvalue of `A` and one of `B`
-    have the product one.
+    **Returns:** as in [`delucax.riccati.sylvester`][], but `result` is
+    `RESULTS.ill_posed` if the product of an eigenvalue of $A$ and an eigenvalue of $B$
+    is one.
 
-    **Raises:** as there.
+    **Raises:** as in [`delucax.riccati.sylvester`][].
 
     Source: Smith, 1968.
 
@@ -220,14 +239,18 @@ def dsylvester(
         import jax.numpy as jnp
 
         A, B = jnp.array([[0.5, 0.2], [0.0, 0.9]]), jnp.array([[0.8]])
-        X = dlx.riccati.dsylvester(A, B, jnp.ones((2, 1))).X
+        dlx.riccati.dsylvester(A, B, jnp.ones((2, 1))).X
+        ```
+
+        ```text
+        TODO5
         ```
     """
     return _equation("dsylvester", True, A, B, C, throw)
 
 
 def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
-    """The checked and solved equation; without `B` the Lyapunov equation."""
+    """Check and solve an equation. If `B` is `None`, it is a Lyapunov equation."""
     name = "Q" if B is None else "C"
     A, C = square_matrix(A, "A", where), as_matrix(C, name, where)
     B = None if B is None else square_matrix(B, "B", where)
@@ -265,7 +288,7 @@ class _Candidate(NamedTuple):
     X: Array
     residual: Array
     iterations: Array
-    finite: Array  # whether the data are
+    finite: Array  # whether the data are finite
 
     @property
     def solved(self) -> Array:
@@ -287,7 +310,7 @@ def _solved(discrete, A, B, C) -> _Candidate:
         if last == _DENSE_SOLVE:
             X = _dense_solution(discrete, A, B, C, X, kind == _DENSE_SOLVE)
         residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
-        # For a linear equation a small residual is a small backward error: enough.
+        # The residual of a linear equation is its backward error.
         better = (residual < before.residual) | direct
         after = before._replace(
             X=xp.where(better, X, before.X),
@@ -304,12 +327,12 @@ def _solved(discrete, A, B, C) -> _Candidate:
 
 
 def _separated(discrete, A, B, C, direct, shifted):
-    """The solution if the spectra are separated, as they are or by a shift."""
+    """The solution if the spectra are separated, with or without a shift."""
     if discrete:
-        # An inactive kind gets a trivial problem, which takes one step.
+        # A kind that is not wanted gets a trivial problem, which takes one step.
         X, steps = smith(*_or_trivial(direct, A, B, C))
-        # Where both spectra are outside the circle, the Cayley transform puts them to
-        # the right of the axis.
+        # If both spectra are outside the circle, the Cayley transform puts them to the
+        # right of the imaginary axis.
         eye_A, eye_B = (xp.eye(size, dtype=C.dtype) for size in C.shape)
         other = (A.T if B is None else B) + eye_B
         A, F = A + eye_A, solve(A + eye_A, A - eye_A)
@@ -320,14 +343,14 @@ def _separated(discrete, A, B, C, direct, shifted):
         Y, more_steps = _one_side(A, B, C, sign, xp.zeros(()), shifted)
         return xp.where(direct, X, Y), steps + more_steps
     n, m = C.shape
-    # Where the sum of the eigenvalues of A and B is positive, those of -A and -B may be
-    # stable: -(A X + X B) = -C.
+    # If the mean eigenvalues of A and B have a positive sum, -A and -B may be stable.
+    # Then solve -(A X + X B) = -C.
     mean = xp.trace(A) / n + (xp.trace(A) / n if B is None else xp.trace(B) / m)
     sign = xp.where(mean > 0, -1.0, 1.0)
     if B is None:
-        # There is no other line for an equation that is its own transpose.
+        # For a Lyapunov equation only the imaginary axis can separate A from -A'.
         return _one_side(A, None, C, sign, xp.zeros(()), direct)
-    # A shift by where the line is, between the spectra of A and -B.
+    # Shift by the position of a line between the spectra of A and -B.
     safe_A, safe_B = (xp.where(shifted, sign * M, 0) for M in (A, B))
     middle = (spectral_abscissa(safe_A) - spectral_abscissa(safe_B)) / 2
     shift = sign * xp.where(shifted, middle, 0)
@@ -345,7 +368,7 @@ def _one_side(A, B, C, sign, shift, wanted):
 
 
 def _or_trivial(wanted, A, B, C, scale=0):
-    """The problem if it is wanted; else a trivial one."""
+    """The problem if it is wanted, else a trivial problem."""
     A = xp.where(wanted, A, scale * xp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
         B = xp.where(wanted, B, scale * xp.eye(B.shape[0], dtype=B.dtype))
@@ -353,7 +376,7 @@ def _or_trivial(wanted, A, B, C, scale=0):
 
 
 def _dense_solution(discrete, A, B, C, X, wanted):
-    """The solution as that of one linear system, if it is wanted, else `X`."""
+    """The solution of one dense linear system if it is wanted, else `X`."""
 
     def dense(_):
         # vec(A X + X B), row by row, is this matrix times vec(X).
@@ -371,14 +394,14 @@ def _dense_solution(discrete, A, B, C, X, wanted):
 @_solved.defjvp
 @full_precision
 def _solved_jvp(discrete, primals, tangents):
-    # The equation is linear in X: dX solves the same one, with another right side.
+    # Because the equation is linear in X, dX solves it with another right side.
     A, B, _ = primals
     solution = _solved(discrete, *primals)
     ok = solution.solved
-    # Masked at input and output, so that a failed member's NaN does not spread.
+    # Masked at input and output, so that the NaN of a failed member does not spread.
     dA, dB, dC = jax.tree.map(lambda t: xp.where(ok, t, 0), tangents)
     X = xp.where(ok, solution.X, 0)
-    # -I/2 for what was not solved: a trivial problem in both times.
+    # A failed problem is replaced: -I/2 is trivial in continuous and discrete time.
     half = functools.partial(xp.where, ok)
     A, B = jax.tree.map(lambda M: half(M, -xp.eye(len(M), dtype=M.dtype) / 2), (A, B))
     other, d_other = (A.T, dA.T) if B is None else (B, dB)
@@ -386,7 +409,7 @@ def _solved_jvp(discrete, primals, tangents):
         right = dC + dA @ X @ other + A @ X @ d_other
     else:
         right = dC - dA @ X - X @ d_other
-    # The transposed equation is that of A' and B'.
+    # The transposed equation has A' and B'.
     across = None if B is None else B.T
     dX = lax.custom_linear_solve(
         lambda X: X - A @ X @ other if discrete else A @ X + X @ other,

@@ -1,5 +1,4 @@
-"""Residuals of matrix equations with rigorous rounding-error bounds, and Newton
-steps."""
+"""Residuals of matrix equations with bounds on their rounding, and Newton refinement."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,17 +15,17 @@ from ._arguments import RiccatiData
 
 
 _MARGIN = 1.01
-"""Covers the rounding of the norms that a residual is the quotient of."""
+"""A residual is a quotient of norms. This factor covers their rounding."""
 _NEWTON_STEPS = 8
 _FEW = 2**13
-"""Up to so many scalar products in an accurate residual it is taken at once: it is as
-fast as one in working precision."""
+"""With at most this many multiplications, an accurate residual is as fast as one in
+working precision, and is used from the start."""
 _FINE = 64
-"""Units of rounding in the relative residual that need no correction."""
+"""A relative residual of this many units of rounding needs no correction."""
 
 
 def tolerance(dtype: Any) -> float:
-    """The relative residual up to which an equation counts as solved."""
+    """The largest relative residual of a solved equation."""
     return 1e-12 if xp.finfo(dtype).bits == 64 else 1e-5
 
 
@@ -34,12 +33,12 @@ class Residual(NamedTuple):
     """The residual of a Riccati equation.
 
     - `error`: the left side, evaluated at a rounded gain.
-    - `relative`: its norm over the sum of the norms of the terms.
+    - `relative`: the norm of `error`, divided by the sum of the norms of the terms.
     - `bounds`: upper bounds on the exact relative residual, at the exact gain and
       without rounding, in each of the requested units.
     - `K`: the best gain at `X`.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
-    - `terms`: the sum of the norms of the terms, in each of these units.
+    - `terms`: the sum of the norms of the terms, in each of the requested units.
     """
 
     error: Square
@@ -60,30 +59,33 @@ def riccati_residual(
 ) -> Residual:
     r"""The residual of the Riccati equation at `X`.
 
-    The left side is stationary in the gain, so that one in working precision is enough.
-    With `N = -K`, `L = A + B N` and `T = S' + R N` it is
+    The left side is stationary in the gain, so a gain in working precision is enough.
+    With `N = -K`, `L = A + B N` and `T = S' + R N`, the left side is
 
-    `L'XE + E'XL + Q + S N + N'T - G'W^-1 G`, `W = R`, `G = B'XE + T`, or
-    `L'XL - E'XE + Q + S N + N'T - G'W^-1 G`, `W = R + B'XB`, `G = B'XL + T`,
+    `L'XE + E'XL + Q + S N + N'T - G'W^-1 G`, `W = R`, `G = B'XE + T`
 
-    in continuous and in discrete time. G is rounding alone, and the last term its
-    square. The rounding of each product is bounded by the product of the absolute
-    values of its factors. Where this bound is too wide they are evaluated `accurately`.
+    in continuous time, and in discrete time
 
-    The last `maximisers` controls are those of a maximising player, whose terms are
-    counted separately. `others` are other units of the states, in which rows and
-    columns of the equation are multiplied by these.
+    `L'XL - E'XE + Q + S N + N'T - G'W^-1 G`, `W = R + B'XB`, `G = B'XL + T`.
+
+    G is only rounding, and the last term is of second order in it. The rounding of a
+    product is bounded by the product of the absolute values of its factors. If this
+    bound is too wide, the products are evaluated `accurately`, with more digits.
+
+    The last `maximisers` controls maximise the cost, and their terms are counted
+    separately. `others` are further units of the states: factors of the rows and
+    columns of the equation.
     """
     A, B, Q, _, _, E = data
     (n, m), dtype = B.shape, A.dtype
     moved, cross, weight = stationary(discrete, data, X)
     weighted = X if E is None else E.T @ X
-    # One factorisation for the gain and for the inverse, whose absolute value bounds
-    # the last term: G is small, so that its own rounding matters little.
+    # One factorisation gives the gain and the inverse. The absolute value of the
+    # inverse bounds the last term. Its rounding matters little, because G is small.
     solved = solve(weight, xp.concatenate([cross.T, xp.eye(m, dtype=dtype)], axis=1))
     K, inverse = solved[:, :n], xp.abs(solved[:, n:])
-    # The terms of the equation, for their norms. A game's two quadratic terms have
-    # opposite signs: their sum would hide how large they are.
+    # The terms of the equation, for their norms. The two quadratic terms of a game are
+    # separate, because they have opposite signs and may cancel in their sum.
     first = m - maximisers
     moved = matmul(moved, A)
     if discrete and E is not None:
@@ -108,7 +110,7 @@ def riccati_residual(
 
         def sharper(wide, X, K):
             left = _sharper(discrete, *data, X, *_working(discrete, data, X, K))
-            # Where nothing cancels the first bound may be the sharper one.
+            # If nothing cancels, the first bound may be the smaller one.
             better = left.lost < wide.lost
             error = xp.where(better, left.error, wide.error)
             lost = xp.minimum(left.lost, wide.lost)
@@ -119,7 +121,7 @@ def riccati_residual(
         left = if_needed(needed, sharper, left, (X, K))
     error, lost, gap, gap_lost = left
     gap = xp.abs(gap) + gap_lost
-    # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
+    # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry. 2 covers the rounding of W^-1.
     bound = xp.abs(error) + lost + 2 * matmul(gap.T, matmul(inverse, gap))
 
     both, terms = xp.stack([error, bound]), xp.stack(terms)
@@ -128,7 +130,7 @@ def riccati_residual(
         factor = d[:, None] * d
         return relative_and_total_size(both * factor, terms * factor)
 
-    # Powers of two: their products have no rounding.
+    # The units are powers of two, so the products have no rounding.
     units = xp.stack([xp.ones(n, dtype), *others])
     relative, sizes = vmap(in_units)(units)
     bounds = _MARGIN * relative[:, 1]
@@ -143,11 +145,11 @@ def is_small(B: Array) -> bool:
 
 
 def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tuple):
-    """`function(value, *operands)` where it is needed, else `value`.
+    """`function(value, *operands)` if it is needed, else `value`.
 
-    By a loop of at most one round, which is not run for a batch in which no member
-    needs it; `lax.cond` would compute both branches. The operands are carried and
-    changed, or compilers would hoist the work out of the loop.
+    This is a loop of at most one round. It does not run if no member of a batch needs
+    it, but `lax.cond` would compute both branches. The operands are carried and
+    changed, because compilers would otherwise hoist the work out of the loop.
     """
 
     def once(carry):
@@ -162,8 +164,8 @@ def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tupl
 def stationary(
     discrete: bool, data: RiccatiData, X: Square
 ) -> tuple[Array, Array, Array]:
-    """`E'X`, `E'XB + S` and `R`, or `A'X`, `A'XB + S` and `R + B'XB` in discrete time:
-    of the last two follows the best gain."""
+    """`E'X`, `E'XB + S` and `R`, or in discrete time `A'X`, `A'XB + S` and `R + B'XB`.
+    The best gain follows from the last two."""
     A, B, _, R, S, E = data
     if discrete:
         moved, weight = matmul(A.T, X), R + symmetric(matmul(B.T, matmul(X, B)))
@@ -193,10 +195,10 @@ def _working(discrete: bool, data: RiccatiData, X: Array, K: Array) -> tuple:
 def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     """The residual, in working precision."""
     n, m = B.shape
-    # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit, and a product of k
-    # terms is off by k units of the product of absolute values. `lost_M` is that bound
-    # for M, `from_L` is what an error of L does to XL. The rounded gain -N is taken for
-    # exact: any gain gives a valid bound.
+    # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit. The error of a sum
+    # of k products is at most k units times the sum of their absolute values. `lost_M`
+    # is this bound for M. `from_L` is the effect of an error in L on XL. The rounded
+    # gain -N counts as exact, because any gain gives a valid bound.
     unit = xp.finfo(A.dtype).eps / 2
     size_B, size_S, size_X, size_N = (xp.abs(M) for M in (B, S, X, N))
     lost_L = (units_of_sum(m) + 1) * unit * (xp.abs(A) + matmul(size_B, size_N))
@@ -217,7 +219,7 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     square = product_in_parts(L.T, Y)
     SN, NT = matmul(S, N), matmul(N.T, T)
     lost = matmul(most_L.T, units * unit * size_Y + lost_Y)
-    # In discrete time an error of L is in both factors, as the second one is XL.
+    # In discrete time both factors, L and XL, have the error of L.
     both = matmul(lost_L.T, size_Y + from_L / 2)
     if discrete:
         lost = lost + _twice(both)
@@ -227,7 +229,7 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
         square, lost = _twice(square), _twice(lost + both)
     lost = lost + m * unit * matmul(size_S, size_N)
     lost = lost + matmul(size_N.T, m * unit * size_T + lost_T)
-    # Four additions, each of a sum no larger than that of the sizes, and a margin.
+    # Four additions, each of a result no larger than this sum, and a margin.
     lost = lost + 5 * unit * sum(xp.abs(M) for M in (square, subtracted, Q, SN, NT))
     gap_lost = matmul(size_B.T, (n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost = gap_lost + lost_T + 2 * unit * size_T
@@ -236,16 +238,16 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
 
 
 def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
-    """The residual in more digits.
+    """The residual with more digits.
 
-    The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
-    place at which their matrix stands in the equation.
+    `rest` holds the rounding errors of L, T, Y and Z. They are added once for each
+    place at which their matrix appears in the equation.
     """
     n, m = B.shape
     eps, nothing = xp.finfo(A.dtype).eps, xp.zeros_like(X)
     right = dict(N=N, L=L, Y=Y, T=T) | ({} if E is None else dict(E=E, Z=Z))
-    # Each row: the factors of N, L, ..., what is added, what is subtracted; and how a
-    # rest stands in the equation.
+    # Each row: the factors of N, L, ..., the added and the subtracted matrix, and the
+    # factor of the rest in the equation.
     rows = [(dict(N=B), A, L, 2 * Y), (dict(N=R), S.T, T, N)]
     if discrete:
         rows.append((dict(L=X), nothing, Y, L))
@@ -275,8 +277,8 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
     error = value[-n:] + matmul(factor, rest)
     lost = rest_lost + (4 * n + 2 * m + 8) * eps * sizes
     lost = rounding[-n:] + matmul(xp.abs(factor), lost)
-    # The second-order terms, an error of L times one of the factor beside it, are far
-    # below those of the first order: the largest entries will do.
+    # The second-order terms, an error of L times an error of the other factor, are far
+    # smaller than the first-order terms, so their largest entries are enough.
     error_L, around = largest(most[:n]), (n + 4) * eps * xp.abs(Y)
     if discrete:
         beside = largest(most[n + m : 2 * n + m]) + n * largest(X) * error_L
@@ -289,16 +291,16 @@ def _sharper(discrete, A, B, Q, R, S, E, X, N, L, T, Y, Z) -> _Left:
 
 
 def _twice(M):
-    """A matrix and its transpose."""
+    """The sum of a matrix and its transpose."""
     return M + M.T
 
 
 def linear_residual(discrete, A, B, C, X) -> Array:
-    """The residual of `A X + X B = C`, or of `X - A X B = C`, over
-    `(|A| + |B|) |X| + |C|`, or over `(|A| |B| + 1) |X| + |C|`.
+    """The residual of `A X + X B = C`, divided by `(|A| + |B|) |X| + |C|`. In discrete
+    time that of `X - A X B = C`, divided by `(|A| |B| + 1) |X| + |C|`.
 
-    It is the backward error: the relative change of the data that makes `X` exact.
-    Relative to these norms rounding is small, and its bound is added.
+    This is the backward error: the relative change of the data that makes `X` exact. A
+    bound on its rounding, which is small, is added.
     """
     eps = xp.finfo(X.dtype).eps
     size_A, size_B = xp.linalg.norm(A), xp.linalg.norm(B)
@@ -315,8 +317,8 @@ def linear_residual(discrete, A, B, C, X) -> Array:
 
 
 class Refined(NamedTuple):
-    """The best point of a refinement: `X`, its gain and closed loop one below the
-    other; and its residual, as of `Residual`."""
+    """The best point of a refinement, and its residual as in `Residual`. The point holds
+    `X`, its gain and its closed loop, one below the other."""
 
     point: Float[Array, "rows n"]
     relative: Scalar
@@ -329,7 +331,7 @@ class Refined(NamedTuple):
 
 
 def matrices_of(point: Float[Array, "rows n"]) -> tuple[Square, Array, Square]:
-    """`X`, `K` and the closed loop."""
+    """`X`, `K` and the closed loop of a point."""
     n = point.shape[1]
     return point[:n], point[n:-n], point[-n:]
 
@@ -345,12 +347,13 @@ def newton_refine(
 ) -> Refined:
     """Newton refinement while the residual decreases.
 
-    `residual(X, accurately)` evaluates the residual, of so many `controls` and in so
-    many `units`, and `correction(X, closed_loop, error)` is the Newton step. Where its
-    bound is too wide for a certificate the steps go on with accurate residuals, unless
-    they are to end in working precision.
+    `residual(X, accurately)` evaluates the residual, and
+    `correction(X, closed_loop, error)` is the Newton step. `controls` is the number of
+    controls, and `units` the number of units of the residual. If the bound of the
+    residual is too wide for a certificate, the steps continue with accurate residuals,
+    unless `to_working_precision`.
 
-    Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
+    Source: Kleinman, 1968 (each step solves the Lyapunov equation of the last loop).
     """
     n, dtype = len(X), X.dtype
     fine, wide = _FINE * float(xp.finfo(dtype).eps), tolerance(dtype)
@@ -358,13 +361,14 @@ def newton_refine(
     def body(carry):
         X, loop, error, best, before = carry
         going, patient, accurately, k, least = before[:5]
-        # The first step is zero, as its error is: the first round measures.
+        # The first step is zero, because its error is zero: the first round only
+        # evaluates the residual.
         X = symmetric(X + correction(X, loop, error))
         new = residual(X, (going > 0) & (accurately > 0))
         first = k == 0
         better = first | (new.relative < least)
-        # Steps that gain little are at the level of rounding. But far from the solution
-        # the residual may rise in the first one.
+        # A step that helps little is at the level of rounding. But far from the
+        # solution the residual may increase in the first step.
         helped = first | (new.relative < least / 4)
         point = xp.concatenate([X, new.K, new.closed_loop])
         best = xp.where(better, point, best)
@@ -373,7 +377,8 @@ def newton_refine(
         least = xp.where(better, new.relative, least)
         again = helped | (patient > 0) & (least > wide)
         again = again & (least > fine) & (k < _NEWTON_STEPS)
-        # The bound is too wide for a certificate: once more, accurately, from the best.
+        # The bound is too wide for a certificate, so repeat from the best point with
+        # accurate residuals.
         hidden = ~again & ~(accurately > 0) & (xp.max(measured[:units]) > wide)
         X = xp.where(hidden, best[:n], X)
         after = numbers(
@@ -388,7 +393,7 @@ def newton_refine(
         return X, new.closed_loop, error, best, xp.concatenate([after, measured])
 
     eye = xp.eye(n, dtype=dtype)
-    # Of a stable loop without an error the correction is zero.
+    # With a stable loop and a zero error the correction is zero.
     best = xp.zeros((2 * n + controls, n), dtype)
     begin = numbers(1, 1, to_working_precision, *[0] * (2 + 2 * units), dtype=dtype)
     start = X, -eye / 2, xp.zeros_like(X), best, begin

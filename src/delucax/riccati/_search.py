@@ -1,5 +1,5 @@
 """The retry strategy of the algebraic Riccati solver: balancing, restarts, and
-perturbed problems that tell why there is no solution."""
+perturbed problems that show why there is no solution."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,42 +19,43 @@ from ._residual import tolerance
 FIRST, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(6)
 """The kinds of attempt.
 
-- `FIRST`: the problem as given.
-- `SECOND`: from another starting point.
-- `PERTURBED`: with `Q` less by rounding. If the closed loop is stable by rounding
-    alone, the solution of this problem differs much, or there is none.
+- `FIRST`: the given problem.
+- `SECOND`: the given problem from another starting point.
+- `PERTURBED`: with a `Q` that is smaller by rounding. If the closed loop is stable only
+    because of rounding, the solution of this problem differs much or does not exist.
 - `UNIT`: with `Q` and `R` multiples of the identity. This problem has a stabilising
     solution if and only if the pair is stabilisable.
-- `REGULARISED`: with `Q` more by the root of rounding. If its closed loop is near the
-    boundary of stability, that of the problem is on it.
+- `REGULARISED`: with a `Q` that is larger by the square root of rounding. If the closed
+    loop of this problem is near the boundary of stability, the closed loop of the given
+    problem is on it.
 """
 _NEXT = (
-    # Following a failure, and a success.
+    # (after a failure, after a success)
     #
-    # FIRST: a success near the boundary is to be confirmed.
+    # FIRST: PERTURBED confirms a success near the boundary.
     (SECOND, PERTURBED),
     # SECOND: the last attempt at a solution. The others find out why there is none.
     (UNIT, PERTURBED),
-    # PERTURBED: the solution is confirmed, or marginal: the question is then whether
-    # the pair is stabilisable.
+    # PERTURBED: the solution is confirmed, or it is marginal. Then UNIT finds out
+    # whether the pair is stabilisable.
     (UNIT, DONE),
-    # UNIT: of a stabilisable pair the closed loop may be on the boundary. If that is
-    # known already, or the pair is not stabilisable, there is nothing more to find out.
+    # UNIT: if the pair is stabilisable, the closed loop may be on the boundary. If that
+    # is known already, or the pair is not stabilisable, the diagnosis is complete.
     (DONE, REGULARISED),
-    # REGULARISED: the last question.
+    # REGULARISED: the last attempt.
     (DONE, DONE),
 )
-"""The next attempt. Far from the boundary a solution needs no `PERTURBED`."""
+"""The next attempt. A solution far from the boundary is accepted without it."""
 _GAP_TOLERANCE = 0.3
-"""The largest relative change of the gap under `PERTURBED` of a robust solution."""
+"""The largest relative change of the gap of a robust solution in `PERTURBED`."""
 _SWEEPS = 100
-"""The most sweeps of the balancing."""
+"""The largest number of balancing sweeps."""
 _BALANCE_THRESHOLD = 4
-"""Units within this many powers of two of each other are left as they are."""
+"""Units that differ by at most this many powers of two are not changed."""
 
 
 class Attempt(NamedTuple):
-    """A candidate for the stabilising solution, and the quantities that decide on it.
+    """A candidate for the stabilising solution, and the quantities that judge it.
 
     `point` holds the matrices of the candidate, one below the other.
     """
@@ -65,18 +66,18 @@ class Attempt(NamedTuple):
     bound: Scalar  # spectral radius or abscissa of the closed loop
     gap: Scalar  # its distance from the boundary of stability, positive if stable
     rounding: Scalar  # of the gap
-    near: BoolScalar  # whether the gap is within reach of rounding of the data
-    around: BoolScalar  # the same for the wider margin of `REGULARISED`
+    near: BoolScalar  # whether rounding of the data may change the sign of the gap
+    around: BoolScalar  # the same with the wider margin of `REGULARISED`
     attainable: Scalar  # the residual that rounding of X alone may cause
-    bounded: BoolScalar  # whether |X| is well below |Q| / sqrt(eps)
+    bounded: BoolScalar  # whether |X| is below |Q| / sqrt(eps)
     iterations: Int[Array, ""]
 
 
 class Verdict(NamedTuple):
-    """The best candidate in numbers, and the diagnosis of the other attempts.
+    """The quantities of the best candidate, and the diagnosis from the other attempts.
 
-    Flags are 0 or 1: one array of numbers is carried and selected at once, which
-    compiles sooner than one for each.
+    Flags are 0 or 1, so that all quantities fit one array. One array in the loop
+    compiles faster than an array for each of them.
     """
 
     kind: Scalar  # of the next attempt
@@ -107,42 +108,40 @@ class Verdict(NamedTuple):
 def search(
     attempt: Callable[[Int[Array, ""]], Attempt], point: Array, well_posed: BoolScalar
 ) -> tuple[Array, Array]:
-    """Make attempts of the kinds above, as few as are needed; the best point, and the
-    numbers of the verdict. `point` is one that stands for no solution.
+    """Make as few attempts as possible. Return the best point and the verdict.
 
-    Most problems are solved by the first attempt. In a batch, the others are made if
-    any member needs them.
+    `point` is the placeholder before the first attempt. Most problems are solved by the
+    first attempt. In a batch, the others run if any member needs them.
     """
     dtype = point.dtype
     close = tolerance(dtype)
 
     def body(carry):
         best, so_far = carry
-        # One attempt, whose kind is data: a branch for each would be compiled for each,
-        # and under vmap all of them run.
+        # The kind is data: branches would each be compiled, and run all under vmap.
         before = Verdict(*so_far)
         kind = before.kind
         at = attempt(kind)
         stable = at.gap > at.rounding
-        # Rounding of X may not allow a smaller residual: up to a hundred times the
-        # tolerance is accepted then.
+        # If rounding of X does not allow a smaller residual, up to a hundred times the
+        # tolerance is accepted.
         enough = xp.clip(at.attainable, close, 100 * close)
         solved = stable & (at.residual <= enough)
         unchanged = kind <= SECOND  # the user's problem, not a perturbed one
-        # Between two solutions the smaller residual decides. Between two failures the
-        # first is kept, unless only the second is stable.
+        # Of two solutions, take that with the smaller residual. Of two failures, keep
+        # the first, unless only the second is stable.
         take = solved & (~(before.solved > 0) | (at.unscaled < before.unscaled))
         take = take | (kind == FIRST) | stable & ~(before.stable > 0)
         take = unchanged & take
 
         # For a perturbed problem a rough solution is enough.
         survives = stable & (at.residual <= close**0.5)
-        # Stable or not: the gap is smaller than its rounding.
+        # The gap is smaller than its rounding, so its sign is not known.
         undecided = ~stable & (at.gap >= -at.rounding)
         undecided = undecided & (at.residual <= close) & at.bounded
-        # The gap of a robust solution hardly changes with Q; that of a marginal one
-        # changes by as much as itself.
-        # So does that of rounding by chance, but no doubling converges to it.
+        # The gap of a robust solution hardly changes with Q. The gap of a marginal
+        # solution changes completely. A gap that is only rounding may stay by chance,
+        # but then the doubling does not converge.
         same = xp.abs(at.gap - before.gap) <= _GAP_TOLERANCE * before.gap
         same = same & (at.iterations < MAX_DOUBLINGS)
         marginal = (before.marginal > 0) & ~(unchanged & solved)
@@ -176,8 +175,8 @@ def search(
 
 
 def no_verdict(kind: Any, dtype: Any) -> Array:
-    """The verdict before an attempt of this kind: the first residual is smaller, and
-    the pair stabilisable."""
+    """The verdict before any attempt, with `kind` the first. The pair counts as
+    stabilisable, and residuals are infinite."""
     most = xp.inf
     return numbers(kind, most, most, most, -most, 0, 0, 0, 1, 0, 0, dtype=dtype)
 
@@ -189,12 +188,12 @@ def weights(
     Q, R, S = data.Q, data.R, data.S
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
     eps = xp.finfo(dtype).eps
-    # Where `Q` is zero `R` sets the scale.
+    # If Q is zero, R sets the scale.
     eye_Q, eye_R = xp.eye(n, dtype=dtype), xp.eye(m, dtype=dtype)
     size_Q, size_R = size(Q), size(R)
     scale_R = one_if_zero(size_R)
     scale_Q = xp.where(size_Q > 0, size_Q, scale_R)
-    # A change of Q by eps is within the rounding of the data. One by the root of eps
+    # A change of Q by eps is within the rounding of the data. A change by eps^(1/2)
     # moves eigenvalues off the boundary by about eps^(1/4).
     users = size(Q * (by[:, None] * by)) / by**2
     change = xp.where(kind == PERTURBED, -10 * n * eps * users, 0)
@@ -208,9 +207,9 @@ def weights(
 def units(data: RiccatiData) -> Float[Array, "2 n"]:
     """Diagonal balancing: powers of two that scale states and the rows of A, B and E.
 
-    They make the row and the column norms of the Hamiltonian matrix equal, state by
-    state: a badly scaled state is lost in the rounding of the others. A state with a
-    zero row or column keeps its scale. The rows of a given E then have equal norms.
+    They make the row norm and the column norm of the Hamiltonian matrix equal for each
+    state, because a badly scaled state is lost in the rounding of the others. A state
+    with a zero row or column keeps its scale. The rows of E, if given, get equal norms.
 
     Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Hamiltonian).
     """
@@ -220,13 +219,13 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
 
     def logarithm(M):
-        # Of a vector: one loop over it compiles sooner than two over rows and columns.
+        # As a vector, because one loop compiles faster than two over rows and columns.
         exponent = xp.log2(M.ravel())
         return xp.where(xp.isfinite(exponent), exponent, lowest).reshape(M.shape)
 
-    # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
-    # each, and that of the cost, which is free: one more row and column, of which the
-    # factor balances the two. All in base-2 logarithms.
+    # The quadratic blocks are products of B R^-1/2 and Q^1/2, which have the scale of
+    # one state and of the cost. The unit of the cost is free: it is one more row and
+    # column, and its factor balances the two. All sizes are base-2 logarithms.
     effort = xp.sqrt(_diagonal_sizes(R))
     force = xp.max(xp.abs(plain_B) / one_if_zero(effort), axis=1)
     weight = xp.concatenate([xp.sqrt(_diagonal_sizes(Q)), xp.zeros(1, dtype)])
@@ -241,15 +240,15 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     def sweep(carry):
         k, _, d = carry
         moved = table + d[:, None] - d
-        # Half of the step that each would take alone, as all move at once.
+        # All scales change at once, so take half of the step of a single scale.
         change = (xp.max(moved, axis=0) - xp.max(moved, axis=1)) / 4
-        # A zero row or column, with the logarithm `lowest`, asks for a huge step.
+        # A zero row or column has the logarithm `lowest` and gives a huge step.
         change = xp.where(xp.abs(change) < -lowest / 8, change, 0)
         return k + 1, change, d + change
 
     start = xp.zeros(n + 1, dtype)
     *_, d = while_loop(more, sweep, (0, start + 1, start))
-    # A factor common to all states has no effect: it is removed to avoid overflow.
+    # A factor common to all states has no effect. It is removed to avoid overflow.
     d = d[:n] - xp.mean(d[:n])
     f = d
     if E is not None:
@@ -267,9 +266,9 @@ def _diagonal_sizes(M):
 
 
 def in_units(by: Float[Array, "2 n"], data: RiccatiData) -> RiccatiData:
-    """The data with states and rows scaled `by` these factors."""
+    """The data with states and rows scaled `by` the factors of `units`."""
     # With the new state z = state x, the cost x'Qx is z'Qz / state^2. The rows of A, B
-    # and E have a scale of their own, as each equation may be multiplied by a number.
+    # and E have their own scale, because an equation may be multiplied by a number.
     A, B, Q, R, S, E = data
     state, row = (unit[:, None] for unit in by)
     across = row / by[0]

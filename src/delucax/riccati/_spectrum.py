@@ -1,4 +1,4 @@
-"""The spectral radius and abscissa of a matrix, by repeated squaring."""
+"""The spectral radius and the spectral abscissa of a matrix, by repeated squaring."""
 
 import math
 
@@ -10,24 +10,24 @@ from ..math._norms import largest, power_of_two, size
 
 
 _SQUARINGS = 60
-"""Beyond it no more digits of `log |A^N| / N` are to be had in float64."""
+"""More squarings give no further digits of `log |A^N| / N` in float64."""
 _DIGITS = 1e-8
-"""Of the logarithm of the spectral radius."""
+"""The relative error of the logarithm of the spectral radius."""
 _LARGE = 16
-"""From here on it pays to look for the few directions that a power has left."""
+"""For a larger matrix, the squaring continues in the few directions that remain."""
 _BLOCK = 4
 _TAYLOR_DEGREE = 12
 _SWEEPS = 24
 
 
 def spectral_radius(A: Square) -> Scalar:
-    """The spectral radius, from above up to rounding: `|A^N|^(1/N)` for a large `N`.
+    """An upper bound on the spectral radius: `|A^N|^(1/N)` for a large `N`.
 
-    The bound holds for every N (Gelfand), and is above the radius by a relative
-    `log(cond) / N`, with `cond` the condition of the eigenvectors. Of a large matrix a
-    few squarings leave only few directions; the rest is done in their span.
+    It is an upper bound for every N (Gelfand), up to rounding. Its relative error is
+    `log(cond) / N`, with `cond` the condition number of the eigenvectors. A few
+    squarings of a large matrix leave only few directions. The rest is done in their
+    span, with small matrices.
     """
-    # In the span of the remaining directions the products are of small matrices.
     logarithm, is_narrow, span, _ = _growth(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         within, *_ = _growth(span.T @ A @ span, False)
@@ -43,14 +43,15 @@ def spectral_abscissa(A: Square) -> Scalar:
 def abscissa_and_size(
     A: Square,
 ) -> tuple[Scalar, Scalar]:
-    """The spectral abscissa, up to rounding of the matrix, and its norm.
+    """The spectral abscissa, up to rounding of the matrix, and the norm of the matrix.
 
-    `h^-1 log` of the spectral radius of `exp(h A)`, with `h` small enough for a series.
+    The abscissa is `h^-1 log` of the spectral radius of `exp(h A)`. The series of
+    `exp(h A)` needs a small `h`.
     """
     value, is_narrow, span, kept = _slowest(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         part = span.T @ A @ span
-        # Directions left out come last.
+        # The directions that are not kept get a very stable eigenvalue.
         part = part - xp.diag(xp.where(kept, 0, size(part)))
         within, *_ = _slowest(part, False)
         value = xp.where(is_narrow, within, value)
@@ -64,15 +65,16 @@ def _slowest(A, probing):
 
 
 def _short_flow(A):
-    """`exp(hA)`, and `h`: `|exp(hA)^N|^(1/N)` tends to `exp(h abscissa)`, `h > 0`."""
+    """`exp(hA)` and `h > 0`: `|exp(hA)^N|^(1/N)` tends to `exp(h abscissa)`."""
     scale = size(A)
     h = 0.25 / xp.where(scale > 0, scale, 1)
     return _exponential(h * A), h
 
 
 def is_stable(discrete: bool, A: Square, margin: Scalar | float) -> BoolScalar:
-    """Whether the spectral radius is below one, or the abscissa below zero, by a
-    margin. As the bounds hold for every power, a few squarings tell of most matrices.
+    """Whether the spectral radius is below one, or the abscissa below zero, by a margin.
+
+    The bounds hold for every power, so a few squarings are enough for most matrices.
     """
     if discrete:
         flow, limit = A, xp.log1p(-xp.asarray(margin, A.dtype))
@@ -84,7 +86,7 @@ def is_stable(discrete: bool, A: Square, margin: Scalar | float) -> BoolScalar:
 
 def _exponential(A):
     """`exp(A)` for `|A| <= 1/4`, where the series is exact to rounding."""
-    # By blocks of four terms, in Horner's way: six products for twelve terms
+    # Blocks of four terms by Horner's rule: six products for twelve terms
     # (Paterson and Stockmeyer, 1973).
     powers = [xp.eye(A.shape[0], dtype=A.dtype), A]
     while len(powers) < _BLOCK:
@@ -98,24 +100,26 @@ def _exponential(A):
 
 
 def _growth(A, probing, limit=None):
-    """`log |A^N| / N` for a large `N`; with a `limit`, for one that tells on which
-    side of it the value for all larger `N` is. If `probing`, also whether an earlier
-    power has few directions left, a basis of them, and which of its columns are used.
+    """An upper bound on `log |A^N| / N` for a large `N`. With a `limit`, `N` is only so
+    large that the value for all larger `N` is known to be above or below the limit.
+
+    If `probing`, also whether few directions remain in the power, a basis of them, and
+    which columns of the basis are used.
     """
     n, dtype = A.shape[0], A.dtype
     eps = float(xp.finfo(dtype).eps)
-    # Probes with a fixed seed: equal problems have equal results.
+    # The seed of the probes is fixed, so equal problems have equal results.
     count = max(n // 4 if n <= 64 else n // 16, min(n, _LARGE))
     probes = np.random.default_rng(0).normal(size=(n, count)) if probing else 0.0
     probes = xp.asarray(probes, dtype)
 
     def above(logarithm, weight):
-        # |A| is at most n times the largest entry; the weight is of the next power.
+        # |A| is at most n times the largest entry. The weight is that of the next power.
         return logarithm + 2 * weight * math.log(n)
 
     def more(carry):
         *_, logarithm, weight, finished = carry
-        # N = 1 / weight: for a log cond of up to 64 the bound is this close.
+        # N = 1 / weight. The bound is this close if log cond is at most 64.
         rough = 64 * weight > _DIGITS * xp.maximum(xp.abs(logarithm), eps)
         if limit is not None:
             bound = above(logarithm, weight)
@@ -124,24 +128,24 @@ def _growth(A, probing, limit=None):
 
     def squared(power, logarithm, weight):
         grown = largest(power)
-        # A nilpotent matrix, whose radius is zero: no power of it is scaled any more.
+        # The power of a nilpotent matrix, whose radius is zero, is not scaled.
         finished = ~(grown > 0)
         scaled = power * (1 / xp.where(finished, 1, grown))
-        # log |A^2N| / 2N is this sum, as each square is of a matrix of norm one. The
-        # norm is the largest entry, which for the flow of a short time is nearly one:
-        # logarithms of others would cancel.
+        # log |A^2N| / 2N is this sum, because each squared matrix has norm one. The
+        # norm is the largest entry, which is nearly one for the flow of a short time.
+        # Logarithms of another norm would cancel in the sum.
         logarithm = logarithm + weight * xp.log(grown)
         return matmul(scaled, scaled), logarithm, weight / 2, scaled, finished
 
     def body(carry):
         power, span, kept, logarithm, weight, _ = carry
         if probing:
-            # Probing takes as long as a square: it is left out in between.
+            # Probing takes as long as squaring, so square twice for each probing.
             power, logarithm, weight, *_ = squared(power, logarithm, weight)
         power, logarithm, weight, scaled, finished = squared(power, logarithm, weight)
         if probing:
-            # A basis of the range of the power, as the probes see it. What is as small
-            # as the rounding of the rest is no direction of it.
+            # A basis of the range of the power, from the probes. Directions that are as
+            # small as the rounding of the others do not belong to it.
             basis, triangle = xp.linalg.qr(scaled @ probes)
             pivots = xp.abs(xp.diagonal(triangle))
             kept = pivots > math.sqrt(eps) * xp.max(pivots)
@@ -158,9 +162,9 @@ def _growth(A, probing, limit=None):
 
 
 def balanced(A: Square) -> Square:
-    """`D^-1 A D` with `D` diagonal, its rows and columns of like size.
+    """`D^-1 A D` with a diagonal `D` that gives rows and columns similar sizes.
 
-    Powers of two, so that no digit is lost. Source: Osborne, 1960.
+    `D` has powers of two, so that there is no rounding. Source: Osborne, 1960.
     """
 
     def more(carry):
@@ -173,9 +177,9 @@ def balanced(A: Square) -> Square:
         off = scaled - xp.diag(xp.diagonal(scaled))
         rows, columns = xp.sum(off, axis=1), xp.sum(off, axis=0)
         usable = (rows > 0) & (columns > 0)
-        # The square root of this ratio makes a row as large as its column.
+        # The square root of this ratio makes a row and its column equally large.
         ratio = xp.where(usable, rows, 1) / xp.where(usable, columns, 1)
-        # All at once: half of the step that each would take alone.
+        # All scales change at once, so take half of the step of a single scale.
         scale = scale * ratio**0.25
         return k + 1, scale / xp.exp2(xp.round(xp.mean(xp.log2(scale)))), ratio
 

@@ -1,4 +1,5 @@
-"""The stabilising solution of an algebraic Riccati equation, in either time."""
+"""The stabilising solution of an algebraic Riccati equation, in discrete or continuous
+time."""
 
 import functools
 from typing import NamedTuple
@@ -51,34 +52,36 @@ from ._spectrum import abscissa_and_size, spectral_radius
 
 
 _SECOND_START = 1e4
-"""How much higher the second start of doubling is than the first: `X` may be far larger
-than `Q`, as where a control is weak."""
+"""The second start of doubling is larger than the first by this factor, because `X` may
+be far larger than `Q`, for example if a control is weak."""
 
 
 class RiccatiSolution(eqx.Module):
-    """The solution of a Riccati equation, with diagnostics.
+    r"""The solution of an algebraic Riccati equation, with diagnostics.
 
     **Attributes:**
 
     - `X`: the solution, shape `(n, n)`, symmetric.
-    - `K`: the gain of `u = -K x`, shape `(m, n)`; of a filter that of
-        `K (y - C x)`, shape `(n, p)`.
-    - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms: an upper bound, with rounding of its own evaluation counted.
-    - `closed_loop`: the matrix of `x_next = closed_loop x` (of
-        `dx/dt = closed_loop x`), shape `(n, n)`.
-    - `spectral_radius`: in discrete time, that of `closed_loop`, to about eight digits
-        and from above: the loop is stable if it is below 1. `None` in continuous time.
-    - `iterations`: doublings or steps of the sign iteration taken.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
-        `closed_loop`, likewise: the loop is stable if it is below 0. `None` in discrete
-        time.
+    - `K`: the gain of the control $u = -K x$, shape `(m, n)`; for a filter, the gain of
+        the correction $K (y - C \hat{x})$, shape `(n, p)`.
+    - `residual`: an upper bound on the relative residual: the norm of the residual of
+        the equation, divided by the sum of the norms of its terms. The bound includes
+        the rounding of its own evaluation.
+    - `closed_loop`: the matrix of the closed loop, shape `(n, n)`: $A - B K$, or
+        $E^{-1} (A - B K)$; for a filter $A - K C$.
+    - `spectral_radius`: in discrete time, a close upper bound on the spectral radius of
+        `closed_loop`, to about eight digits. The loop is stable if it is below 1.
+        `None` in continuous time.
+    - `iterations`: the number of doublings, or of steps of the sign iteration.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `spectral_abscissa`: in continuous time, a close upper bound on the largest real
+        part of an eigenvalue of `closed_loop`. The loop is stable if it is below 0.
+        `None` in discrete time.
 
     `X`, `K` and `closed_loop` are differentiable. `residual`, `spectral_radius` and
-    `spectral_abscissa` are measurements and have no gradient. Where the solve failed
-    and the loop is not stable the derivatives are zero, so that a failed member does
-    not affect the gradient of a batch.
+    `spectral_abscissa` are measurements and have no gradient. If the solve failed and
+    the loop is not stable, the derivatives are zero, so that a failed member does not
+    affect the gradient of a batch.
 
     !!! example
 
@@ -90,6 +93,10 @@ class RiccatiSolution(eqx.Module):
         B = jnp.array([[0.0], [1.0]])
         solution = dlx.riccati.dare(A, B, jnp.eye(2), jnp.eye(1))
         solution.K, solution.spectral_radius
+        ```
+
+        ```text
+        TODO1
         ```
     """
 
@@ -117,7 +124,7 @@ class RiccatiSolution(eqx.Module):
 def stabilising_solution(
     discrete: bool, data: RiccatiData, where: str, throw: bool
 ) -> RiccatiSolution:
-    """The solution of an equation with checked data, complex ones in real form."""
+    """Solve an equation with checked data. Complex data are solved in real form."""
     if is_complex(*data):
         data = jax.tree.map(real_form, data)
         solution = _as_complex(_solution(discrete, data), discrete, data)
@@ -129,10 +136,10 @@ def stabilising_solution(
 @compiled_unless_on_host
 @full_precision
 def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
-    """The solution in complex form, with a new residual bound: rounding may have left
-    an `X` that is not exactly a real form."""
-    # The real form solves the real equation of twice the size, whose solution has the
-    # same structure, gain and closed loop included.
+    """The solution in complex form. The residual bound is computed again, because
+    rounding may have left an `X` that is not exactly a real form."""
+    # The solution of the real equation of twice the size is a real form, and so are its
+    # gain and closed loop.
     solution = eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
@@ -159,8 +166,8 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
 
 
 class _Solved(NamedTuple):
-    """The best `X`, its gain and loop, the verdict on it in numbers, and the units of
-    states and rows of the search."""
+    """The best `X`, its gain and closed loop, the numbers of its verdict, and the units
+    of states and rows in the search."""
 
     X: Square
     K: Array
@@ -180,16 +187,15 @@ def _certified(discrete: bool, data: RiccatiData) -> _Solved:
     """The certified search for the stabilising `X`."""
     A, B, Q, _, S, _ = data
     (n, m), dtype = B.shape, A.dtype
-    # NaN and infinity, times zero, are NaN, which any sum keeps.
+    # Zero times NaN or infinity is NaN, and so is the sum.
     finite = xp.sum(0 * xp.concatenate([A, Q, B.T, S.T])) == 0
     unknown = xp.full((2 * n + m, n), xp.nan, dtype)
-    # In two loops of one round each, which XLA on CPU compiles as a whole if the arrays
-    # are small, and at the same time: in less time than operation by operation, and
-    # they run sooner.
+    # Two loops of one round each. If the arrays are small, XLA on CPU compiles a loop
+    # as a whole, and both at the same time. They compile and run faster this way.
     problem = _Problem(xp.ones((2, n), dtype), data, (A, B), finite)
     prepare = lambda _, data: _in_fitting_units(discrete, data)
     problem = if_needed(finite, prepare, problem, (data,))
-    # Of data that are not well posed these remain.
+    # The result for data that are not well posed.
     kept = no_verdict(DONE, dtype), problem.well_posed, problem.by
     nothing = _Solved(*matrices_of(unknown), *kept)
     solved = lambda _, problem: _search(discrete, problem)
@@ -197,8 +203,8 @@ def _certified(discrete: bool, data: RiccatiData) -> _Solved:
 
 
 class _Problem(NamedTuple):
-    """The data with states and rows scaled `by` the units that fit, and `A` and `B`
-    without the descriptor."""
+    """The data with states and rows scaled `by` balancing units, and `A` and `B` without
+    the descriptor."""
 
     by: Array
     data: RiccatiData
@@ -214,7 +220,7 @@ def _in_fitting_units(discrete: bool, data: RiccatiData) -> _Problem:
     well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
-    # The starting points are computed for E^-1 A and E^-1 B.
+    # The starting points need E^-1 A and E^-1 B.
     if E is not None:
         A, B = map(factorised(E), (A, B))
         finite = xp.sum(0 * xp.concatenate([A, B], axis=1)) == 0
@@ -223,7 +229,7 @@ def _in_fitting_units(discrete: bool, data: RiccatiData) -> _Problem:
 
 
 def _search(discrete: bool, problem: _Problem) -> _Solved:
-    """The search, in these units."""
+    """The search for the solution, in the units of the problem."""
     by, data, plain, well_posed = problem
     d, _ = by
     A, B, *_, E = data
@@ -237,10 +243,10 @@ def _search(discrete: bool, problem: _Problem) -> _Solved:
         if discrete:
             height = xp.where(kind == SECOND, _SECOND_START * size_Q, size_Q)
             X, iterations = discrete_start(start, height)
-            size_G = xp.zeros_like(size_Q)  # needed in continuous time alone
+            size_G = xp.zeros_like(size_Q)  # used in continuous time only
         else:
             X, size_G, iterations = continuous_start(start, kind)
-        # Residuals in the balanced and in the user's units.
+        # The residuals are in the balanced and in the user's units.
         left = newton_refine(
             lambda X, flag: riccati_residual(discrete, here, X, small or flag, d),
             lambda _, *at: _correction(discrete, here.E, *at),
@@ -256,19 +262,19 @@ def _search(discrete: bool, problem: _Problem) -> _Solved:
             weight = here.R + matmul(here.B.T, matmul(X, here.B))
             gap = xp.where(is_semidefinite(weight), 1 - bound, -xp.inf)
             rounding, scale = xp.asarray(n * eps, A.dtype), 1.0
-            # Eigenvalues come in pairs z, 1/z. Where two meet on the circle, data that
-            # change by rounding move them apart by its root.
+            # Eigenvalues come in pairs z, 1/z. If two meet on the unit circle, rounding
+            # of the data moves them apart by its square root.
             reach = 10 * eps**0.5
         else:
             bound, scale = abscissa_and_size(loop)
             gap, rounding = -bound, n * eps * scale
-            # A change of Q by rounding moves eigenvalues on the axis off it by its
-            # root.
+            # A change of Q by rounding moves eigenvalues off the imaginary axis by its
+            # square root.
             reach = xp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
             scale = size(loop)
         size_X, size_loop = size(X), size(loop)
         gain = 1 + size_loop**2 if discrete else 2 * size_loop
-        # A change dX by rounding causes a residual L'dX L - E'dX E, or E'dX L + L'dX E.
+        # A change dX by rounding gives a residual L'dX L - E'dX E, or E'dX L + L'dX E.
         terms = xp.where(left.terms[0] > 0, left.terms[0], xp.inf)
         return Attempt(
             left.point,
@@ -290,7 +296,7 @@ def _search(discrete: bool, problem: _Problem) -> _Solved:
 
 
 def _in_users_units(by, X, K, loop):
-    """Back from other units, by powers of two: without rounding."""
+    """Back to the user's units, by powers of two and therefore without rounding."""
     d, f = by
     return X * (f[:, None] * f), K * d, loop / (d[:, None] / d)
 
@@ -298,25 +304,26 @@ def _in_users_units(by, X, K, loop):
 @_certified.defjvp
 @full_precision
 def _certified_jvp(discrete, primals, tangents):
-    """By the implicit function theorem; zero in unsolved members."""
+    """By the implicit function theorem. Derivatives of unsolved members are zero."""
     solved = _certified(discrete, *primals)
     ok, by = solved.differentiable, stop_gradient(solved.by)
     d, f = by
-    # Masked at input and output, so that a failed member's NaN does not spread.
+    # Masked at input and output, so that the NaN of a failed member does not spread.
     if_ok = lambda tree: jax.tree.map(lambda M: xp.where(ok, M, 0), tree)
     tangent = if_ok(in_units(by, *tangents))
     A, B, Q, R, S, E = in_units(by, *primals)
     X = solved.X / (f[:, None] * f)
     (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, X), (R, E))
     safe = RiccatiData(A, B, Q, R, S, E)
-    # The derivative of the equation in X is the Lyapunov operator of the closed loop:
-    # dX solves a Lyapunov equation whose constant is the derivative in the data.
+    # The derivative of the equation with respect to X is the Lyapunov operator of the
+    # closed loop. So dX solves a Lyapunov equation, with the derivative with respect to
+    # the data as the constant.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
-    # -I/2 is stable in both times, and its Lyapunov equation converges fast.
+    # -I/2 is stable in discrete and continuous time, and its solve converges fast.
     loop = xp.where(ok, loop, shifted(-0.5, loop))
     dX = if_ok(_correction(discrete, E, loop, if_ok(error)))
-    # The gain is a formula in X and the data, whose derivatives are then its own.
+    # The gain is an explicit function of X and the data.
     feedback = lambda *at: _terms(discrete, *at)[2:]
     _, (dK, d_loop) = jax.jvp(feedback, (safe, X), (tangent, dX))
     dX, dK, d_loop = _in_users_units(by, dX, if_ok(dK), if_ok(d_loop))
@@ -324,10 +331,10 @@ def _certified_jvp(discrete, primals, tangents):
 
 
 def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array]:
-    """The left side of the equation at `X`, and the closed loop; for derivatives."""
+    """The left side of the equation at `X`, and the closed loop, for derivatives."""
     A, _, Q, *_, E = data
     moved, cross, K, closed_loop = _terms(discrete, data, X)
-    # With the gain eliminated: its derivative in X is then the Lyapunov operator.
+    # With the gain eliminated, the derivative in X is the Lyapunov operator.
     linear = moved @ A
     if discrete:
         linear = linear - (X if E is None else E.T @ X @ E)
@@ -345,7 +352,7 @@ def _terms(discrete, data, X):
 
 
 def _correction(discrete: bool, E: Array | None, loop: Array, error: Array) -> Array:
-    """The Newton step for an `error` of the equation, given its closed loop."""
+    """The Newton step for an `error` of the equation, given the closed loop."""
     return _outside(E, lyapunov(discrete, loop, error))
 
 
@@ -357,12 +364,12 @@ def _outside(E: Array | None, Y: Array) -> Array:
 def is_semidefinite(weight: Array, units: int = 100) -> BoolScalar:
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
     rounding = weight.shape[0] * xp.finfo(weight.dtype).eps
-    # The shift makes a zero eigenvalue positive, as Cholesky's factorisation needs, and
-    # leaves a negative one that is more than rounding.
+    # The Cholesky factorisation needs positive eigenvalues. The shift makes zero ones
+    # positive, but not a negative one that is larger than rounding.
     slack = units * rounding * one_if_zero(size(weight))
     return is_definite(symmetric(weight) + shifted(slack, weight))
 
 
 def shifted(c, like: Array) -> Array:
-    """`c I`."""
+    """`c I`, of the shape of `like`."""
     return c * xp.eye(like.shape[0], dtype=like.dtype)
