@@ -212,7 +212,8 @@ def filter_dare(
         ```
 
         ```text
-        TODO1
+        Array([[0.168],
+               [0.092]], dtype=float32)
         ```
     """
     return _filter(True, "filter_dare", A, C, W, V, S, throw)
@@ -268,7 +269,8 @@ def filter_care(
         ```
 
         ```text
-        TODO2
+        Array([[0.458],
+               [0.1  ]], dtype=float32)
         ```
     """
     return _filter(False, "filter_care", A, C, W, V, S, throw)

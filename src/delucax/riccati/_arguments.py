@@ -97,7 +97,7 @@ def _check_shape(shape: tuple, wanted: tuple, name: str, where: str, to_fit: str
 
 
 def where_solved(ok: Array, zeroed: Any, units: Any) -> tuple[Any, Any]:
-    """Replace the matrices of failed problems: `zeroed` by zeros, `units` by identities.
+    """Replace matrices of failed problems: `zeroed` by zeros, `units` by identities.
 
     `ok` is one flag, or one for each step. Without this, the derivative of a failed
     problem would be NaN, even if it were multiplied by zero afterwards.
@@ -116,7 +116,8 @@ def is_complex(*matrices: Array | None) -> bool:
 
 
 def real_form(M: Array) -> Array:
-    """The real matrix `[[Re M, -Im M], [Im M, Re M]]`; it adds and multiplies as `M`."""
+    """The real matrix `[[Re M, -Im M], [Im M, Re M]]`, which adds and multiplies as
+    `M` does."""
     return xp.block([[M.real, -M.imag], [M.imag, M.real]])
 
 

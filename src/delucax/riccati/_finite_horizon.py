@@ -64,7 +64,7 @@ class FiniteHorizonSolution(eqx.Module):
         ```
 
         ```text
-        TODO1
+        Array([[0.422, 1.244]], dtype=float32)
         ```
     """
 
@@ -161,7 +161,7 @@ def dre(
         ```
 
         ```text
-        TODO2
+        Array([1.681], dtype=float32)
         ```
     """
     where = "dre"
@@ -284,7 +284,7 @@ def cre(
         ```
 
         ```text
-        TODO3
+        Array([[1.   , 1.732]], dtype=float32)
         ```
     """
     where = "cre"

@@ -195,7 +195,7 @@ def hinf_care(
         ```
 
         ```text
-        TODO1
+        Array([[2.39, 5.76]], dtype=float32)
         ```
     """
     where = "hinf_care"

@@ -193,7 +193,7 @@ def hinf_cre(
         ```
 
         ```text
-        TODO1
+        Array([[1.059, 1.872]], dtype=float32)
         ```
     """
     where = "hinf_cre"

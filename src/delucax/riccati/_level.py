@@ -20,7 +20,7 @@ from ._residual import stationary
 
 
 _LOOSE = {4: 1e-3, 8: 1e-6}
-"""The default tolerance of a level at which `X` has a pole, by the bytes of a number."""
+"""The default tolerance of a level if `X` has a pole at it, by the bytes of a number."""
 _WIDEST = 1e18
 """The search gives up this factor away from its start."""
 _FACTOR = 4.0
@@ -79,7 +79,8 @@ class GameSolution(eqx.Module):
         ```
 
         ```text
-        TODO1
+        (Array([[0.497, 1.37 ]], dtype=float32), Array([[0.087, 0.107],
+               [0.02 , 0.055]], dtype=float32))
         ```
     """
 

@@ -59,7 +59,8 @@ class MatrixSolution(eqx.Module):
         ```
 
         ```text
-        TODO1
+        Array([[0.583, 0.083],
+               [0.083, 0.25 ]], dtype=float32)
         ```
     """
 
@@ -117,7 +118,8 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
         ```
 
         ```text
-        TODO2
+        Array([[ 2.25, -0.5 ],
+               [-0.5 ,  2.  ]], dtype=float32)
         ```
     """
     return _equation("lyap", False, A, None, Q, throw)
@@ -156,7 +158,8 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
         ```
 
         ```text
-        TODO3
+        Array([[5.448, 0.121],
+               [0.121, 1.333]], dtype=float32)
         ```
     """
     return _equation("dlyap", True, A, None, Q, throw)
@@ -203,7 +206,8 @@ def sylvester(
         ```
 
         ```text
-        TODO4
+        Array([[0.143],
+               [0.143]], dtype=float32)
         ```
     """
     return _equation("sylvester", False, A, B, C, throw)
@@ -243,7 +247,8 @@ def dsylvester(
         ```
 
         ```text
-        TODO5
+        Array([[2.619],
+               [3.571]], dtype=float32)
         ```
     """
     return _equation("dsylvester", True, A, B, C, throw)

@@ -19,8 +19,8 @@ _PADE = (1.0, 1 / 2, 5 / 44, 1 / 66, 1 / 792, 1 / 15840, 1 / 665280)
 """Numerator of the [6/6] Pade approximant of exp. The error is 2e-17 at norm 1/2."""
 
 Element = tuple[Array, Array, Array]
-"""`A, C, J` of an interval. If `X` is the solution at its end, the solution at its start
-is `J + A' X (I + C X)^-1 A`."""
+"""`A, C, J` of an interval: the solution `X` at its end gives the solution
+`J + A' X (I + C X)^-1 A` at its start."""
 
 
 def is_clearly_definite(M: Square) -> BoolScalar:
@@ -137,8 +137,8 @@ def _in_parallel(A, B, Q, R, S, final):
 
 
 def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
-    """`A - B R^-1 S'`, `B R^-1 B'` and `Q - S R^-1 S'`: the data without a cross weight,
-    with `u + R^-1 S'x` as the control. `added` is a part of `Q` that is added last.
+    """`A - B R^-1 S'`, `B R^-1 B'` and `Q - S R^-1 S'`: the data for the control
+    `u + R^-1 S'x`, without a cross weight. `added` is a part of `Q` that is added last.
 
     The element of a step in discrete time, about some `X0`, follows with
     `A'X0 A - X0` for `Q`, `R + B'X0 B` for `R`, `A'X0 B + S` for `S` and `added = Q`.

@@ -1,4 +1,4 @@
-"""Residuals of matrix equations with bounds on their rounding, and Newton refinement."""
+"""Residuals of matrix equations with bounds on their rounding, and Newton steps."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -317,8 +317,10 @@ def linear_residual(discrete, A, B, C, X) -> Array:
 
 
 class Refined(NamedTuple):
-    """The best point of a refinement, and its residual as in `Residual`. The point holds
-    `X`, its gain and its closed loop, one below the other."""
+    """The best point of a refinement, and its residual as in `Residual`.
+
+    The point holds `X`, its gain and its closed loop, one below the other.
+    """
 
     point: Float[Array, "rows n"]
     relative: Scalar

@@ -72,7 +72,7 @@ def _short_flow(A):
 
 
 def is_stable(discrete: bool, A: Square, margin: Scalar | float) -> BoolScalar:
-    """Whether the spectral radius is below one, or the abscissa below zero, by a margin.
+    """Whether the spectral radius is below 1, or the abscissa below 0, by a margin.
 
     The bounds hold for every power, so a few squarings are enough for most matrices.
     """
@@ -114,7 +114,7 @@ def _growth(A, probing, limit=None):
     probes = xp.asarray(probes, dtype)
 
     def above(logarithm, weight):
-        # |A| is at most n times the largest entry. The weight is that of the next power.
+        # |A| is at most n times the largest entry. The weight is of the next power.
         return logarithm + 2 * weight * math.log(n)
 
     def more(carry):

@@ -96,7 +96,7 @@ class RiccatiSolution(eqx.Module):
         ```
 
         ```text
-        TODO1
+        (Array([[0.422, 1.244]], dtype=float32), Array(0.422, dtype=float32))
         ```
     """
 
@@ -203,8 +203,8 @@ def _certified(discrete: bool, data: RiccatiData) -> _Solved:
 
 
 class _Problem(NamedTuple):
-    """The data with states and rows scaled `by` balancing units, and `A` and `B` without
-    the descriptor."""
+    """The data with states and rows scaled `by` balancing units, and `A` and `B` of the
+    system without a descriptor matrix."""
 
     by: Array
     data: RiccatiData
