@@ -45,13 +45,13 @@ def crossed():
         (lambda: Soft(1, 0), "Soft: bounds must have a finite number between"),
         (lambda: Staged(A, B, None, R, horizon=3), "Staged: Q must be an array"),
         (lambda: Soft(0, 1, linear=-1), "Soft: linear must be at least 0"),
-        (lambda: Staged(A, B, Q, R), "Staged: give the horizon"),
-        (lambda: Staged(A, B, stages(Q), R, horizon=4), "differ in their stages"),
+        (lambda: Staged(A, B, Q, R), "Staged: horizon must be given"),
+        (lambda: Staged(A, B, stages(Q), R, horizon=4), "must have the same number of stages"),
         (
             lambda: Staged(A, np.ones((3, 1)), Q, R, horizon=3),
             "A must have shape (3, 3)",
         ),
-        (lambda: Staged(A, B, bent(), R), "at stage 1 its least eigenvalue is -0.5"),
+        (lambda: Staged(A, B, bent(), R), "at stage 1 its smallest eigenvalue is -0.5"),
         (
             lambda: Staged(A, B, Q, R, horizon=3, states=crossed()),
             "those of entry 1 of stage 2 are 5.0 and 1.0",

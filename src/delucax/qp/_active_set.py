@@ -1,9 +1,10 @@
 """Guesses of the active sides, before the interior-point method.
 
-With the active sides given, a program is one linear system, that of a step of the
-method. Its solution says which sides it violates and which do not push: the next guess.
-Programs of control end after a few, from the active sides of a program before or from
-none; there is no proof that they do, so the number of guesses is bounded.
+If the active sides are known, a program is one linear system, of the same form as in a
+step of the method. Its solution shows which other sides it violates and which active
+sides have a negative multiplier. This gives the next guess. Programs of control need
+only a few guesses, from the active sides of a previous program or from none. There is
+no proof of this, so the number of guesses is limited.
 
 Source: Hintermueller, Ito and Kunisch, 2002 (primal-dual active sets).
 """
@@ -18,28 +19,30 @@ from ._form import both, Sides
 
 
 GUESSES = 10
-"""So many sets are tried at most."""
+"""The largest number of guesses."""
 PASSES = 3
-"""Each linear system is solved and refined so many times."""
+"""The number of solves of each linear system, with its refinements."""
 
 
 class Guess(NamedTuple):
-    """Which sides are taken to be active."""
+    """A guess of the active sides."""
 
-    held: Array  # with equality
-    over: Array  # violated, a soft side
-    left: Array  # so many guesses are left
+    held: Array  # sides that hold with equality
+    over: Array  # soft sides that are violated
+    left: Array  # the number of guesses that are left
 
     def sides(self, sides: Sides) -> tuple[Sides, Array]:
-        """The sides of the equations that then hold, and the compliance of each: that
-        of the weight of a violation."""
+        """The sides that the guess makes equations, and the compliance of each side.
+
+        The compliance is the inverse of the quadratic weight of a violated side.
+        """
         spring = self.over & (sides.W > 0)
         compliance = jnp.where(spring, 1 / jnp.where(spring, sides.W, 1), 0)
         held = sides.equality | self.held
         return sides._replace(inequality=spring, equality=held), compliance
 
     def pushed(self, sides: Sides) -> Array:
-        """The multipliers of the sides whose violation has a linear weight alone."""
+        """The multipliers of the violated sides that have only a linear weight."""
         return jnp.where(self.over & (sides.W == 0), sides.v, 0)
 
 
@@ -52,7 +55,7 @@ def active_at(method: Method, at: Iterate) -> Guess:
 
 
 def tried(method: Method, along: Array, guess: Guess) -> tuple[Iterate, Guess]:
-    """The point at which the active sides are as guessed, and the next guess."""
+    """The point for a guess of the active sides, and the next guess."""
     sides = method.sides
     x, p, z, *_ = method.apart(along)
     z = z + guess.pushed(sides)
@@ -61,7 +64,7 @@ def tried(method: Method, along: Array, guess: Guess) -> tuple[Iterate, Guess]:
     too_far = sides.soft & (z > sides.v) & guess.held
     stays = jnp.where(guess.over, over > 0, False)
     held = jnp.where(guess.held, (z > 0) & ~too_far, over > 0) & on
-    # A violated side that is met again is held.
+    # A soft side that is not violated any more is held at its bound.
     held = jnp.where(guess.over, ~stays, held)
     violated = too_far | stays
     t = jnp.where(guess.over, jnp.maximum(over, 0), 0)

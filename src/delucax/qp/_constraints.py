@@ -1,4 +1,4 @@
-"""Bounds and rows, as a user gives them, and their checks."""
+"""Bounds and rows as the user gives them, and their checks."""
 
 from typing import Any
 
@@ -13,20 +13,21 @@ from .._typing import Array
 
 
 class Soft(eqx.Module):
-    r"""Bounds that may be violated, at a cost: a violation `t` of one side costs
-    `linear t + 1/2 quadratic t^2`.
+    r"""Bounds that may be violated at a cost.
 
-    A linear weight above the multiplier that the hard bound has makes the solution
-    meet the bound where it can be met (an exact penalty).
+    A violation $t \ge 0$ of one side costs $v\, t + \tfrac12 W t^2$. The penalty is
+    exact if $v$ is larger than the multiplier of the hard bound: the solution then
+    violates the bound only if the constraints leave no other choice.
 
     **Arguments:**
 
-    - `low`, `high`: as of a pair of bounds.
-    - `linear`: at least 0; a number, or of the shape of the bounds; 0 by default.
-        Where it is infinite, the bound is hard.
-    - `quadratic`: likewise.
+    - `low`, `high`: the bounds, numbers or arrays, which may be infinite.
+    - `linear`: the weight $v$, at least 0; a number, or of the shape of the bounds; 0
+        by default. If it is infinite, the bound is hard.
+    - `quadratic`: the weight $W$, like `linear`.
 
-    **Raises:** `ValueError` on a weight that is negative or NaN.
+    **Raises:** `ValueError` if a weight is negative or NaN, or if there is no finite
+    number between the bounds.
 
     Source: Kerrigan and Maciejowski, 2000.
 
@@ -34,8 +35,15 @@ class Soft(eqx.Module):
 
         ```python
         import delucax as dlx
+        import jax.numpy as jnp
 
-        limits = dlx.qp.Soft(-1.0, 1.0, linear=100.0, quadratic=1.0)
+        soft = dlx.qp.Soft(0.0, 1.0, quadratic=4.0)
+        problem = dlx.qp.Dense(jnp.eye(1), jnp.array([-6.0]), bounds=soft)
+        dlx.qp.solve(problem).x
+        ```
+
+        ```text
+        Array([2.], dtype=float32)
         ```
     """
 
@@ -57,20 +65,21 @@ class Soft(eqx.Module):
 
 
 class Rows(eqx.Module):
-    r"""General inequalities, `lower <= C x + D u <= upper`.
+    r"""General linear constraints, $l \le C x + D u \le h$.
 
-    Where both bounds of a row are equal, it is an equation. A row without a bound on
-    one side has an infinite one there.
+    A row with two equal bounds is an equation. If a row has no bound on one side, give
+    an infinite bound there.
 
     **Arguments:**
 
-    - `C`: shape `(p, n)`; of stages also `(T, p, n)`.
+    - `C`: shape `(p, n)`; in a staged program also `(T, p, n)`.
     - `D`: shape `(p, m)`, or `(T, p, m)`; zero by default.
-    - `lower`, `upper`: numbers, or shape `(p,)` or `(T, p)`; infinite by default.
-    - `linear`, `quadratic`: the weights of a violation, as of
-        [`delucax.qp.Soft`][]; the rows are hard by default.
+    - `lower`, `upper`: the bounds $l$ and $h$, numbers or arrays of shape `(p,)` or
+        `(T, p)`; infinite by default.
+    - `linear`, `quadratic`: the weights of a violation, as in [`delucax.qp.Soft`][];
+        the rows are hard by default.
 
-    **Raises:** `ValueError` on an array of the wrong shape, on NaN, or on a weight that
+    **Raises:** `ValueError` if an array has the wrong shape or has NaN, or if a weight
     is negative.
 
     !!! example
@@ -80,6 +89,12 @@ class Rows(eqx.Module):
         import jax.numpy as jnp
 
         rows = dlx.qp.Rows(jnp.array([[1.0, 1.0]]), upper=1.0)
+        problem = dlx.qp.Dense(jnp.eye(2), jnp.array([-1.0, -1.0]), rows=rows)
+        dlx.qp.solve(problem).x
+        ```
+
+        ```text
+        Array([0.5, 0.5], dtype=float32)
         ```
     """
 
@@ -106,7 +121,7 @@ class Rows(eqx.Module):
         self.D = None if D is None else as_matrices(D, "D", "Rows")
         if self.D is not None and self.D.shape[-2] != self.C.shape[-2]:
             raise ValueError(
-                "Rows: C and D must have as many rows, got shapes "
+                "Rows: C and D must have the same number of rows, got shapes "
                 f"{self.C.shape} and {self.D.shape}."
             )
         self.lower = _as_array(lower, "lower", "Rows")
@@ -121,19 +136,19 @@ class Rows(eqx.Module):
 
 
 class Limits(eqx.Module):
-    """Bounds as they were given, and their weights, `None` where they are hard."""
+    """Bounds as the user gave them, and their weights, `None` for hard bounds."""
 
     low: Array
     high: Array
     weights: tuple[Array, Array] | None
 
     def broadcast(self, shape: tuple[int, ...], dtype: Any) -> "Limits":
-        """With arrays of one shape."""
+        """The same limits with all arrays broadcast to one shape."""
         return jax.tree.map(lambda a: jnp.broadcast_to(a, shape).astype(dtype), self)
 
 
 def as_limits(value: Any, shape: tuple[int, ...], name: str, where: str) -> Limits:
-    """Bounds of any kind, checked; they broadcast to `shape`."""
+    """Check bounds of any kind. They must broadcast to `shape`."""
     low, high, *weights = _parts(value, name, where)
     shapes = [shape[k:] for k in reversed(range(len(shape) + 1))]
     for array in (low, high, *(w for w in weights if w is not None)):
@@ -163,7 +178,7 @@ def _parts(value: Any, name: str, where: str) -> tuple[Any, ...]:
 
 
 def _check_order(low: Array, high: Array, name: str, where: str) -> None:
-    """Raise if no number is between two bounds, with the stage and the entry."""
+    """Raise an error if no finite number is between two bounds."""
     if not (is_concrete(low) and is_concrete(high)):
         return
     least, most = np.broadcast_arrays(np.asarray(low), np.asarray(high))
@@ -179,7 +194,7 @@ def _check_order(low: Array, high: Array, name: str, where: str) -> None:
 
 
 def _as_array(value: Any, name: str, where: str) -> Array:
-    """`value` as a real array without NaN."""
+    """Check that `value` is a real array without NaN."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array):
         raise ValueError(
@@ -192,7 +207,7 @@ def _as_array(value: Any, name: str, where: str) -> Array:
 
 
 def _place(array: Array) -> str:
-    """Where the first NaN of an array is."""
+    """The words for the first NaN of an array."""
     index = np.argwhere(np.isnan(np.asarray(array)))[0]
     return f", but its entry {tuple(map(int, index))} is" if index.size else ""
 
@@ -205,7 +220,7 @@ def _as_weight(value: Any, name: str, where: str) -> Array:
 
 
 def as_finite_array(value: Any, name: str, where: str) -> Array:
-    """`value` as a real array of finite entries."""
+    """Check that `value` is a real array of finite entries."""
     array = _as_array(value, name, where)
     if is_concrete(array) and not np.isfinite(np.asarray(array)).all():
         raise ValueError(f"{where}: {name} must be finite.")
@@ -213,19 +228,19 @@ def as_finite_array(value: Any, name: str, where: str) -> Array:
 
 
 def as_matrices(value: Any, name: str, where: str) -> Array:
-    """A matrix, or one for each stage."""
+    """Check that `value` is a matrix, or a stack of one matrix for each stage."""
     array = as_finite_array(value, name, where)
     if array.ndim not in (2, 3):
         raise ValueError(
             f"{where}: {name} must be a matrix"
-            f"{'' if where == 'Dense' else ', or a stack of one for each stage'}, got "
+            f"{'' if where == 'Dense' else ', or one for each stage in a stack'}, got "
             f"shape {array.shape}."
         )
     return array
 
 
 def check_convex(hessian: Array, name: str, where: str) -> None:
-    """Raise unless a symmetric matrix, or each of a stack, is semidefinite."""
+    """Raise an error unless each symmetric matrix of a stack is semidefinite."""
     if not is_concrete(hessian):
         return
     stack = np.asarray(hessian)
@@ -239,12 +254,12 @@ def check_convex(hessian: Array, name: str, where: str) -> None:
         at = f" at stage {k}" if hessian.ndim == 3 else ""
         raise ValueError(
             f"{where}: the problem is not convex: {name} must be positive "
-            f"semidefinite, but{at} its least eigenvalue is {least[k].min():.3g}."
+            f"semidefinite, but{at} its smallest eigenvalue is {least[k].min():.3g}."
         )
 
 
 def symmetric_part(matrix: Array, name: str, where: str) -> Array:
-    """A symmetric matrix, or a stack of them, without its rounding."""
+    """Check that the matrices of a stack are symmetric, and remove their rounding."""
     if matrix.shape[-1] != matrix.shape[-2]:
         raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
     if is_concrete(matrix):
@@ -261,7 +276,8 @@ def symmetric_part(matrix: Array, name: str, where: str) -> Array:
 
 
 def stacked_weights(parts: list[Limits], axis: int) -> tuple[Array, Array] | None:
-    """The weights of both sides of several bounds, in a row; `None` if all are hard."""
+    """The weights of several bounds for both sides, concatenated; `None` if all are
+    hard."""
     if all(part.weights is None for part in parts):
         return None
 
@@ -286,7 +302,7 @@ def common_horizon(
     controls: Any,
     where: str,
 ) -> int:
-    """The number of stages, on which all arrays with a time axis agree."""
+    """The number of stages. All arrays with a time axis must have the same."""
     lengths: dict[str, int] = {}
     for name, array in given.items():
         size = sizes[name]
@@ -307,15 +323,19 @@ def common_horizon(
             if np.ndim(array) == 2:
                 lengths[name] = np.shape(array)[0] - extra
     if not lengths:
-        raise ValueError(f"{where}: give the horizon, as no argument has a time axis.")
+        raise ValueError(
+            f"{where}: horizon must be given if no argument has a time axis."
+        )
     if len(set(lengths.values())) > 1:
         words = ", ".join(f"{name}: {length}" for name, length in lengths.items())
-        raise ValueError(f"{where}: the arguments differ in their stages ({words}).")
+        raise ValueError(
+            f"{where}: all arguments must have the same number of stages, got {words}."
+        )
     return next(iter(lengths.values()))
 
 
 def check_stage_weights(given: dict[str, Array], where: str) -> None:
-    """Raise unless the cost is convex, with the stage."""
+    """Raise an error unless the cost of every stage is convex."""
     parts = [given[name] for name in ("Q", "R", "S") if name in given]
     if all(map(is_concrete, parts)):
         Q, R, *cross = map(np.asarray, parts)

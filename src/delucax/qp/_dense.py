@@ -1,4 +1,4 @@
-"""The dense form: any program of up to some hundreds of variables."""
+"""The dense form, for any program of up to some hundreds of variables."""
 
 import dataclasses
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from ._form import AbstractForm, Scaling
 
 
 _PASSES = 4
-"""Of the equilibration; each takes the square root of what is left."""
+"""The passes of the equilibration. Each takes the square root of the remaining ratio."""
 
 
 class Factors(NamedTuple):
-    """`M = H + G'W G + F'F` and the Schur complement `F M^-1 F'`."""
+    """The factors of `M = H + G'W G + F'F` and of the Schur complement `F M^-1 F'`."""
 
     L: Array
     solved: Array  # M^-1 F', shape (n, e)
@@ -29,7 +29,7 @@ class Factors(NamedTuple):
 class DenseForm(AbstractForm):
     """A program with dense matrices.
 
-    With `bounded`, the first rows are the variables themselves.
+    With `bounded`, the first rows are the bounds of the variables.
     """
 
     H: Float[Array, "n n"]
@@ -72,7 +72,7 @@ class DenseForm(AbstractForm):
         if self.G.shape[0]:
             M = M + (self.G.T * general) @ self.G
         if e:
-            # It changes nothing on F x = f, and makes M definite where only F is.
+            # F'F changes nothing on F x = f, and makes M definite where H is not.
             M = M + self.F.T @ self.F
         L = jnp.linalg.cholesky(M, symmetrize_input=False)
         solved = jsl.cho_solve((L, True), self.F.T) if e else self.F.T
@@ -88,7 +88,7 @@ class DenseForm(AbstractForm):
         return free - factors.solved @ dp, dp
 
     def rows_matrix(self):
-        """`G`, the variables included."""
+        """The matrix of all rows, with the bounds of the variables."""
         eye = jnp.eye(self.q.shape[0], dtype=self.q.dtype)
         return jnp.concatenate([eye, self.G]) if self.bounded else self.G
 
@@ -113,14 +113,14 @@ class DenseForm(AbstractForm):
         c = cost_unit(H, lax.stop_gradient(q))
         H = D[:, None] * self.H * D
         F, G = E[:, None] * self.F * D, R[:, None] * self.G * D
-        # A bound of a variable is scaled as the variable is.
+        # The bound of a variable has the scale of the variable.
         rows = jnp.concatenate([1 / D, R]) if self.bounded else R
         scaled = dict(H=c * H, q=c * q, F=F, f=E * self.f, G=G)
         return dataclasses.replace(self, **scaled), Scaling(D, E, rows, c)
 
     def meaningful(self, sides):
-        # A row of zeros whose bound is zero has no interior, and the method would not
-        # converge.
+        # A row of zeros with a bound of zero has no interior, so the method would not
+        # converge. Such rows are left out if they hold.
         empty = jnp.max(jnp.abs(self.rows_matrix()), axis=1, initial=0) == 0
         slack = 10 * jnp.finfo(self.q.dtype).eps * jnp.max(jnp.abs(sides.h), initial=0)
         off = empty & (sides.h >= -slack)
@@ -136,8 +136,8 @@ class DenseForm(AbstractForm):
 
 
 def regularisation(dtype) -> float:
-    """What is added to the diagonal of a scaled problem, and taken out of the solution
-    by refinement."""
+    """The regularisation of the diagonal of a scaled problem. Refinement removes its
+    effect on the solution."""
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 

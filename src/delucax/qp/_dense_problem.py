@@ -24,15 +24,21 @@ from ._dense import DenseForm
 
 
 class DenseMultipliers(eqx.Module):
-    """Multipliers of the constraints: at a solution `P x + q + E'equalities` and, of
-    bounds and rows, `G'(upper - lower)` add up to zero.
+    r"""The multipliers of the constraints of a dense program.
+
+    At the solution the gradient of the Lagrangian is zero. If $y$ are the multipliers
+    of the equalities, $\lambda$ those of the bounds and $\mu$ those of the rows,
+
+    $$P x + q + E^\top y + \lambda_\mathrm{upper} - \lambda_\mathrm{lower}
+    + G^\top (\mu_\mathrm{upper} - \mu_\mathrm{lower}) = 0.$$
 
     **Attributes:**
 
-    - `equalities`: shape `(e,)`.
-    - `bounds`: a pair `(lower, upper)` of non-negative arrays of shape `(n,)`; `None`
-        if there are no bounds.
-    - `rows`: likewise, of shape `(p,)`.
+    - `equalities`: $y$, shape `(e,)`.
+    - `bounds`: $\lambda$, a pair `(lower, upper)` of non-negative arrays of shape
+        `(n,)`; `None` if there are no bounds.
+    - `rows`: $\mu$, a pair `(lower, upper)` of non-negative arrays of shape `(p,)`;
+        `None` if there are no rows.
 
     !!! example
 
@@ -40,11 +46,13 @@ class DenseMultipliers(eqx.Module):
         import delucax as dlx
         import jax.numpy as jnp
 
-        rows = dlx.qp.Rows(jnp.array([[1.0, 1.0]]), upper=1.0)
         P, q = jnp.eye(2), jnp.array([1.0, -2.0])
-        problem = dlx.qp.Dense(P, q, bounds=(0.0, 1.0), rows=rows)
-        multipliers = dlx.qp.solve(problem).multipliers
-        multipliers.bounds, multipliers.rows
+        problem = dlx.qp.Dense(P, q, bounds=(0.0, 1.0))
+        dlx.qp.solve(problem).multipliers.bounds
+        ```
+
+        ```text
+        (Array([1., 0.], dtype=float32), Array([0., 1.], dtype=float32))
         ```
     """
 
@@ -56,12 +64,15 @@ class DenseMultipliers(eqx.Module):
 
 
 class Dense(eqx.Module):
-    r"""A convex quadratic program: minimise `1/2 x'P x + q'x` such that
+    r"""A convex quadratic program.
 
-    `E x = b`, `low <= x <= high` and `lower <= G x <= upper`.
+    $$\min_x \; \tfrac12 x^\top P x + q^\top x \quad \text{such that} \quad
+    E x = b, \quad \mathit{low} \le x \le \mathit{high}, \quad
+    \mathit{lower} \le G x \le \mathit{upper}$$
 
-    It suits up to some hundreds of variables; a program in stages is a
-    [`delucax.qp.Staged`][].
+    It is suitable for up to some hundreds of variables. Write a problem of optimal
+    control as a [`delucax.qp.Staged`][] program instead: its time is linear in the
+    horizon.
 
     **Arguments:**
 
@@ -70,11 +81,12 @@ class Dense(eqx.Module):
     - `equalities`: a pair `(E, b)` of shapes `(e, n)` and `(e,)`; none by default.
     - `bounds`: a pair `(low, high)` of numbers or arrays of shape `(n,)`, which may be
         infinite, or a [`delucax.qp.Soft`][]; none by default.
-    - `rows`: a [`delucax.qp.Rows`][] of shape `(p, n)`, without a `D`; none by default.
+    - `rows`: a [`delucax.qp.Rows`][] with the matrix `G` of shape `(p, n)` as its `C`,
+        and without a `D`; none by default.
 
-    **Raises:** `ValueError` on an array of the wrong shape, that is NaN, or not finite
-    where it must be; on bounds with nothing between them; if `P` is not symmetric and
-    positive semidefinite.
+    **Raises:** `ValueError` if an array has the wrong shape, has NaN, or is not finite
+    (only bounds may be infinite), if there is no finite number between two bounds, or
+    if `P` is not symmetric and positive semidefinite.
 
     !!! example
 
@@ -86,6 +98,10 @@ class Dense(eqx.Module):
         rows = dlx.qp.Rows(jnp.array([[1.0, 1.0]]), upper=1.0)
         problem = dlx.qp.Dense(P, q, bounds=(0.0, jnp.inf), rows=rows)
         dlx.qp.solve(problem).x
+        ```
+
+        ```text
+        Array([0., 1.], dtype=float32)
         ```
     """
 
@@ -109,7 +125,7 @@ class Dense(eqx.Module):
         rows: Rows | None = None,
     ):
         where = "Dense"
-        # What is given is only checked here; `form` computes with it.
+        # The arguments are only checked here. `form` computes with them.
         P, q = as_matrices(P, "P", where), as_finite_array(q, "q", where)
         n = P.shape[-1]
         _check_shape(P, (n, n), "P", where)
@@ -133,13 +149,15 @@ class Dense(eqx.Module):
         if rows is not None:
             check_instance(rows, Rows, "rows", where)
             if rows.D is not None:
-                raise ValueError(f"{where}: rows must have no D, which is of stages.")
+                raise ValueError(
+                    f"{where}: rows must have no D, which is for staged programs."
+                )
             self.G = rows.C
             _check_shape(self.G, (len(self.G), n), "C of rows", where)
             self.rows = as_limits(rows, (len(self.G),), "rows", where)
 
     def form(self) -> DenseForm:
-        """The arrays for the method."""
+        """The program as the method takes it."""
         n, dtype = self.q.shape[0], jnp.result_type(*jax.tree.leaves(self))
         empty = jnp.zeros((0, n), dtype)
         G = empty if self.G is None else self.G
@@ -162,12 +180,12 @@ class Dense(eqx.Module):
         return [self.P]
 
     def primal(self, x: Array) -> tuple[Array, None]:
-        """The variables and the controls of the unknowns `x` of the form."""
+        """The variables of the unknowns `x` of the form; there are no controls."""
         return x, None
 
     def multipliers(self, p: Array, sides: Array) -> DenseMultipliers:
-        """The multipliers `p` of the equations and those of the `sides` of the form,
-        the upper ones first, by name."""
+        """The multipliers by name, from those of the equations, `p`, and those of the
+        `sides` of the form, upper sides first."""
         upper, lower = sides
         n = 0 if self.bounds is None else self.q.shape[0]
         bounds = None if self.bounds is None else (lower[:n], upper[:n])
@@ -177,8 +195,8 @@ class Dense(eqx.Module):
     def unknowns(
         self, x: Array, u: None, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers`
-        as a solution has them."""
+        """The unknowns and multipliers of the form, from `x`, `u` and `multipliers` of a
+        solution."""
         del u
         parts = [p for p in (multipliers.bounds, multipliers.rows) if p is not None]
         empty = jnp.zeros(0, self.q.dtype)
@@ -187,11 +205,11 @@ class Dense(eqx.Module):
         return x, multipliers.equalities, jnp.stack([upper, lower])
 
     def equation(self, row: int) -> str:
-        """The words for the equation in `row` of the form."""
+        """The words for an equation of the form, for an error message."""
         return f"row {row} of equalities"
 
     def place(self, side: int, row: int) -> str:
-        """The words for a `side` (1 is the lower one) of a `row` of the form."""
+        """The words for a `side` (1 is the lower one) of a `row`, for an error message."""
         n = 0 if self.bounds is None else self.q.shape[0]
         end = "lower" if side else "upper"
         return f"the {end} bound of " + (f"x[{row}]" if row < n else f"row {row - n}")

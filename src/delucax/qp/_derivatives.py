@@ -1,10 +1,10 @@
 """Derivatives of a solution, by the implicit function theorem at its active set.
 
-A side whose multiplier is positive is held as an equation, and one whose slack is
-positive is left out. So the conditions are linear equations in the change of the
-solution, with the matrix of one more step of the method. Where the solution is not
-unique, or a side has neither (it is about to become active or inactive), there is no
-derivative, and it is NaN.
+A side with a positive multiplier becomes an equation, and a side with a positive slack
+is left out. The conditions of optimality are then linear equations in the change of the
+solution, with the matrix of one more step of the method. If the solution is not unique,
+or if the multiplier and the slack of a side are both zero (the side is about to become
+active or inactive), there is no derivative, and the result is NaN.
 """
 
 from typing import Any
@@ -25,15 +25,15 @@ from ._interior_point import assembled, minimise, solved
 
 
 _CLEAR = 1e3
-"""Of a multiplier and its slack, one is this many times the other where it is clear
-whether the side is active, in the scaled problem; both are alike where it is not."""
+"""It is clear whether a side is active if its multiplier is this many times its slack,
+or the reverse, in the scaled problem."""
 _PASSES = 3
 _PROBING = 2
-"""Passes of the linear solve, and of the one that shows whether it is singular."""
+"""Passes of the linear solve, and of the solve that shows whether it is singular."""
 
 
 class Options(eqx.Module):
-    """What does not change the solution."""
+    """The options of the method, which do not change the solution."""
 
     start: Any
     tolerances: Tolerances
@@ -57,7 +57,7 @@ def _run(form: AbstractForm, options: Options) -> Outcome:
 
 
 def warm(method: Method, x: Array, z: Array) -> Guess:
-    """The sides that are active at a point; none where it is not finite."""
+    """The sides that are active at a point; none if the point is not finite."""
     D, _, R, c = method.scaling
     sides = method.sides
     usable = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(z))
@@ -91,14 +91,14 @@ def _optimum_jvp(primals: Any, tangents: Any) -> Any:
     last = outcome.iterate
     pushes = lambda method: method.apart(last.v / last.tau)[2:]
     *moved, unique = _change(form, change, outcome[:3], pushes)
-    # Of a failed solve there is no derivative.
+    # A failed solve has no derivative.
     ok = unique & (outcome.errors[0] <= 1)
     dx, dp, dz = (nan_tangent(d, ok) for d in moved)
     return outcome, nothing._replace(x=dx, p=dp, z=dz)
 
 
 def moved_with(form: AbstractForm, change: AbstractForm, x: Array, p: Array, z: Array):
-    """The change of a solution that is known, and whether it is unique."""
+    """The change of a known solution, and whether the solution is unique."""
 
     def pushes(method):
         (D, _, R, c), sides = method.scaling, method.sides
@@ -113,9 +113,11 @@ def moved_with(form: AbstractForm, change: AbstractForm, x: Array, p: Array, z: 
 
 
 def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
-    """The change of `x`, `p` and `z`, and whether the solution is unique. Of the scaled
-    problem `pushes` gives the multipliers of the sides, their slacks, the violations of
-    soft ones, and the multipliers of these."""
+    """The change of `x`, `p` and `z`, and whether the solution is unique.
+
+    For the scaled problem, `pushes` gives the multipliers and slacks of the sides, and
+    the violations of soft sides with their multipliers.
+    """
     method = Method.of(form)
     scaled, sides, (D, E, R, c) = method.scaled, method.sides, method.scaling
     x, p, z = (jnp.where(jnp.isfinite(a), a, 0) for a in point)
@@ -130,8 +132,9 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
     spring = violated & (sides.W > 0)
 
     def conditions(form):
-        """The gradient of the Lagrangian, the equations, and the rows that are held.
-        With a linear weight alone, a violated side has that as its multiplier."""
+        """The gradient of the Lagrangian, the equations, the rows that are held, and the
+        multipliers of violated sides with a linear weight only, which are the weights.
+        """
         sides = form.sides()
         pushed = jnp.where(violated & ~spring, sides.v, z)
         act = form.rows_transposed(signed(pushed)) + form.equations_transposed(p)
@@ -149,7 +152,7 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
 
     *right, own = jax.jvp(conditions, (form,), (change,))[1]
     right = [-a * unit for a, unit in zip(right, (c * D, E, R), strict=True)]
-    # A linear system like that of a step: held sides are its equations.
+    # A linear system as in a step of the method. Held sides are its equations.
     none = jnp.zeros_like(scaled_z)
     W = jnp.where(spring, sides.W, 1)
     system_sides = Sides(none, spring, held, spring, spring, none, W)
@@ -160,10 +163,10 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
         x, p, z = vector
         pull = scaled.equations_transposed(p) + scaled.rows_transposed(signed(z * on))
         rows = both(scaled.rows(x)) - compliance * z
-        # The rows that do not take part are those of the identity.
+        # Sides that are not active get the identity.
         return scaled.hessian(x) + pull, scaled.equations(x), jnp.where(on, rows, z)
 
-    # A singular system does not return a vector that it was multiplied with.
+    # Multiply a vector with the system and solve: a singular system does not return it.
     probe = jax.tree.map(
         lambda a: jnp.cos(1.0 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape),
         (x, p, z),
@@ -177,7 +180,7 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
         off = [jnp.max(jnp.abs(a - b), initial=0) for a, b in pairs]
         return system, jnp.max(jnp.stack(off))
 
-    # A linear solve needs no derivative of its factors.
+    # The derivative of a linear solve does not need that of its factors.
     fixed = lax.stop_gradient((scaled, system_sides, compliance, probe, product(probe)))
     system, off = by_lanes(factorised, *fixed)
     unique = jnp.all(clear) & (off < 1e-2)
@@ -189,7 +192,7 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
         x, p, z = by_lanes(refined, *fixed[:2], system, right)
         return x, p, jnp.where(on, z, right[2])
 
-    # As one vector: all of a right side must be linear in the tangents.
+    # As one vector, because the whole right side must be linear in the tangents.
     flat, apart = ravel_pytree(tuple(right))
     flattened = lambda f: lambda *args: ravel_pytree(f(*args[:-1], apart(args[-1])))[0]
     dx, dp, dz = apart(

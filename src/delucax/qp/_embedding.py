@@ -1,11 +1,11 @@
-"""The homogeneous embedding of a program: its points, and what is left of its lines.
+"""The homogeneous embedding of a program: its points and its residuals.
 
     H x + q tau + F'p + G'z = 0,   F x = f tau,   G x - t + s = h tau,
     W t + v tau = z + m,   kappa + q'x + v't + f'p + h'z + (x'H x + t'W t) / tau = 0,
     s z = 0,   t m = 0,   tau kappa = 0,   and s, z, t, m, tau, kappa >= 0.
 
-Its solutions are either a solution of the program (`tau > 0`) or a certificate that
-there is none (`tau = 0`).
+A solution of the embedding is either a solution of the program (`tau > 0`) or a
+certificate that the program has no solution (`tau = 0`).
 
 Source: Andersen and Ye, 1999; Goulart and Chen, 2024 (with a quadratic cost).
 """
@@ -20,9 +20,11 @@ from ._form import AbstractForm, both, Scaling, Sides, signed
 
 
 class Iterate(NamedTuple):
-    """A point of the embedding, or a direction. All vectors stand in one, so that what
-    is done to each of their entries is one loop: `x, p, z, s`, and `t, m` if there are
-    soft sides."""
+    """A point of the embedding, or a direction.
+
+    All vectors are in one, so that an operation on all entries compiles to one loop:
+    `x, p, z, s`, and `t, m` if there are soft sides.
+    """
 
     v: Array
     tau: Scalar
@@ -30,7 +32,7 @@ class Iterate(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """What is left of each line of the embedding, and how far it is from the ends."""
+    """The residual of each line of the embedding, and the errors of the end tests."""
 
     x: Array
     p: Array
@@ -40,19 +42,20 @@ class Residuals(NamedTuple):
     Hx: Array
     products: Scalar  # s'z + t'm + tau kappa
     linear: Scalar
-    """The worst of the lines `x` and `p` over what is allowed, times tau."""
+    """The larger of the errors of the lines `x` and `p`, relative to the tolerance,
+    times tau."""
     measured: Array
-    """Of the program in the units of the user: what is left of the primal and the dual,
-    the complementarity, and the gap."""
+    """The primal residual, the dual residual, the complementarity and the gap of the
+    program, in the units of the user."""
     errors: Array
-    """The worst of them over what is allowed; that of the certificate that the program
-    is infeasible, and of the one that it is unbounded."""
+    """The largest of these relative to the tolerance, and the errors of the certificates
+    that the program is infeasible and that it is unbounded."""
     gains: Array
     """The support of the first certificate and the slope of the second, scaled."""
 
 
 class Tolerances(NamedTuple):
-    """Residuals may be `atol + rtol * scale`; those of a certificate `certificate`."""
+    """A residual may be `atol + rtol * scale`, and that of a certificate `certificate`."""
 
     atol: Array
     rtol: Array
@@ -60,7 +63,7 @@ class Tolerances(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The best point in the units of the user, and what is known of it."""
+    """The best point in the units of the user, and its residuals."""
 
     x: Array
     p: Array
@@ -73,7 +76,7 @@ class Outcome(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A program, the same one scaled, and its sides."""
+    """A program, the scaled program, and the sides of both."""
 
     form: AbstractForm
     scaled: AbstractForm
@@ -92,7 +95,7 @@ class Method(NamedTuple):
 
     @property
     def is_soft(self) -> bool:
-        """Whether a side may be violated."""
+        """Whether some side may be violated."""
         return self.form.soft is not None
 
     def apart(self, v: Array) -> list[Array]:
@@ -129,8 +132,8 @@ def _sums(*arrays: Array) -> list[Scalar]:
 
 
 def evaluated(method: Method, at: Iterate) -> Residuals:
-    """The residuals of the program as the user gave it, from which those of the
-    embedding of the scaled one follow: all scales are powers of two."""
+    """The residuals of the program in the units of the user, and those of the scaled
+    embedding, which follow from them because all scales are powers of two."""
     form, sides = method.form, method.own_sides
     D, E, R, c = method.scaling
     assert method.tolerances is not None
@@ -144,7 +147,7 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
     row = jnp.where(sides.active, both(form.rows(x)) - t_own, 0)
     left_x, left_p, over = Hx + form.q + pulled, reached - form.f, row - sides.h
     violated = jnp.where(sides.equality, over, jnp.maximum(over, 0))
-    # A direction of recession does not violate the bounds 0.
+    # A direction of recession does not violate the rows with bounds of zero.
     outward = jnp.where(sides.equality, row, jnp.maximum(row, 0))
     slack = jnp.where(sides.inequality, z * jnp.maximum(-over, 0), 0)
 
@@ -163,7 +166,7 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
         resistance = sides.W * t_own
         slack_t = jnp.where(sides.soft, resistance + sides.v - z, 0)
         left_t = jnp.where(sides.soft, slack_t * c * tau / R - m, 0)
-        # A soft side has no part in a certificate.
+        # Soft sides do not take part in a certificate.
         yielding = jnp.where(sides.soft, z, 0)
         resisted = pulled - form.rows_transposed(signed(yielding))
         (pull,) = _largest(resisted * D)
@@ -179,15 +182,15 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
     gap = square + slope + lift + push
     products = products + tau * at.kappa
 
-    # Each is compared with the terms that cancel in it.
+    # Each residual is compared with the terms that cancel in it.
     terms = jnp.max(jnp.abs(jnp.stack([square, slope, lift, push])))
     left = jnp.stack([violated, missed, dual, product, jnp.abs(gap)])
     rows, gradient = jnp.max(jnp.stack(z_terms)), jnp.max(jnp.stack(x_terms))
     scales = jnp.stack([rows, jnp.maximum(rows, p_term), gradient, terms, terms])
     errors = left / (atol + rtol * scales)
-    # A certificate is judged in the scaled problem, whose units mean nothing. It must
-    # hold with all data off by the tolerance too: what a tolerance away is feasible has
-    # a solution.
+    # A certificate is judged in the scaled problem, so that units do not matter. It must
+    # also hold after a change of all data by the tolerance, because a program that is
+    # feasible after such a change counts as solvable.
     unit = c * tau
     gains = jnp.stack([lift + support, slope])
     relaxed = unit * (gains + (atol + rtol) * jnp.stack([p_size + z_size, x_size]))

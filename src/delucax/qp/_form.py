@@ -1,9 +1,9 @@
-"""What the interior-point method asks of a quadratic program.
+"""The interface between a quadratic program and the interior-point method.
 
-Minimise `1/2 x'H x + q'x` over `F x = f` and `lower <= G x <= upper`. Each row has two
-sides, the upper and the lower one, in this order on an axis in front. A side without a
-finite bound takes no part. Where both bounds of a row are equal, its upper side is an
-equation. A soft side may be violated by `t >= 0` at the cost `v t + 1/2 W t^2`.
+Minimise `1/2 x'H x + q'x` such that `F x = f` and `lower <= G x <= upper`. Each row has
+two sides, the upper and the lower one, in this order on a leading axis. A side without
+a finite bound does not take part. If both bounds of a row are equal, its upper side is
+an equation. A soft side may be violated by `t >= 0` at the cost `v t + 1/2 W t^2`.
 """
 
 from abc import abstractmethod
@@ -17,8 +17,8 @@ from .._typing import Array, Scalar
 
 
 class Scaling(NamedTuple):
-    """The scaled problem has the unknowns `x / primal`, its equations are multiplied by
-    `equations`, its rows by `rows`, and its cost by `cost`; all are powers of two."""
+    """The factors of the scaled problem, all powers of two. Its unknowns are
+    `x / primal`. Its equations, rows and cost are multiplied by the other three."""
 
     primal: Array
     equations: Array
@@ -29,7 +29,7 @@ class Scaling(NamedTuple):
 class Sides(NamedTuple):
     """The sides of all rows: `G x <= upper` and `-G x <= -lower`."""
 
-    h: Array  # the bound; 0 where there is none
+    h: Array  # the bound, or 0 without a bound
     inequality: Array
     equality: Array
     soft: Array  # may be violated
@@ -39,7 +39,7 @@ class Sides(NamedTuple):
 
     @property
     def active(self) -> Array:
-        """The sides that take part."""
+        """The sides that take part in the program."""
         return self.inequality | self.equality
 
     def scaled(self, scaling: Scaling) -> "Sides":
@@ -49,9 +49,9 @@ class Sides(NamedTuple):
 
 
 class AbstractForm(eqx.Module):
-    """The arrays of a program, and what is linear algebra of its own structure.
+    """The arrays of a program, and the linear algebra that uses its structure.
 
-    All methods take one vector.
+    All methods act on a single vector, not on batches.
     """
 
     q: eqx.AbstractVar[Array]
@@ -59,8 +59,7 @@ class AbstractForm(eqx.Module):
     lower: eqx.AbstractVar[Array]
     upper: eqx.AbstractVar[Array]
     soft: eqx.AbstractVar[tuple[Array, Array] | None]
-    """The weights `v` and `W` of both sides of each row; infinite where a side is hard.
-    """
+    """The weights `v` and `W` of both sides of each row; infinite for hard sides."""
 
     __repr__ = shown
 
@@ -86,23 +85,23 @@ class AbstractForm(eqx.Module):
 
     @abstractmethod
     def factorise(self, weight: Array) -> Any:
-        """The factors of `[[H + G'diag(weight)G, F'], [F, 0]]`, regularised."""
+        """The factors of the regularised `[[H + G'diag(weight)G, F'], [F, 0]]`."""
 
     @abstractmethod
     def solve(self, factors: Any, x: Array, p: Array) -> tuple[Array, Array]:
-        """The solution for one right side."""
+        """Solve the factorised system for one right side `(x, p)`."""
 
     @abstractmethod
     def equilibrated(self) -> tuple["AbstractForm", Scaling]:
-        """The same problem with rows and columns of similar size, but for its bounds
-        and weights, which are those of `Sides.scaled`."""
+        """The problem with rows and columns of similar size, and its scaling. The bounds
+        and weights are not scaled: `Sides.scaled` does it."""
 
     def meaningful(self, sides: Sides) -> Sides:
-        """The sides that the method takes, of all."""
+        """The sides that the method uses; by default all."""
         return sides
 
     def admissible(self, x: Array, p: Array) -> tuple[Array, Array]:
-        """A vector without the entries that stand for nothing."""
+        """The vector with zeros in the entries that the form does not use."""
         return x, p
 
     def sides(self) -> Sides:
@@ -111,9 +110,9 @@ class AbstractForm(eqx.Module):
         finite = jnp.isfinite(bounds)
         equal = finite[0] & (self.lower == self.upper)
         if self.soft is not None:
-            # A soft equation may be violated on either side, each with its price.
+            # A soft equation may be violated on both sides, so it is two inequalities.
             equal = equal & ~_are_soft(*self.soft)[0]
-        # An equation stands once, at the upper side.
+        # An equation takes part once, as the upper side.
         equality = jnp.stack([equal, jnp.zeros_like(equal)])
         inequality = finite & ~equal
         h = jnp.where(inequality | equality, bounds, 0)
@@ -126,7 +125,7 @@ class AbstractForm(eqx.Module):
         return Sides(h, inequality, equality, soft, soft & (v > 0), v, W)
 
     def cost(self, x: Array) -> Scalar:
-        """The cost, soft sides included."""
+        """The cost, with the violations of soft sides."""
         cost = jnp.sum(x * (self.hessian(x) / 2 + self.q))
         if self.soft is None:
             return cost
@@ -140,10 +139,10 @@ def _are_soft(v: Array, W: Array) -> Array:
 
 
 def both(row: Array) -> Array:
-    """The rows as the two sides see them."""
+    """The values of the rows for the upper and the lower side."""
     return jnp.stack([row, -row])
 
 
 def signed(z: Array) -> Array:
-    """The sum over both sides of what acts on a row."""
+    """The multiplier of each row: that of the upper minus that of the lower side."""
     return z[0] - z[1]

@@ -1,8 +1,8 @@
-"""The interior-point method: one loop for every form of a program.
+"""The interior-point method, for every form of a program.
 
 The violation `t` of a soft side and its multiplier `m` are eliminated, so that a soft
-side costs no more than a hard one: in a linear step it is a spring of compliance
-`1 / (W + m / t)`, in series with `s / z`, that of the barrier.
+side takes no more time than a hard side. In a linear step it is a spring with the
+compliance `1 / (W + m / t)`, in series with the compliance `s / z` of the barrier.
 
 Source: Mehrotra, 1992.
 """
@@ -20,16 +20,16 @@ from ._form import AbstractForm, both, Sides, signed
 
 
 _TO_BOUNDARY = 0.99
-"""The share of the step to the boundary that is taken."""
+"""The taken share of the step to the boundary."""
 _NEGLIGIBLE = 1e-2
-"""So much of the tolerance is no reason to refine a linear system."""
+"""An error of this share of the tolerance is no reason to refine a linear system."""
 _PATIENCE = 5
-"""It ends after so many steps without a better iterate: rounding is reached."""
+"""The method ends after this many steps without a better iterate, because of rounding."""
 
 
 class System(NamedTuple):
-    """The linear system of a step: its factors, and the compliance of each side, as it
-    is and as it is factorised."""
+    """The linear system of a step: its factors, and the compliance of each side, exact
+    and regularised for the factorisation."""
 
     factors: object
     compliance: Array
@@ -38,8 +38,8 @@ class System(NamedTuple):
 
 def assembled(form: AbstractForm, sides: Sides, compliance: Array) -> System:
     """Factorise `[[H, F', G'], [F, 0, 0], [G, 0, -compliance]]`."""
-    # An equation has no compliance, which refinement restores. Its rate is the sum of
-    # this and of rounding over this, in the scaled problem.
+    # The compliance of an equation is zero. It is factorised with a small one, and
+    # refinement removes the error, at a rate of `soft` plus rounding over `soft`.
     soft = jnp.asarray(jnp.finfo(form.q.dtype).eps ** 0.5, form.q.dtype)
     compliance = jnp.where(sides.equality, 0, compliance)
     regularised = jnp.where(sides.equality, soft, compliance)
@@ -49,7 +49,7 @@ def assembled(form: AbstractForm, sides: Sides, compliance: Array) -> System:
 
 
 def solved(form, sides: Sides, system: System, right, passes: Array | int):
-    """The solution `(x, p, z)` of the linear system, in so many passes."""
+    """The solution `(x, p, z)` of the linear system, after some refinement passes."""
     active = sides.active
 
     def once(right):
@@ -68,11 +68,11 @@ def solved(form, sides: Sides, system: System, right, passes: Array | int):
         left = jax.tree.map(lambda a, b: a - b, right, made)
         return *left[:2], jnp.where(active, left[2], 0)
 
-    # The solver stands in the program once, for the solution and its refinements.
+    # A loop, so that the solve is compiled once for the solution and its refinements.
     def refine(k, carry):
         solution, left = carry
         solution = jax.tree.map(lambda a, b: a + b, solution, once(left))
-        # The error of the last solution is not of interest.
+        # The error of the last solution is not needed.
         return solution, lax.cond(k + 1 < passes, error, lambda _: right, solution)
 
     start = jax.tree.map(jnp.zeros_like, right), right
@@ -80,8 +80,8 @@ def solved(form, sides: Sides, system: System, right, passes: Array | int):
 
 
 def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, passes):
-    """Mehrotra's step: the direction, its length, the share of the residuals that it
-    aims to remove, and the direction of tau."""
+    """A step of Mehrotra's method: the direction, its length, the share of the residuals
+    that it removes if it is taken in full, and the direction of tau."""
     form, sides, is_soft = method.scaled, method.sides, method.is_soft
     inequality, hinge = sides.inequality, sides.hinge
     guessing = guess.left > 0
@@ -92,7 +92,7 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
     e = stay = jnp.zeros((), z.dtype)
     t_or_1 = jnp.ones((), z.dtype)
     if is_soft:
-        # Of the violation, which the multiplier m keeps at zero with stiffness m / t.
+        # The violation t is a spring too. Its multiplier m adds the stiffness m / t.
         m, t_or_1 = jnp.where(hinge, m, 0), jnp.where(sides.soft & ~first, t, 1)
         stay = m / t_or_1
         stiffness = jnp.where(sides.soft, sides.W + stay, 1)
@@ -124,7 +124,7 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
     values = method.joined(form.q, form.f, z, s, t, m)
 
     def solve(lines, rt, rs, rm):
-        """The change of all vectors, for the right sides of the lines of `x, p, z`, of
+        """The change of all vectors, from the right sides of the lines of `x, p, z` and
         `t`, and of the products `s z` and `t m`. The last three are eliminated."""
         x, p, r = lines
         r = r - rs / z
@@ -140,8 +140,8 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
         dm = jnp.where(hinge, rm - stay * dt, 0)
         return method.joined(dx, dp, dz, ds, dt, dm)
 
-    # Three right sides in turn, that of tau, the affine one, and the one with a
-    # second-order correction: so all that follows stands in the program once.
+    # A loop over three right sides, so that the solve is compiled once: that of tau, the
+    # affine one, and the one with the second-order correction.
     def turn(k, carry):
         along, d, sigma, _ = carry
         is_tau = k == 0
@@ -160,7 +160,7 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
             rm = jnp.where(hinge & ~is_tau, aim - t * m - dt * dm, 0)
         change = solve(lines, rt, rs, rm)
         along = pick(change, along)
-        # The curvature of the last line along tau is a sum of squares.
+        # The slope of the last line along tau is a sum of squares.
         ax, _, az, _, a_t, _ = method.apart(along)
         off = x / tau - ax
         springs = barrier * az**2
@@ -180,15 +180,15 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
     none = jnp.zeros_like(at.v)
     nothing = jnp.zeros((), z.dtype)
     start = none, Iterate(none, nothing, nothing), nothing, nothing
-    # A start needs the first one alone.
+    # A start and a guess need the first right side only.
     turns = jnp.where(first, 1, 3)
     along, d, sigma, length = lax.fori_loop(0, turns, turn, start)
     return d, jnp.minimum(_TO_BOUNDARY * length, 1), 1 - sigma, along
 
 
 def begun(method: Method, along: Array) -> Iterate:
-    """A start: with unit weights the direction of tau solves the problem with squares
-    for the inequalities, of which `s = -z`."""
+    """The start of the method. With unit weights, the direction of tau solves the
+    problem with squared violations instead of inequalities, and `s = -z`."""
     sides = method.sides
     x, p, z, *_ = method.apart(along)
     s, one = interior(-z, sides.inequality), jnp.ones((), along.dtype)
@@ -198,9 +198,12 @@ def begun(method: Method, along: Array) -> Iterate:
 
 
 def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> Outcome:
-    """Try a guess of the active sides and what follows from it; then, if none of them
-    gives the solution, run the method from its own start. With the sides that are
-    active at its end one more linear system gives the solution up to rounding."""
+    """Solve a program.
+
+    First try a guess of the active sides and the guesses that follow from it. If none
+    gives the solution, run the method from its own start. At its end, one more linear
+    system for the active sides gives the solution up to rounding.
+    """
     sides, dtype = method.sides, method.form.q.dtype
     count = 1 + jnp.sum(sides.inequality) + jnp.sum(sides.hinge)
     rounding = jnp.finfo(dtype).eps
@@ -217,8 +220,8 @@ def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> 
         pick = lambda a, b, c: jnp.where(guessing, a, jnp.where(first, b, c))
         at = jax.tree.map(pick, point, begin, moved)
         left = evaluated(method, at)
-        # Where a residual is larger than it should be, rounding is: from now on the
-        # linear systems are refined once more.
+        # A residual that is larger than expected is a sign of rounding. From now on the
+        # linear systems get one more refinement.
         fresh = first | guessing
         expected = jnp.where(fresh, jnp.inf, (1 - length * share) * before)
         rounded = left.linear > 1.5 * expected + _NEGLIGIBLE * at.tau
@@ -229,7 +232,7 @@ def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> 
         best, known = jax.tree.map(
             lambda a, b: jnp.where(better, a, b), (at, now), (best, known)
         )
-        # While the products fall, an error may rise for a while.
+        # An error may increase for a while, as long as the products decrease.
         falls = left.products > count * rounding * at.tau**2
         since = jnp.where(better | fresh, 0, since + ~falls)
         ends = (jnp.min(known[1]) <= 1) & (guessing | (known[1][0] > 1))
@@ -260,7 +263,7 @@ def minimise(method: Method, guess: Guess, max_steps: int, refinements: int) -> 
 
 
 def interior(z: Array, on: Array) -> Array:
-    """`z` where all entries are well positive, else moved until they are."""
+    """`z` if all its entries are positive, else `z` shifted until they are."""
     least = jnp.min(jnp.where(on, z, jnp.inf), initial=jnp.inf)
     shift = jnp.where(least > 0, 0, 1 - least)
     return jnp.where(on, z + jnp.where(jnp.isfinite(shift), shift, 0), 0)

@@ -1,4 +1,4 @@
-"""What a solver of quadratic programs returns."""
+"""The solution of a quadratic program."""
 
 import equinox as eqx
 
@@ -10,29 +10,31 @@ from ._staged_problem import StagedMultipliers
 
 
 class Solution(eqx.Module):
-    """What the method found: a solution, or a proof that there is none.
+    r"""The solution of a quadratic program, or a certificate that it has none.
 
-    Where `result` is `RESULTS.no_feasible_point`, the multipliers are the certificate:
-    those of inequalities are not negative, `E'equalities + G'(upper - lower)` is zero,
-    and the sum of each multiplier times its bound is -1, which no feasible point
-    allows. `x` and `u` are NaN, and `cost` is infinite. Where it is
-    `RESULTS.unbounded`, `x` and `u` are a direction that keeps within all constraints,
-    along which the Hessian is zero and the cost falls by 1 each unit; the multipliers
-    are NaN.
+    If `result` is `RESULTS.no_feasible_point`, the multipliers are a certificate. The
+    multipliers of inequalities are not negative, their combination of the constraints,
+    $E^\top y + G^\top (\mu_\mathrm{upper} - \mu_\mathrm{lower})$, is zero, and the same
+    combination of the bounds is $-1$. This contradicts any feasible point. `x` and `u`
+    are NaN, and `cost` is infinite.
+
+    If `result` is `RESULTS.unbounded`, `x` and `u` are a direction. It stays within all
+    constraints, the Hessian is zero along it, and the linear cost decreases by 1 per
+    unit. The multipliers are NaN, and `cost` is minus infinity.
 
     **Attributes:**
 
-    - `x`: the variables, shape `(n,)`; of a staged program the states, `(T+1, n)`.
-    - `u`: the controls of a staged program, shape `(T, m)`; `None` of a dense one.
+    - `x`: the variables, shape `(n,)`; for a staged program the states, `(T+1, n)`.
+    - `u`: the controls of a staged program, shape `(T, m)`; `None` for a dense one.
     - `multipliers`: a [`delucax.qp.DenseMultipliers`][] or a
         [`delucax.qp.StagedMultipliers`][].
-    - `cost`: of the solution, violations of soft sides included.
+    - `cost`: the cost of the solution, with the violations of soft sides.
     - `primal_residual`: the largest violation of a constraint that is not soft.
     - `dual_residual`: the largest entry of the gradient of the Lagrangian.
     - `complementarity`: the largest product of a multiplier and its slack.
-    - `gap`: the difference of the cost and that of the dual program, absolute.
-    - `iterations`: the iterations taken, each with one factorisation.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `gap`: the absolute difference of the cost and the cost of the dual program.
+    - `iterations`: the number of iterations, each with one factorisation.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     !!! example
 
@@ -40,11 +42,13 @@ class Solution(eqx.Module):
         import delucax as dlx
         import jax.numpy as jnp
 
-        rows = dlx.qp.Rows(jnp.array([[1.0, 1.0]]), upper=5.0)
-        bounds = 2.0, 3.0
-        problem = dlx.qp.Dense(jnp.eye(2), jnp.ones(2), bounds=bounds, rows=rows)
+        problem = dlx.qp.Dense(jnp.eye(2), jnp.ones(2), bounds=(2.0, 3.0))
         solution = dlx.qp.solve(problem)
-        solution.x, solution.multipliers.bounds, solution.gap
+        solution.x, solution.cost
+        ```
+
+        ```text
+        (Array([2., 2.], dtype=float32), Array(8., dtype=float32))
         ```
     """
 

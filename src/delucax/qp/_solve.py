@@ -1,4 +1,4 @@
-"""The door of the solver of quadratic programs."""
+"""The solver of quadratic programs, and the judgement of its result."""
 
 from typing import Any
 
@@ -21,8 +21,7 @@ from ._staged_problem import Staged
 
 
 _LOOSE = 1e2
-"""Where rounding ends the iteration within so many times the tolerance, it is
-inaccurate."""
+"""If the iteration ends within this many times the tolerance, `result` is `inaccurate`."""
 
 
 def solve(
@@ -37,38 +36,45 @@ def solve(
 ) -> Solution:
     r"""Solve a convex quadratic program, or show that it has no solution.
 
-    First by guesses of the active sides, each a linear system that gives the next one,
-    which solves most programs of control in a few. Else by a predictor-corrector
-    interior-point method on the homogeneous embedding, which ends at a solution or at a
-    certificate.
+    The solver first guesses which sides of the constraints are active. Each guess gives
+    a linear system, whose solution gives the next guess. Most programs of control are
+    solved after a few guesses. If not, a predictor-corrector interior-point method on
+    the homogeneous embedding finds a solution, or a certificate that there is none.
 
     The solution is differentiable in both modes with respect to every array of the
     problem, by the implicit function theorem: sides with positive multipliers stay
-    active. The derivative is NaN where the solution is not unique, where a side is at
-    its bound with a multiplier of zero, and of a solve that failed. Residuals,
-    certificates and the start have none.
+    active. The derivative is NaN if the solution is not unique, if a side is at its
+    bound with a multiplier of zero, or if the solve failed. Residuals and certificates
+    have no derivatives, and there is none with respect to the start.
 
     **Arguments:**
 
     - `problem`: a [`delucax.qp.Dense`][] or a [`delucax.qp.Staged`][].
-    - `start`: the solution of a problem of the same shapes, whose active sides are the
-        first guess; one that is not finite is ignored. If the problem changed little,
-        one or two iterations solve it. By default the first guess is that none is
-        active.
-    - `rtol`, `atol`: each residual is at most `atol + rtol` times the size of the terms
-        that cancel in it. Both are `1e-8` by default, in single precision `1e-4`.
-    - `max_steps`: the most iterations.
-    - `refinements`: at most so many of each linear system, as rounding asks for.
-    - `throw`: raise unless there is a solution (default); if false, check `result`.
+    - `start`: the solution of a problem with the same shapes. Its active sides are the
+        first guess. If the problem has changed little, one or two iterations are
+        enough. A start that is not finite is ignored. By default the first guess is
+        that no side is active.
+    - `rtol`, `atol`: tolerances. A residual may be at most `atol + rtol * size`, with
+        the size of the terms that cancel in it. Both are `1e-8` by default, or `1e-4`
+        in single precision.
+    - `max_steps`: the largest number of iterations.
+    - `refinements`: the largest number of refinements of each linear system. They are
+        made if rounding requires them.
+    - `throw`: raise an error unless there is a solution (default). If false, check
+        `result`.
 
-    **Returns:** a [`delucax.qp.Solution`][], whose residuals are those of the problem
-    as it was given. `result` is `RESULTS.successful` if they meet the tolerance;
-    `RESULTS.no_feasible_point` or `RESULTS.unbounded` with a certificate, checked;
-    `RESULTS.inaccurate` if rounding ended the iteration near the tolerance;
-    `RESULTS.ill_posed` if the data are not finite or the cost is not convex;
-    else `RESULTS.not_converged`.
+    **Returns:** a [`delucax.qp.Solution`][], with the residuals of the problem in the
+    user's units. `result` is one of
 
-    **Raises:** `ValueError` on a wrong argument; an error at run time as `throw` says.
+    - `RESULTS.successful`: the residuals are within the tolerance.
+    - `RESULTS.no_feasible_point`, `RESULTS.unbounded`: with a certificate, which has
+        been checked.
+    - `RESULTS.inaccurate`: the iteration ended near the tolerance, but not within it.
+    - `RESULTS.ill_posed`: the data are not finite, or the cost is not convex.
+    - `RESULTS.not_converged`: in all other cases.
+
+    **Raises:** `ValueError` if an argument is wrong. With `throw`, an error at run time
+    if there is no solution.
 
     Source: Hintermueller, Ito and Kunisch, 2002 (active sides); Mehrotra, 1992;
     Andersen and Ye, 1999; Goulart and Chen, 2024.
@@ -85,6 +91,11 @@ def solve(
             return dlx.qp.solve(problem).x
 
         jax.jacobian(least)(jnp.array([-2.0, -0.5]))
+        ```
+
+        ```text
+        Array([[-0., -0.],
+               [-0., -1.]], dtype=float32)
         ```
     """
     where = "solve"
@@ -113,7 +124,7 @@ def solve(
 
 
 def as_scalar(number: Any, dtype: Any) -> Any:
-    """A number as an argument of a compiled program."""
+    """A number as a scalar argument of a compiled program."""
     if is_concrete(number):
         return np.asarray(number, dtype)
     return number.astype(dtype)
@@ -138,7 +149,7 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     x, p, z = _certified(form, point, infeasible, unbounded)
     cost = form.cost(x)
     cost = jnp.where(infeasible, jnp.inf, jnp.where(unbounded, -jnp.inf, cost))
-    # An equation has one multiplier of either sign; of its two sides one is pushed.
+    # The multiplier of an equation has either sign, which selects one of its two sides.
     equality = form.sides().equality
     lower = jnp.where(equality[0], jnp.maximum(-z[0], 0), z[1])
     upper = jnp.where(equality[0], jnp.maximum(z[0], 0), z[0])
@@ -149,7 +160,7 @@ def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
 
 
 def _fitting(problem: Dense | Staged, form: AbstractForm, start: Any) -> Any:
-    """The unknowns of a start."""
+    """Check that a start fits the problem, and return its unknowns."""
     wanted = [form.q.shape, form.f.shape, (2, *form.lower.shape)]
     try:
         unknowns = problem.unknowns(*start)
@@ -182,13 +193,13 @@ def _is_posed(problem: Dense | Staged, form: AbstractForm) -> Array:
     bounds = (jnp.where(jnp.isinf(b), 0, b) for b in (form.lower, form.upper))
     arrays = *problem.data(), form.q, form.f, *bounds
     posed = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(a) for a in arrays])))
-    # What a trace hides from the checks of the arguments.
+    # Traced bounds and weights have not been checked yet.
     posed = posed & jnp.all(form.lower < jnp.inf) & jnp.all(form.upper > -jnp.inf)
     if form.soft is not None:
         posed = posed & jnp.all(jnp.stack(form.soft) >= 0)
     for hessian in problem.hessians():
         n, size = hessian.shape[-1], jnp.max(jnp.abs(hessian), initial=0)
-        # A product C'C is semidefinite up to this.
+        # Rounding of a product C'C may make it indefinite by this much.
         slack = 100 * n * jnp.finfo(size.dtype).eps * jnp.where(size > 0, size, 1)
         L = jnp.linalg.cholesky(hessian + slack * jnp.eye(n, dtype=size.dtype))
         posed = posed & jnp.all(jnp.isfinite(L))
@@ -196,7 +207,7 @@ def _is_posed(problem: Dense | Staged, form: AbstractForm) -> Array:
 
 
 def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded: Array):
-    """The point, or the normalised certificate with NaN for what is none."""
+    """The point, or the normalised certificate, with NaN for the other unknowns."""
     sides = form.sides()
     at = lax.stop_gradient(point)
     p, z = at.p, jnp.where(sides.soft, 0, at.z)
@@ -205,7 +216,7 @@ def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded:
     dual, primal = unit(infeasible, support), unit(unbounded, slope)
 
     def either(value, certificate, is_certificate, has_none):
-        # Zero, whose derivative is that of the failed solve: NaN.
+        # A zero with the derivative of the failed solve, which is NaN.
         zero = jnp.where(jnp.isfinite(value), value, 0)
         zero = zero - lax.stop_gradient(zero)
         value = jnp.where(is_certificate, certificate + zero, value)
@@ -217,7 +228,7 @@ def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded:
 
 
 def _facts(problem: Dense | Staged, solution: Solution) -> str:
-    """Which constraint weighs most in a certificate, where it is known."""
+    """A sentence about the constraint with the largest weight in a certificate."""
     if not (solution.result == RESULTS.no_feasible_point):
         return ""
     given: Any = solution.x, solution.u, solution.multipliers
@@ -233,7 +244,10 @@ def _facts(problem: Dense | Staged, solution: Solution) -> str:
         return heights[index], tuple(map(int, index))
 
     (bound, side), (value, row) = largest(sides.h * z), largest(form.f * p)
-    # Equations, such as the steps of stages, are to blame if they alone contradict.
+    # Name an equation, such as a step, only if equations contradict each other alone.
     alone = bound <= 1e-6 * value
     where = problem.equation(*row) if alone else problem.place(*side)
-    return f"{where[0].upper()}{where[1:]} weighs most in the certificate."
+    return (
+        f"{where[0].upper()}{where[1:]} has the largest weight in the certificate of "
+        "infeasibility: relax it first."
+    )

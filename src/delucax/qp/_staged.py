@@ -1,9 +1,9 @@
-"""The staged form: a Riccati recursion solves the linear system in time linear in the
+"""The staged form. A Riccati recursion solves the linear system in time linear in the
 horizon.
 
-The unknowns are `z_k = (x_k, u_k)`, shape `(T+1, n+m)`; the last control is zero. The
-equations are `x_0 = f_0` and `x_{k+1} - A_k x_k - B_k u_k = f_{k+1}`, and their
-multipliers the costates. An entry of the start that is free has no equation.
+The unknowns are `z_k = (x_k, u_k)`, shape `(T+1, n+m)`, with a last control of zero.
+The equations are `x_0 = f_0` and `x_{k+1} - A_k x_k - B_k u_k = f_{k+1}`. Their
+multipliers are the costates. A free entry of the start has no equation.
 """
 
 import dataclasses
@@ -24,14 +24,14 @@ from ._form import AbstractForm, Scaling
 
 
 _ELIMINATED = 6
-"""So many controls are eliminated entry by entry; more of them by LAPACK."""
+"""Up to this many controls are eliminated entry by entry, more of them by LAPACK."""
 _SUMMED = 16
-"""Products of matrices with an inner dimension up to this are sums."""
+"""Matrix products with an inner dimension up to this are written as sums."""
 _PASSES = 3
 
 
 class Factors(NamedTuple):
-    """Of the recursion: the cost-to-go, the gains, and what solves for the controls."""
+    """The result of the recursion: the cost-to-go, the gains and the inverse weights."""
 
     V: Array  # (T+1, n, n)
     K: Array  # (T, m, n)
@@ -40,7 +40,7 @@ class Factors(NamedTuple):
 
 
 class StagedForm(AbstractForm):
-    """A program in stages; the first rows of each are some of its variables."""
+    """A program in stages. The first rows of each stage are bounds of variables."""
 
     H: Float[Array, "steps N N"]
     q: Float[Array, "steps N"]
@@ -55,11 +55,11 @@ class StagedForm(AbstractForm):
     """The entries of the start that are free."""
 
     def given(self, p):
-        """The costates, or what is like them, with zeros where the start is free."""
+        """The costates, or an array of their shape, with zeros for the free start."""
         return p.at[0, np.array(self.free)].set(0) if self.free else p
 
     def hessian(self, x):
-        # Symmetric: this order of the sum runs along the rows.
+        # H is symmetric, and this order of the sum reads memory along the rows.
         return _each_transposed(self.H, x)
 
     def rows(self, x):
@@ -111,8 +111,8 @@ class StagedForm(AbstractForm):
         n = self.f.shape[1]
         V, K, pivots, closed = factors
         A_t = lambda v: _each_transposed(self.F, v)
-        # With the cost-to-go 1/2 x'V x + v'x of each state. What does not depend on the
-        # recursion is computed for all stages at once.
+        # The cost-to-go of a state is 1/2 x'V x + v'x. Terms that do not depend on the
+        # recursion are computed for all stages at once.
         r, s = x[:, :n], x[:-1, n:]
         pushed = _each(V, p)
         added = _each_transposed(K, s) - r[:-1]
@@ -146,7 +146,8 @@ class StagedForm(AbstractForm):
         largest = lambda M, axis: jnp.max(jnp.abs(M), axis=axis, initial=0)
         unit = lambda size: power_of_two(lax.rsqrt(jnp.where(size > 0, size, 1)))
         D, R = jnp.ones(N, self.q.dtype), jnp.ones(self.G.shape[:2], self.q.dtype)
-        # One scale for each component at all times, so that the equations keep theirs.
+        # A component has the same scale at all times, so that the step x_{k+1} - A x_k
+        # keeps its form.
         H, general = lax.stop_gradient((largest(self.H, 0), self.G))
 
         def balance(_, scaled):
@@ -183,7 +184,7 @@ class StagedForm(AbstractForm):
 
 
 def _eliminated(matrix: Array, right: Array) -> Array:
-    """`matrix^-1 [right, I]` of a definite matrix."""
+    """`matrix^-1 [right, I]` for a definite matrix."""
     m = matrix.shape[0]
     eye = jnp.eye(m, dtype=matrix.dtype)
     right = jnp.concatenate([right, eye], axis=1)
@@ -192,8 +193,8 @@ def _eliminated(matrix: Array, right: Array) -> Array:
     if m > _ELIMINATED:
         L = jnp.linalg.cholesky(matrix, symmetrize_input=False)
         return jax.scipy.linalg.cho_solve((L, True), right)
-    # Entry by entry the loop over the stages is one compiled loop, ten times as fast as
-    # with a call of LAPACK in it. A definite matrix needs no pivoting.
+    # Without a call of LAPACK, the loop over the stages is compiled as a whole and is
+    # ten times as fast. A definite matrix needs no pivoting.
     rows = list(jnp.concatenate([matrix, right], axis=1))
     for i in range(m):
         rows[i] = rows[i] / rows[i][i]
@@ -204,7 +205,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
 
 
 def _product(a, b):
-    """`a @ b`, as a sum where it is small: the loop over stages calls no library."""
+    """`a @ b`, as a sum if it is small, so that the loop over stages calls no library."""
     if a.shape[1] > _SUMMED:
         return a @ b
     return jnp.sum(a[:, :, None] * b, axis=1)

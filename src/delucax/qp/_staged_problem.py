@@ -25,22 +25,23 @@ from ._staged import StagedForm
 
 
 Pair = tuple[Array, Array] | None
-"""The multipliers of the lower and of the upper bounds, which are not negative."""
+"""The multipliers of the lower and of the upper bounds, non-negative."""
 
 
 class StagedMultipliers(eqx.Module):
-    """Multipliers of the constraints of a staged program.
+    r"""The multipliers of the constraints of a staged program.
 
     **Attributes:**
 
-    - `costates`: of the equations, shape `(T+1, n)`: the first of `x_0 = start`, zero
-        if the start is free; of `x_{k+1} = A x_k + B u_k + d_k` at `k + 1`. The
-        derivative of the least cost with respect to `d_k` is `-costates[k + 1]`.
+    - `costates`: the multipliers of the equations, shape `(T+1, n)`. The first belongs
+        to the start, and is zero if the start is free. Entry $k + 1$ belongs to
+        $x_{k+1} = A x_k + B u_k + d_k$. The derivative of the optimal cost with respect
+        to $d_k$ is `-costates[k + 1]`.
     - `states`: a pair `(lower, upper)` of non-negative arrays of shape `(T+1, n)`;
         `None` if there are no bounds.
-    - `controls`: likewise, of shape `(T, m)`.
-    - `rows`: likewise, of shape `(T, p)`.
-    - `final_rows`: likewise, of shape `(p,)`.
+    - `controls`: a pair of arrays of shape `(T, m)`, like `states`.
+    - `rows`: a pair of arrays of shape `(T, p)`, like `states`.
+    - `final_rows`: a pair of arrays of shape `(p,)`, like `states`.
 
     !!! example
 
@@ -60,8 +61,11 @@ class StagedMultipliers(eqx.Module):
             controls=(-1.0, 1.0),
             states=(jnp.array([-jnp.inf, -0.3]), jnp.inf),
         )
-        multipliers = dlx.qp.solve(problem).multipliers
-        multipliers.costates, multipliers.controls
+        dlx.qp.solve(problem).multipliers.costates[0]
+        ```
+
+        ```text
+        Array([-15.558,  -4.702], dtype=float32)
         ```
     """
 
@@ -75,17 +79,20 @@ class StagedMultipliers(eqx.Module):
 
 
 class Staged(eqx.Module):
-    r"""A convex quadratic program in stages: minimise
+    r"""A convex quadratic program in stages: optimal control of a linear system with
+    constraints.
 
-    $$\sum_{k<T} \tfrac12 x'Q x + x'S u + \tfrac12 u'R u + q'x + r'u
-    + \tfrac12 x_T' Q_T x_T + q_T' x_T$$
+    $$\min \; \sum_{k=0}^{T-1} \left( \tfrac12 x_k^\top Q x_k + x_k^\top S u_k
+    + \tfrac12 u_k^\top R u_k + q^\top x_k + r^\top u_k \right)
+    + \tfrac12 x_T^\top Q_T x_T + q_T^\top x_T$$
 
-    along `x_{k+1} = A x_k + B u_k + d_k` from `x_0 = start`, between bounds of states
-    and controls and under general rows.
+    The constraints are $x_{k+1} = A x_k + B u_k + d_k$ from a given or free start
+    $x_0$, bounds of states and controls, and general rows.
 
-    What is given without a time axis holds at all stages. Bounds of the states hold
-    at stages 1 to T, and at 0 if the start is free: nothing can move a start that is
-    given. It takes time linear in the horizon, by a Riccati recursion.
+    An argument without a time axis holds at all stages. Bounds of the states hold at
+    stages 1 to T. They also hold at stage 0 if the start is free, but not for a given
+    start, because the program cannot change it. A Riccati recursion solves the program
+    in time linear in the horizon.
 
     **Arguments:**
 
@@ -95,24 +102,24 @@ class Staged(eqx.Module):
     - `R`: shape `(m, m)`, or `(T, m, m)`, symmetric.
     - `S`: shape `(n, m)`, or `(T, n, m)`; zero by default. `[[Q, S], [S', R]]` must be
         positive semidefinite.
-    - `d`: what is added to the next state, `(n,)` or `(T, n)`; zero by default.
+    - `d`: an offset of the next state, `(n,)` or `(T, n)`; zero by default.
     - `q`, `r`: shapes `(n,)` or `(T, n)`, and `(m,)` or `(T, m)`; zero by default.
-    - `final`: the final weight `Q_T`, shape `(n, n)`, symmetric, positive semidefinite;
+    - `final`: the final weight $Q_T$, shape `(n, n)`, symmetric, positive semidefinite;
         zero by default.
-    - `final_q`: `q_T`, shape `(n,)`; zero by default.
-    - `start`: shape `(n,)`; free by default.
-    - `horizon`: the number of stages `T`; needed if no argument has a time axis.
+    - `final_q`: $q_T$, shape `(n,)`; zero by default.
+    - `start`: $x_0$, shape `(n,)`; free by default.
+    - `horizon`: the number of stages $T$; needed if no argument has a time axis.
     - `states`: a pair `(low, high)` of numbers or arrays of shape `(n,)` or `(T+1, n)`,
         which may be infinite, or a [`delucax.qp.Soft`][]; none by default. Equal bounds
         are an equation.
-    - `controls`: likewise, of shape `(m,)` or `(T, m)`.
-    - `rows`: a [`delucax.qp.Rows`][] that holds at stages 0 to T - 1; none by default.
-    - `final_rows`: one without a `D` that holds at stage T; none by default.
+    - `controls`: bounds like `states`, of shape `(m,)` or `(T, m)`.
+    - `rows`: a [`delucax.qp.Rows`][] for stages 0 to T - 1; none by default.
+    - `final_rows`: a [`delucax.qp.Rows`][] without a `D`, for stage T; none by default.
 
-    **Raises:** `ValueError` on an array of the wrong shape, on arrays for different
-    horizons, on NaN, or infinity where a number must be finite; on bounds with nothing
-    between them, with the stage and the entry; on weights that are not symmetric and
-    positive semidefinite, with the stage.
+    **Raises:** `ValueError` if an array has the wrong shape or has NaN, if it is not
+    finite (only bounds may be infinite), if arrays are for different horizons, if there
+    is no finite number between two bounds, or if the weights are not symmetric and
+    positive semidefinite. The message names the stage and the entry.
 
     Source: Rao, Wright and Rawlings, 1998.
 
@@ -134,7 +141,13 @@ class Staged(eqx.Module):
             controls=(-1.0, 1.0),
             states=(jnp.array([-jnp.inf, -0.3]), jnp.inf),
         )
-        dlx.qp.solve(problem).u
+        dlx.qp.solve(problem).u[:3]
+        ```
+
+        ```text
+        Array([[-1.   ],
+               [-1.   ],
+               [-0.933]], dtype=float32)
         ```
     """
 
@@ -181,7 +194,7 @@ class Staged(eqx.Module):
         final_rows: Rows | None = None,
     ):
         where = "Staged"
-        # What is given is only checked here; `form` computes with it.
+        # The arguments are only checked here. `form` computes with them.
         matrices = dict(A=A, B=B, Q=Q, R=R, S=S)
         vectors = dict(d=d, q=q, r=r, final_q=final_q, start=start)
         given = {
@@ -239,7 +252,7 @@ class Staged(eqx.Module):
                 )
 
     def form(self) -> StagedForm:
-        """The arrays for the method."""
+        """The program as the method takes it."""
         T, (n, m) = self.horizon, self.B.shape[-2:]
         dtype = jnp.result_type(*jax.tree.leaves(self))
 
@@ -270,7 +283,7 @@ class Staged(eqx.Module):
         return StagedForm(*parts)
 
     def _sides(self, stages: Any) -> tuple[Array, list[Limits]]:
-        """The matrix of the general rows, and the bounds of all."""
+        """The matrix of the general rows, and the limits of all rows."""
         T, (n, m) = self.horizon, self.B.shape[-2:]
         dtype = jnp.result_type(*jax.tree.leaves(self))
         none = lambda steps, size: _unlimited(steps, size, dtype)
@@ -304,7 +317,7 @@ class Staged(eqx.Module):
         return [array for array in data if array is not None]
 
     def hessians(self) -> list[Array]:
-        """The matrices that must be semidefinite, a stack where they vary in time."""
+        """The matrices that must be semidefinite; a stack if they vary in time."""
         S = jnp.zeros(self.B.shape[-2:]) if self.S is None else self.S
         leading = jnp.broadcast_shapes(*(M.shape[:-2] for M in (self.Q, S, self.R)))
         full = lambda M: jnp.broadcast_to(M, (*leading, *M.shape[-2:]))
@@ -313,12 +326,12 @@ class Staged(eqx.Module):
         return [stage] if self.final is None else [stage, self.final]
 
     def primal(self, x: Array) -> tuple[Array, Array]:
-        """The variables and the controls of the unknowns `x` of the form."""
+        """The states and the controls of the unknowns `x` of the form."""
         n = self.B.shape[-2]
         return x[:, :n], x[:-1, n:]
 
     def _parts(self, at: Array) -> list[Array | None]:
-        """Of an array like a side of the form: states, controls, rows, final rows."""
+        """The states, controls, rows and final rows of an array like a side."""
         n, m = self.B.shape[-2:]
         k, parts = 0, []
         for limits, size, stages in (
@@ -332,8 +345,8 @@ class Staged(eqx.Module):
         return [*parts, along, end]
 
     def multipliers(self, p: Array, sides: Array) -> StagedMultipliers:
-        """The multipliers `p` of the equations and those of the `sides` of the form,
-        the upper ones first, by name."""
+        """The multipliers by name, from those of the equations, `p`, and those of the
+        `sides` of the form, upper sides first."""
         upper, lower = map(self._parts, sides)
         pairs: Any = zip(lower, upper, strict=True)
         return StagedMultipliers(p, *(None if a is None else (a, b) for a, b in pairs))
@@ -341,8 +354,8 @@ class Staged(eqx.Module):
     def unknowns(
         self, x: Array, u: Array, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns of the form and its multipliers, of `x`, `u` and `multipliers`
-        as a solution has them."""
+        """The unknowns and multipliers of the form, from `x`, `u` and `multipliers` of a
+        solution."""
         y = multipliers
         x = jnp.concatenate([x, jnp.pad(u, ((0, 1), (0, 0)))], axis=1)
 
@@ -362,11 +375,11 @@ class Staged(eqx.Module):
         return x, y.costates, jnp.stack([side(1), side(0)])
 
     def equation(self, stage: int, row: int) -> str:
-        """The words for the equation in `row` of a `stage` of the form."""
+        """The words for an equation of a `stage`, for an error message."""
         return f"entry {row} of the step to stage {stage}" if stage else "the start"
 
     def place(self, side: int, stage: int, row: int) -> str:
-        """The words for a `side` (1 is the lower one) of a `row` of a `stage`."""
+        """The words for a `side` (1 is the lower one) of a `row`, for an error message."""
         n, m = self.B.shape[-2:]
         end = "lower" if side else "upper"
         for name, limits, size in (("x", self.states, n), ("u", self.controls, m)):
@@ -384,7 +397,7 @@ def _unlimited(steps: int, size: int, dtype: Any) -> Limits:
 
 
 def _joined(parts: list[Limits], axis: int = 0) -> Limits:
-    """Bounds of some stages after those of others."""
+    """Concatenate bounds, by default along the stages."""
     low = jnp.concatenate([part.low for part in parts], axis)
     high = jnp.concatenate([part.high for part in parts], axis)
     weights = stacked_weights(parts, axis)

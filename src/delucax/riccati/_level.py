@@ -20,7 +20,7 @@ from ._residual import stationary
 
 
 _LOOSE = {4: 1e-3, 8: 1e-6}
-"""The default tolerance of a level if `X` has a pole at it, by the bytes of a number."""
+"""The default tolerance of a level at which `X` has a pole, by the bytes of a float."""
 _WIDEST = 1e18
 """The search gives up this factor away from its start."""
 _FACTOR = 4.0
