@@ -74,14 +74,14 @@ def test_an_infeasible_program_says_where():
         A, B, Q, R, horizon=3, start=np.ones(2), controls=(-0.1, 0.1), states=(-9, 0.5)
     )
     with pytest.raises(
-        RuntimeError, match="The constraints cannot all hold.* at stage 1 weighs"
+        RuntimeError, match="The constraints cannot all hold.* at stage 1 contributes"
     ):
         dlx.qp.solve(problem)
 
 
 def test_equations_that_contradict_each_other_are_named():
     problem = Dense(Q, [1, 2], equalities=(np.ones((2, 2)), [1.0, 2.0]))
-    with pytest.raises(RuntimeError, match="Row . of equalities weighs most"):
+    with pytest.raises(RuntimeError, match="Row . of equalities contributes most"):
         dlx.qp.solve(problem)
 
 

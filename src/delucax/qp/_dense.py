@@ -15,7 +15,7 @@ from ._form import AbstractForm, Scaling
 
 
 _PASSES = 4
-"""The passes of the equilibration. Each takes the square root of the remaining ratio."""
+"""The passes of the equilibration. Each scales by a square root of the sizes."""
 
 
 class Factors(NamedTuple):

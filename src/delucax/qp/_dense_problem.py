@@ -195,8 +195,8 @@ class Dense(eqx.Module):
     def unknowns(
         self, x: Array, u: None, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns and multipliers of the form, from `x`, `u` and `multipliers` of a
-        solution."""
+        """The unknowns and multipliers of the form, from those of a solution: `x`, `u`
+        and `multipliers`."""
         del u
         parts = [p for p in (multipliers.bounds, multipliers.rows) if p is not None]
         empty = jnp.zeros(0, self.q.dtype)
@@ -209,7 +209,7 @@ class Dense(eqx.Module):
         return f"row {row} of equalities"
 
     def place(self, side: int, row: int) -> str:
-        """The words for a `side` (1 is the lower one) of a `row`, for an error message."""
+        """The words for a `side` (1 is the lower one), for an error message."""
         n = 0 if self.bounds is None else self.q.shape[0]
         end = "lower" if side else "upper"
         return f"the {end} bound of " + (f"x[{row}]" if row < n else f"row {row - n}")

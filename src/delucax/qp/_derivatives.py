@@ -132,9 +132,8 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
     spring = violated & (sides.W > 0)
 
     def conditions(form):
-        """The gradient of the Lagrangian, the equations, the rows that are held, and the
-        multipliers of violated sides with a linear weight only, which are the weights.
-        """
+        """The gradient of the Lagrangian, the equations, the held rows, and the weights
+        that are the multipliers of violated sides without a quadratic weight."""
         sides = form.sides()
         pushed = jnp.where(violated & ~spring, sides.v, z)
         act = form.rows_transposed(signed(pushed)) + form.equations_transposed(p)

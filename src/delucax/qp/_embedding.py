@@ -48,14 +48,14 @@ class Residuals(NamedTuple):
     """The primal residual, the dual residual, the complementarity and the gap of the
     program, in the units of the user."""
     errors: Array
-    """The largest of these relative to the tolerance, and the errors of the certificates
-    that the program is infeasible and that it is unbounded."""
+    """The largest of these, relative to the tolerance, and the errors of the
+    certificates that the program is infeasible and that it is unbounded."""
     gains: Array
     """The support of the first certificate and the slope of the second, scaled."""
 
 
 class Tolerances(NamedTuple):
-    """A residual may be `atol + rtol * scale`, and that of a certificate `certificate`."""
+    """A residual may be `atol + rtol * scale`; `certificate` is for certificates."""
 
     atol: Array
     rtol: Array
@@ -188,9 +188,9 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
     rows, gradient = jnp.max(jnp.stack(z_terms)), jnp.max(jnp.stack(x_terms))
     scales = jnp.stack([rows, jnp.maximum(rows, p_term), gradient, terms, terms])
     errors = left / (atol + rtol * scales)
-    # A certificate is judged in the scaled problem, so that units do not matter. It must
-    # also hold after a change of all data by the tolerance, because a program that is
-    # feasible after such a change counts as solvable.
+    # A certificate is judged in the scaled problem, so that units do not matter. It
+    # must also hold after a change of all data by the tolerance, because a program that
+    # is feasible after such a change counts as solvable.
     unit = c * tau
     gains = jnp.stack([lift + support, slope])
     relaxed = unit * (gains + (atol + rtol) * jnp.stack([p_size + z_size, x_size]))

@@ -93,8 +93,8 @@ class AbstractForm(eqx.Module):
 
     @abstractmethod
     def equilibrated(self) -> tuple["AbstractForm", Scaling]:
-        """The problem with rows and columns of similar size, and its scaling. The bounds
-        and weights are not scaled: `Sides.scaled` does it."""
+        """The problem with rows and columns of similar size, and its scaling. Bounds
+        and weights are not scaled here, but by `Sides.scaled`."""
 
     def meaningful(self, sides: Sides) -> Sides:
         """The sides that the method uses; by default all."""

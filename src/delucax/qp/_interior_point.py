@@ -24,7 +24,7 @@ _TO_BOUNDARY = 0.99
 _NEGLIGIBLE = 1e-2
 """An error of this share of the tolerance is no reason to refine a linear system."""
 _PATIENCE = 5
-"""The method ends after this many steps without a better iterate, because of rounding."""
+"""The method ends after this many steps without a better iterate."""
 
 
 class System(NamedTuple):
@@ -80,8 +80,8 @@ def solved(form, sides: Sides, system: System, right, passes: Array | int):
 
 
 def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, passes):
-    """A step of Mehrotra's method: the direction, its length, the share of the residuals
-    that it removes if it is taken in full, and the direction of tau."""
+    """A step of Mehrotra's method: the direction, its length, the share of the
+    residuals that a full step removes, and the direction of tau."""
     form, sides, is_soft = method.scaled, method.sides, method.is_soft
     inequality, hinge = sides.inequality, sides.hinge
     guessing = guess.left > 0
@@ -140,8 +140,8 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
         dm = jnp.where(hinge, rm - stay * dt, 0)
         return method.joined(dx, dp, dz, ds, dt, dm)
 
-    # A loop over three right sides, so that the solve is compiled once: that of tau, the
-    # affine one, and the one with the second-order correction.
+    # A loop over three right sides, so that the solve is compiled once: that of tau,
+    # the affine one, and the one with the second-order correction.
     def turn(k, carry):
         along, d, sigma, _ = carry
         is_tau = k == 0

@@ -21,7 +21,7 @@ from ._staged_problem import Staged
 
 
 _LOOSE = 1e2
-"""If the iteration ends within this many times the tolerance, `result` is `inaccurate`."""
+"""A result within this many times the tolerance is `inaccurate`, not a failure."""
 
 
 def solve(
@@ -228,7 +228,7 @@ def _certified(form: AbstractForm, point: Outcome, infeasible: Array, unbounded:
 
 
 def _facts(problem: Dense | Staged, solution: Solution) -> str:
-    """A sentence about the constraint with the largest weight in a certificate."""
+    """A sentence about the constraint that contributes most to a certificate."""
     if not (solution.result == RESULTS.no_feasible_point):
         return ""
     given: Any = solution.x, solution.u, solution.multipliers
@@ -247,7 +247,4 @@ def _facts(problem: Dense | Staged, solution: Solution) -> str:
     # Name an equation, such as a step, only if equations contradict each other alone.
     alone = bound <= 1e-6 * value
     where = problem.equation(*row) if alone else problem.place(*side)
-    return (
-        f"{where[0].upper()}{where[1:]} has the largest weight in the certificate of "
-        "infeasibility: relax it first."
-    )
+    return f"{where[0].upper()}{where[1:]} contributes most to the certificate."

@@ -31,10 +31,10 @@ _PASSES = 3
 
 
 class Factors(NamedTuple):
-    """The result of the recursion: the cost-to-go, the gains and the inverse weights."""
+    """The factors of the Riccati recursion."""
 
-    V: Array  # (T+1, n, n)
-    K: Array  # (T, m, n)
+    V: Array  # (T+1, n, n), the cost-to-go
+    K: Array  # (T, m, n), the gains
     pivots: Array  # (T, m, m), the inverse of the weight of the controls
     closed: Array  # (T, n, n), A - B K
 
@@ -205,7 +205,7 @@ def _eliminated(matrix: Array, right: Array) -> Array:
 
 
 def _product(a, b):
-    """`a @ b`, as a sum if it is small, so that the loop over stages calls no library."""
+    """`a @ b`, as a sum if it is small. The loop over stages then calls no library."""
     if a.shape[1] > _SUMMED:
         return a @ b
     return jnp.sum(a[:, :, None] * b, axis=1)

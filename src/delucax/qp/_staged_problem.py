@@ -354,8 +354,8 @@ class Staged(eqx.Module):
     def unknowns(
         self, x: Array, u: Array, multipliers: Any
     ) -> tuple[Array, Array, Array]:
-        """The unknowns and multipliers of the form, from `x`, `u` and `multipliers` of a
-        solution."""
+        """The unknowns and multipliers of the form, from those of a solution: `x`, `u`
+        and `multipliers`."""
         y = multipliers
         x = jnp.concatenate([x, jnp.pad(u, ((0, 1), (0, 0)))], axis=1)
 
@@ -379,7 +379,7 @@ class Staged(eqx.Module):
         return f"entry {row} of the step to stage {stage}" if stage else "the start"
 
     def place(self, side: int, stage: int, row: int) -> str:
-        """The words for a `side` (1 is the lower one) of a `row`, for an error message."""
+        """The words for a `side` (1 is the lower one), for an error message."""
         n, m = self.B.shape[-2:]
         end = "lower" if side else "upper"
         for name, limits, size in (("x", self.states, n), ("u", self.controls, m)):
