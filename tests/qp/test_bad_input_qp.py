@@ -46,7 +46,10 @@ def crossed():
         (lambda: Staged(A, B, None, R, horizon=3), "Staged: Q must be an array"),
         (lambda: Soft(0, 1, linear=-1), "Soft: linear must be at least 0"),
         (lambda: Staged(A, B, Q, R), "Staged: horizon must be given"),
-        (lambda: Staged(A, B, stages(Q), R, horizon=4), "must have the same number of stages"),
+        (
+            lambda: Staged(A, B, stages(Q), R, horizon=4),
+            "must have the same number of stages",
+        ),
         (
             lambda: Staged(A, np.ones((3, 1)), Q, R, horizon=3),
             "A must have shape (3, 3)",

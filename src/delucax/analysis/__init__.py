@@ -1,4 +1,4 @@
-"""Analysis of linear models: poles and zeros, Gramians, norms, margins. Periodic orbits
+"""Analysis of linear models: poles, zeros, Gramians, norms and margins. Periodic orbits
 of hybrid systems."""
 
 from ._disk_margin import disk_margin as disk_margin, DiskMargin as DiskMargin

@@ -12,15 +12,16 @@ from ._state_space import LinearModel, state_space, StateSpace
 
 
 class DiskMargin(eqx.Module):
-    """The disk margin of a feedback loop.
+    r"""The disk margin of a feedback loop.
 
     **Attributes:**
 
-    - `margin`: the radius `alpha` of the disk; zero if the closed loop is not stable.
+    - `margin`: the radius $\alpha$ of the disk; zero if the closed loop is not stable.
     - `frequency`: the critical frequency, in radians per unit of time.
-    - `gain_low`, `gain_high`: the real factors between which the loop gain may lie.
+    - `gain_low`, `gain_high`: the loop stays stable if its gain is multiplied by a real
+        factor between these two.
     - `phase`: the phase change, of either sign, that the loop tolerates, in radians.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     !!! example
 
@@ -33,6 +34,10 @@ class DiskMargin(eqx.Module):
             jnp.array([[1.0, 0.0]]),
         )
         dlx.analysis.disk_margin(loop).gain_high
+        ```
+
+        ```text
+        Array(2., dtype=float32)
         ```
     """
 
@@ -54,29 +59,38 @@ def disk_margin(
     channel: int | None = None,
     throw: bool = True,
 ) -> DiskMargin:
-    r"""The disk margin: the size of simultaneous gain and phase perturbations,
+    r"""The disk margin of a loop: how much its gain and its phase may change together.
 
-    `alpha = 1 / max over omega of sigma_max(S + (skew - 1)/2 I)`, `S = (I + L)^-1`:
-    the closed loop stays stable with the loop gain multiplied by any
-    `(2 + (1 - skew) delta) / (2 - (1 + skew) delta)`, `|delta| < alpha`.
+    $$\alpha = \left( \max_\omega \sigma_{\max}
+    \left( S(j\omega) + \tfrac{\sigma - 1}{2} I \right) \right)^{-1},
+    \qquad S = (I + L)^{-1}$$
 
-    The loop `L` is the linear model from `u` to `y`, closed by `u = -y`. Of several
-    channels, all are perturbed at once by one full matrix `delta`, which is
-    conservative with respect to independent factors in each channel.
+    with the skew $\sigma$. The closed loop stays stable if the loop gain is multiplied
+    by any complex factor
+
+    $$\frac{2 + (1 - \sigma)\, \delta}{2 - (1 + \sigma)\, \delta}, \qquad
+    |\delta| < \alpha.$$
+
+    The loop $L$ is the linear model from $u$ to $y$, closed by $u = -y$. Several
+    channels are perturbed at once, by one full matrix $\delta$. For independent factors
+    in each channel this is conservative.
 
     **Arguments:**
 
     - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][], with as many controls as outputs.
-    - `skew`: 0 (default) balances `S` and `T`, 1 takes `S` and -1 takes `T`; a number.
-    - `channel`: perturb this one alone, the others being closed; all by default.
-    - `throw`: raise if the search does not converge (default); if false, check
+    - `skew`: $\sigma$, a number. 0 (default) balances the sensitivity $S$ and the
+        complementary sensitivity $T = I - S$; 1 uses $S$, and -1 uses $T$.
+    - `channel`: the index of the only channel that is perturbed, with the others
+        closed; by default all channels are.
+    - `throw`: raise an error if the search does not converge (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.analysis.DiskMargin`][].
 
     **Raises:** `ValueError` if `loop` is not linear, is time-varying or is not square,
-    or if there is no such `channel`; an error at run time as `throw` says.
+    or if there is no such `channel`. With `throw`, an error at run time if the search
+    does not converge.
 
     Source: Seiler, Packard and Gahinet, 2020.
 
@@ -89,6 +103,10 @@ def disk_margin(
         A = jnp.array([[-1.0, 0.5], [0.0, -2.0]])
         loop = dlx.systems.LinearSystem(A, jnp.eye(2), 3 * jnp.eye(2))
         dlx.analysis.disk_margin(loop).margin
+        ```
+
+        ```text
+        Array(2., dtype=float32)
         ```
     """
     where = "disk_margin"
@@ -118,18 +136,18 @@ def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     # S = I - C (s I - (A - B C))^-1 B.
     closed = StateSpace(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt)
     peak = peak_gain(closed)
-    # Finite values in the branches that are not taken keep their gradients finite.
-    # The gain is zero, and the margin infinite, where there is no loop at all.
+    # Finite values in the branches that are not taken keep gradients finite. If the
+    # loop is zero, its peak gain is zero and the margin is infinite.
     stable = xp.isfinite(peak.gain)
     usual = stable & (peak.gain > 0)
     alpha = 1 / xp.where(usual, peak.gain, 1)
-    # The extreme real factors are those at delta = -alpha and alpha.
+    # The extreme real factors have delta = -alpha and delta = alpha.
     up, down = 2 - alpha * (1 + skew), 2 + alpha * (1 + skew)
     low = (2 - alpha * (1 - skew)) / down
     bounded = up > 0
     high = (2 + alpha * (1 - skew)) / xp.where(bounded, up, 1)
-    # With a factor exp(j phase), delta is 2 tan / sqrt(1 + skew^2 tan^2) in size, tan
-    # being that of half the phase.
+    # For a factor exp(j phase), |delta| = 2 tan / sqrt(1 + skew^2 tan^2), with the
+    # tangent of half the phase.
     square = 1 - (skew * alpha / 2) ** 2
     turns = square > 0
     tangent = alpha / 2 / xp.sqrt(xp.where(turns, square, 1))

@@ -1,4 +1,4 @@
-"""Gains from inputs to outputs: at a frequency, and the H2 and H-infinity norms."""
+"""Gains of linear models: at a frequency, and the H2 and H-infinity norms."""
 
 import equinox as eqx
 from jaxtyping import ArrayLike, Complex, Float
@@ -30,21 +30,22 @@ from ._state_space import (
 def frequency_response(
     model: LinearModel, omega: ArrayLike, *, inputs: str = "controls"
 ) -> Complex[Array, "*frequencies p m"]:
-    """The complex gain `C (s I - A)^-1 B` from inputs to outputs,
+    r"""The frequency response: the complex gain from inputs to outputs.
 
-    at `s = j omega`, or in discrete time at `exp(j omega dt)`.
+    $$G(s) = C (s I - A)^{-1} B$$
 
-    Differentiable with respect to the model and to `omega`. At a frequency where a pole
-    is on the boundary of stability it is infinite.
+    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. It is infinite if
+    there is a pole at the frequency. It is differentiable with respect to the model and
+    to `omega`.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `omega`: angular frequencies, in radians per unit of time, any shape.
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `omega`: angular frequencies $\omega$, in radians per unit of time, any shape.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
 
-    **Returns:** the shape of `omega` and then `(p, m)`, complex.
+    **Returns:** a complex array, with the shape of `omega` followed by `(p, m)`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, if `omega` is
     not finite, or `inputs` is unknown.
@@ -55,14 +56,18 @@ def frequency_response(
         import delucax as dlx
         import jax.numpy as jnp
 
-        upright = dlx.linearize(dlx.systems.Pendulum())
-        gains = dlx.analysis.frequency_response(upright, jnp.logspace(-1, 2, 50))
-        decibels = 20 * jnp.log10(jnp.abs(gains[:, 0, 0]))
+        system = dlx.systems.LinearSystem(-jnp.eye(1), jnp.eye(1))
+        gains = dlx.analysis.frequency_response(system, jnp.array([0.0, 1.0]))
+        20 * jnp.log10(jnp.abs(gains[:, 0, 0]))  # in decibels
+        ```
+
+        ```text
+        Array([ 0.  , -3.01], dtype=float32)
         ```
     """
     where = "frequency_response"
     system = state_space(model, inputs, where)
-    # Infinite frequencies are refused: the response there is D alone.
+    # At infinite frequency the response is zero, so it is probably a mistake.
     array = as_float_array(omega)
     real = eqx.is_inexact_array(array) and not xp.iscomplexobj(array)
     if not real or is_concrete(array) and not bool(xp.all(xp.isfinite(array))):
@@ -83,22 +88,22 @@ def _responses(
 def dcgain(
     model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> Float[Array, "p m"]:
-    """The steady-state (DC) gain from inputs to outputs,
+    r"""The steady-state (DC) gain from inputs to outputs.
 
-    `-C A^-1 B`, or in discrete time `C (I - A)^-1 B`.
+    $$-C A^{-1} B, \quad \text{or in discrete time} \quad C (I - A)^{-1} B$$
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][]. It need not be stable.
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if there is a pole at frequency zero, an integrator (default); if
-        false, return infinity there.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `throw`: raise an error if there is a pole at frequency zero, an integrator
+        (default). If false, return infinity.
 
-    **Returns:** shape `(p, m)`.
+    **Returns:** the gain, shape `(p, m)`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
-    unknown; an error at run time as `throw` says.
+    unknown. With `throw`, an error at run time if there is an integrator.
 
     !!! example
 
@@ -108,7 +113,12 @@ def dcgain(
 
         A = jnp.array([[0.0, 1.0], [-2.0, -3.0]])
         B = jnp.array([[0.0], [1.0]])
-        dlx.analysis.dcgain(dlx.systems.LinearSystem(A, B))  # 1/2 and 0
+        dlx.analysis.dcgain(dlx.systems.LinearSystem(A, B))
+        ```
+
+        ```text
+        Array([[0.5],
+               [0. ]], dtype=float32)
         ```
     """
     gain, has_integrator = _dcgain(state_space(model, inputs, "dcgain"))
@@ -133,19 +143,19 @@ def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
 
 _LEVELS = 30
 _SWEEP = 64
-"""Frequencies to begin with, besides those of the poles."""
+"""The number of frequencies at the start, besides those of the poles."""
 _NEWTON_STEPS = 5
 
 
 class PeakGain(eqx.Module):
-    """The largest gain over all frequencies, and where it is.
+    """The largest gain of a model over all frequencies, and the frequency of the peak.
 
     **Attributes:**
 
     - `gain`: the H-infinity norm; infinite if the model is not stable.
-    - `frequency`: where the gain is largest, in radians per unit of time; of the least
-        stable pole if the model is not stable.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `frequency`: the frequency of the largest gain, in radians per unit of time. If
+        the model is not stable, it is the frequency of the least stable pole.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     `gain` and `frequency` are differentiable.
 
@@ -160,6 +170,10 @@ class PeakGain(eqx.Module):
         peak = dlx.analysis.hinf_norm(dlx.systems.LinearSystem(A, B))
         peak.gain, peak.frequency
         ```
+
+        ```text
+        (Array(14.147, dtype=float32), Array(0.999, dtype=float32))
+        ```
     """
 
     gain: Scalar
@@ -171,21 +185,21 @@ class PeakGain(eqx.Module):
 
 @host_unless_traced
 def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
-    """The H2 norm: the root of the outputs' mean square under unit white noise,
+    r"""The H2 norm: the root mean square of the outputs under unit white noise.
 
-    `sqrt(trace(C W C'))`, `W` being the controllability Gramian; the same as the root
-    of the sum, over inputs, of the energy of the outputs after an impulse.
+    $$\sqrt{\mathrm{tr}(C W C^\top)}$$
 
-    Infinite if a pole is on or outside the boundary of stability. Differentiable to any
-    order, in either mode.
+    with the controllability Gramian $W$. Its square is also the energy of the outputs
+    after a unit impulse, summed over the inputs. The norm is infinite if the model is
+    not stable. It is differentiable to any order, in either mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
 
-    **Returns:** a scalar.
+    **Returns:** the norm, a scalar.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown.
@@ -197,7 +211,11 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
         import jax.numpy as jnp
 
         A, B = jnp.array([[0.5]]), jnp.array([[1.0]])
-        dlx.analysis.h2_norm(dlx.LinearDynamics(A, B))  # sqrt(4/3)
+        dlx.analysis.h2_norm(dlx.LinearDynamics(A, B))
+        ```
+
+        ```text
+        Array(1.1547, dtype=float32)
         ```
     """
     return _h2_norm(state_space(model, inputs, "h2_norm"))
@@ -207,7 +225,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 def _h2_norm(system: StateSpace) -> Scalar:
     stable = system.is_stable()
     W = stable_gramian(system.stable_or_placeholder(stable))
-    # The square root has no derivative at zero: the branch not taken is that of 1.
+    # The square root has no derivative at zero, so the unused branch takes that of 1.
     square = xp.trace(system.C @ W @ system.C.T)
     positive = square > 0
     norm = xp.where(positive, xp.sqrt(xp.where(positive, square, 1)), 0)
@@ -218,32 +236,34 @@ def _h2_norm(system: StateSpace) -> Scalar:
 def hinf_norm(
     model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> PeakGain:
-    r"""The H-infinity norm: the largest gain that any sinusoid meets,
+    r"""The H-infinity norm: the largest gain of a model over all frequencies.
 
-    `max over omega of sigma_max(C (s I - A)^-1 B)`, at `s = j omega`, or in discrete
-    time at `exp(j omega dt)`.
+    $$\max_\omega \; \sigma_{\max} \left( C (s I - A)^{-1} B \right)$$
 
-    The frequencies at which the gain crosses a level just above the largest one so far
-    are eigenvalues of a Hamiltonian matrix. The gain is evaluated again at their
-    midpoints until no crossing remains, and Newton steps refine the peak. Infinite if a
-    pole is on or outside the boundary of stability.
+    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. It is infinite if
+    the model is not stable.
 
-    It has first and second derivatives, in either mode, where the maximum is attained
-    at one frequency in one direction alone; elsewhere the derivatives of one maximiser
-    are returned.
+    The frequencies at which the gain crosses a level are eigenvalues of a Hamiltonian
+    matrix. The search takes a level just above the largest gain so far, and evaluates
+    the gain at the midpoints between crossings, until there is no crossing. Newton
+    steps then refine the peak.
+
+    The norm has first and second derivatives, in either mode, if it is attained at one
+    frequency and in one direction only. Otherwise you get the derivatives of one
+    maximiser.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if the search does not converge (default); if false, check
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `throw`: raise an error if the search does not converge (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.analysis.PeakGain`][].
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
-    unknown; an error at run time as `throw` says.
+    unknown. With `throw`, an error at run time if the search does not converge.
 
     Source: Bruinsma and Steinbuch, 1990; Boyd and Balakrishnan, 1990.
 
@@ -258,6 +278,10 @@ def hinf_norm(
         peak = dlx.analysis.hinf_norm(system)
         peak.gain, peak.frequency
         ```
+
+        ```text
+        (Array(10.0125, dtype=float32), Array(0.9975, dtype=float32))
+        ```
     """
     peak = peak_gain(state_space(model, inputs, "hinf_norm"))
     return raise_on_failure(peak, "hinf_norm", throw)
@@ -265,25 +289,25 @@ def hinf_norm(
 
 @compiled_unless_on_host
 def peak_gain(system: StateSpace) -> PeakGain:
-    """The largest gain of a model with a feed-through `D`."""
+    """The largest gain of a model that may have a feed-through `D`."""
     poles = eigenvalues(stop_gradient(system.A))
     growth = system.growth(poles)
     stable = xp.all(growth < 0)
     safe = system.stable_or_placeholder(stable)
-    # The search is not differentiated: the peak is stationary in the frequency, so that
-    # the gain's derivatives are those at a fixed frequency (the envelope theorem).
+    # The search is not differentiated. The gain is stationary in the frequency at the
+    # peak, so its first derivatives are those at a fixed frequency.
     frozen = stop_gradient(safe)
     start, ended = _search(frozen)
     top, curvature, moves = _climb(frozen, start)
     finite = xp.isfinite(top)
     gain, slope, _ = expanded_gain(*safe.expansion(xp.where(finite, top, 1), 2))
     rise = xp.where(moves, slope - stop_gradient(slope), 0)
-    # One Newton step, numerically zero: it carries the implicit derivative of the
+    # A Newton step whose value is zero. It carries the implicit derivative of the
     # maximiser.
     step = -rise / curvature
     gain = gain + step * slope + step**2 * curvature / 2
     gain, frequency = xp.where(finite, gain, largest_gain(safe.D)), top + step
-    # An unstable model has no peak: the frequency is that of its least stable pole.
+    # An unstable model has no peak. Its frequency is that of the least stable pole.
     least = poles[xp.argmax(growth)]
     if system.dt is None:
         at_pole = xp.abs(xp.imag(least))
@@ -297,27 +321,27 @@ def peak_gain(system: StateSpace) -> PeakGain:
 
 
 def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScalar]:
-    """The peak, refined by Newton steps while the gain rises.
+    """Refine the peak by Newton steps while the gain increases.
 
-    **Returns:** its frequency, the curvature of the gain there, and whether its
-    frequency depends on the plant, which at the ends of the axis it does not.
+    **Returns:** the frequency, the curvature of the gain, and whether the frequency
+    depends on the plant. It does not at the ends of the frequency axis.
     """
     rounding = 100 * xp.finfo(omega.dtype).eps
 
     def step(_, carry):
         best, flattest, top, top_curvature, moves, trial = carry
-        # At an infinite frequency there is no slope: the placeholder 1 is not used.
+        # There is no slope at an infinite frequency. The result at 1 is not used.
         finite = xp.isfinite(trial)
         at = xp.where(finite, trial, 1)
         gain, slope, curvature = expanded_gain(*system.expansion(at, 2))
         usable = finite & (curvature < 0) & xp.isfinite(slope) & xp.isfinite(curvature)
-        # Newton's step on the slope goes up only where the curvature is negative.
+        # A Newton step increases the gain only if the curvature is negative.
         curvature = xp.where(usable, curvature, -1)
-        # Near the peak gains differ by rounding alone, and the slope decides.
+        # Near the peak gains differ only by rounding, so the slope decides.
         up = usable & (gain >= best) & (xp.abs(slope) < flattest) & (trial >= 0)
         top = xp.where(up, trial, top)
         return (
-            # Less its rounding: the next gain may be equal in exact arithmetic.
+            # Minus rounding, because the next gain may be equal in exact arithmetic.
             xp.where(up, gain * (1 - rounding), best),
             xp.where(up, xp.abs(slope), flattest),
             top,
@@ -359,12 +383,12 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     best = best_of(at_infinity, infinity, starts)
 
     def crossings(level):
-        """Frequencies of the eigenvalues of the Hamiltonian at a level.
+        """The frequencies of all eigenvalues of the Hamiltonian at a level.
 
-        Those of all eigenvalues: off the axis they are no crossings, but evaluating the
-        gain there as well is cheap and harmless.
+        Eigenvalues off the axis are not crossings, but it does no harm to evaluate the
+        gain there too.
         """
-        # A singular value of G(j omega) is `level` where j omega is an eigenvalue of H.
+        # G(j omega) has the singular value `level` if j omega is an eigenvalue of H.
         m, p = D.shape[1], D.shape[0]
         R = level**2 * xp.eye(m, dtype=D.dtype) - D.T @ D
         S = level**2 * xp.eye(p, dtype=D.dtype) - D @ D.T
@@ -372,7 +396,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         F = A + B @ solved[:, :n]
         upper, lower = level * B @ solved[:, n:], level * C.T @ lu_solve(S, C)
         H = xp.block([[F, upper], [-lower, -F.T]])
-        # Eigenvalues come in pairs, s and -s.
+        # Eigenvalues come in pairs s, -s.
         omegas = xp.sort(xp.abs(xp.imag(eigenvalues(H))))[::2]
         return xp.concatenate([xp.zeros(1, A.dtype), omegas])
 
@@ -382,7 +406,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
 
     def body(carry):
         gain_now, omega_now, _, k = carry
-        # At the level of D the Hamiltonian is not finite, and close to it not accurate.
+        # The Hamiltonian is not finite at the level of D, and not accurate close to it.
         is_close = gain_now < (1 + eps**0.375) * at_infinity
         # A smaller step would lose the crossings next to the peak in rounding.
         step = xp.where(is_close, eps**0.375, eps**0.625)

@@ -1,4 +1,4 @@
-"""Controllability and observability: Krylov matrices and Gramians."""
+"""Controllability and observability matrices and Gramians."""
 
 from jaxtyping import Float
 
@@ -15,18 +15,19 @@ from ._state_space import LinearModel, state_space, StateSpace
 def controllability_matrix(
     model: LinearModel, *, inputs: str = "controls"
 ) -> Float[Array, "n nm"]:
-    """The Krylov matrix `[B, A B, ..., A^(n-1) B]`.
+    r"""The controllability matrix $[B,\; A B,\; \dots,\; A^{n-1} B]$.
 
-    Its rank is the dimension of the controllable subspace, but ill-conditioned beyond a
-    few states: [`delucax.analysis.is_controllable`][] tests mode by mode instead.
+    Its rank is the dimension of the controllable subspace. With more than a few states
+    the matrix is ill-conditioned: to test controllability, use
+    [`delucax.analysis.is_controllable`][], which tests each mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
 
-    **Returns:** shape `(n, n m)`.
+    **Returns:** the matrix, shape `(n, n m)`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown.
@@ -39,18 +40,26 @@ def controllability_matrix(
         upright = dlx.linearize(dlx.systems.Pendulum())
         dlx.analysis.controllability_matrix(upright)
         ```
+
+        ```text
+        Array([[0., 3.],
+               [3., 0.]], dtype=float32)
+        ```
     """
     return _krylov(state_space(model, inputs, "controllability_matrix"))
 
 
 @host_unless_traced
 def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
-    """The Krylov matrix `[C; C A; ...; C A^(n-1)]`.
+    r"""The observability matrix $[C;\; C A;\; \dots;\; C A^{n-1}]$.
+
+    Its rank is $n$ if the model is observable. With more than a few states it is
+    ill-conditioned: use [`delucax.analysis.is_observable`][] instead.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
     [`delucax.LinearDynamics`][].
 
-    **Returns:** shape `(n p, n)`.
+    **Returns:** the matrix, shape `(n p, n)`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying.
 
@@ -61,6 +70,13 @@ def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
 
         upright = dlx.linearize(dlx.systems.Pendulum())
         dlx.analysis.observability_matrix(upright)
+        ```
+
+        ```text
+        Array([[ 1.,  0.],
+               [ 0.,  1.],
+               [ 0.,  1.],
+               [15.,  0.]], dtype=float32)
         ```
     """
     return _krylov(state_space(model, "controls", "observability_matrix").dual).T
@@ -74,26 +90,32 @@ def controllability_gramian(
     inputs: str = "controls",
     throw: bool = True,
 ) -> Float[Array, "n n"]:
-    """The covariance of the state under unit white noise at the inputs,
+    r"""The controllability Gramian: the covariance of the state under white noise.
 
-    the integral of `exp(A t) B B' exp(A' t)`, or in discrete time the sum of
-    `A^k B B' (A')^k`, over all time or over a horizon. `x' W^-1 x` is the least energy
-    of inputs that reach `x` from rest. Differentiable to any order, in either mode.
+    $$W = \int_0^T e^{A t} B B^\top e^{A^\top t} \,\mathrm{d}t, \quad
+    \text{or in discrete time} \quad
+    W = \sum_{k=0}^{T-1} A^k B B^\top (A^\top)^k$$
+
+    The horizon $T$ is infinite by default. The white noise acts at the inputs and has
+    unit intensity. The minimal energy of inputs that reach $x$ from rest is
+    $x^\top W^{-1} x$. $W$ is differentiable to any order, in either mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `horizon`: the time in continuous time, a positive number; the number of steps in
-        discrete time, a whole number. All time by default, which needs a stable model.
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if there is no horizon and the model is not stable (default); if
-        false, return infinity there.
+    - `horizon`: $T$: in continuous time a positive number, in units of time; in
+        discrete time a number of steps. Infinite by default, which needs a stable
+        model.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `throw`: raise an error if there is no horizon and the model is not stable
+        (default). If false, return infinity.
 
-    **Returns:** shape `(n, n)`, symmetric.
+    **Returns:** the Gramian, shape `(n, n)`, symmetric.
 
-    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `horizon`
-    or `inputs` is not as above; an error at run time as `throw` says.
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, if `horizon`
+    is not positive, or if `inputs` is unknown. With `throw`, an error at run time if
+    there is no horizon and the model is not stable.
 
     Source: Van Loan, 1978 (over a horizon).
 
@@ -104,7 +126,11 @@ def controllability_gramian(
         import jax.numpy as jnp
 
         A, B = jnp.array([[0.5]]), jnp.array([[1.0]])
-        dlx.analysis.controllability_gramian(dlx.LinearDynamics(A, B))  # 4/3
+        dlx.analysis.controllability_gramian(dlx.LinearDynamics(A, B))
+        ```
+
+        ```text
+        Array([[1.333]], dtype=float32)
         ```
     """
     where = "controllability_gramian"
@@ -115,25 +141,31 @@ def controllability_gramian(
 def observability_gramian(
     model: LinearModel, horizon: RealScalar | None = None, *, throw: bool = True
 ) -> Float[Array, "n n"]:
-    """The energy `x' W x` of the outputs from a state `x`,
+    r"""The observability Gramian: it gives the energy of the outputs after a start.
 
-    `W` being the integral of `exp(A' t) C' C exp(A t)`, or in discrete time the sum of
-    `(A')^k C' C A^k`, over all time or over a horizon. Differentiable to any order, in
-    either mode.
+    $$W = \int_0^T e^{A^\top t} C^\top C e^{A t} \,\mathrm{d}t, \quad
+    \text{or in discrete time} \quad
+    W = \sum_{k=0}^{T-1} (A^\top)^k C^\top C A^k$$
+
+    The horizon $T$ is infinite by default. From the state $x$ and without inputs, the
+    energy of the outputs is $x^\top W x$. $W$ is differentiable to any order, in either
+    mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `horizon`: the time in continuous time, a positive number; the number of steps in
-        discrete time, a whole number. All time by default, which needs a stable model.
-    - `throw`: raise if there is no horizon and the model is not stable (default); if
-        false, return infinity there.
+    - `horizon`: $T$: in continuous time a positive number, in units of time; in
+        discrete time a number of steps. Infinite by default, which needs a stable
+        model.
+    - `throw`: raise an error if there is no horizon and the model is not stable
+        (default). If false, return infinity.
 
-    **Returns:** shape `(n, n)`, symmetric.
+    **Returns:** the Gramian, shape `(n, n)`, symmetric.
 
-    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `horizon`
-    is not as above; an error at run time as `throw` says.
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or if
+    `horizon` is not positive. With `throw`, an error at run time if there is no horizon
+    and the model is not stable.
 
     Source: Van Loan, 1978 (over a horizon).
 
@@ -146,6 +178,10 @@ def observability_gramian(
         A, B = jnp.array([[-1.0]]), jnp.array([[1.0]])
         system = dlx.systems.LinearSystem(A, B)
         dlx.analysis.observability_gramian(system, horizon=2.0)
+        ```
+
+        ```text
+        Array([[0.491]], dtype=float32)
         ```
     """
     where = "observability_gramian"
@@ -163,7 +199,7 @@ def _gramian(
     W, stable = _gramian_of_all_time(system)
     message = (
         f"{where}: the model must be stable for a Gramian over all time. Give a "
-        "horizon, or pass throw=False for infinity."
+        "horizon, or pass throw=False to return infinity."
     )
     return raise_if(~stable, W, message) if throw else W
 
@@ -185,7 +221,7 @@ def _gramian_of_all_time(system: StateSpace) -> tuple[Float[Array, "n n"], BoolS
 
 @full_precision
 def stable_gramian(system: StateSpace) -> Float[Array, "n n"]:
-    """The controllability Gramian over all time of a stable model."""
+    """The controllability Gramian of a stable model over all time."""
     noise = system.B @ system.B.T
     return symmetric(lyapunov(system.is_discrete, system.A.T, noise))
 
@@ -196,8 +232,8 @@ def _gramian_over(system: StateSpace, horizon: int | Scalar) -> Float[Array, "n 
     A, Q = system.A, system.B @ system.B.T
     if not isinstance(horizon, int):
         return gramian_over(A, Q, horizon)
-    # By doubling, W_2k = W_k + A^k W_k (A^k)', along the bits of the number of steps:
-    # logarithmic work, and no assumption of stability.
+    # Doubling, W_2k = W_k + A^k W_k (A^k)', along the bits of the number of steps. It
+    # takes logarithmic time, and the model need not be stable.
     W, power = xp.zeros_like(Q), system.eye
     for bit in bin(horizon)[2:]:
         W, power = W + power @ W @ power.T, power @ power

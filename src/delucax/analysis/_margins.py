@@ -23,24 +23,24 @@ class Margins(eqx.Module):
 
     **Attributes:**
 
-    - `gain_margin`: the smallest factor above 1 on the loop gain that brings a pole to
+    - `gain_margin`: the smallest factor above 1 on the loop gain that moves a pole to
         the boundary of stability; infinite if there is none.
     - `gain_reduction`: the largest such factor below 1; zero if there is none.
-    - `phase_margin`: the smallest phase change, of either sign, with that effect, in
-        radians; infinite if there is none.
-    - `delay_margin`: the smallest delay with that effect, in units of time; infinite if
-        there is none.
+    - `phase_margin`: the smallest phase change, of either sign, that moves a pole to
+        the boundary, in radians; infinite if there is none.
+    - `delay_margin`: the smallest delay that moves a pole to the boundary, in units of
+        time; infinite if there is none.
     - `gain_margin_frequency`, `gain_reduction_frequency`, `phase_margin_frequency`,
         `delay_margin_frequency`: the critical frequencies, in radians per unit of time;
         NaN if there is none.
-    - `disk`, `disk_s`, `disk_t`: the [`delucax.analysis.DiskMargin`][] that balances
-        `S` and `T`, that of the sensitivity `S = 1 / (1 + L)`, and that of
-        `T = L / (1 + L)`.
-    - `is_stable`: whether the closed loop is. If not it has no margins: the factors are
-        1, the others 0, the frequencies NaN.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `disk`, `disk_s`, `disk_t`: disk margins, each a
+        [`delucax.analysis.DiskMargin`][]: with $S$ and $T$ balanced, of the sensitivity
+        $S = 1 / (1 + L)$, and of the complementary sensitivity $T = L / (1 + L)$.
+    - `is_stable`: whether the closed loop is stable. If it is not, it has no margins:
+        the two factors are 1, the other margins 0, and the frequencies NaN.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
-    All but `is_stable` and `result` are differentiable.
+    All attributes except `is_stable` and `result` are differentiable.
 
     !!! example
 
@@ -54,6 +54,10 @@ class Margins(eqx.Module):
         )
         margins = dlx.analysis.margins(loop)
         margins.phase_margin, margins.phase_margin_frequency
+        ```
+
+        ```text
+        (Array(0.6749, dtype=float32), Array(1.2496, dtype=float32))
         ```
     """
 
@@ -76,26 +80,28 @@ class Margins(eqx.Module):
 
 @host_unless_traced
 def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
-    """The gain, phase, delay and disk margins of a loop with one input and one output.
+    r"""The gain, phase, delay and disk margins of a loop with one input and one output.
 
-    The loop `L` is the linear model from `u` to `y`, closed by `u = -y`: for a state
-    feedback `u = -K x`, the plant's `A` and `B` with `C = K`.
+    The loop $L$ is the linear model from $u$ to $y$, closed by $u = -y$. For a state
+    feedback $u = -K x$, take $A$ and $B$ of the plant and $C = K$.
 
-    The frequencies at which `L` is real, and those at which it is 1 in size, are
-    eigenvalues of matrices. Sign changes between these identify the true crossings,
-    and each is refined to rounding. First and second derivatives, in either mode, are
-    those of the critical crossing.
+    The frequencies at which $L$ is real, and those at which $|L| = 1$, are eigenvalues
+    of matrices. Sign changes between them show which are crossings, and each crossing
+    is refined to rounding. The margins have first and second derivatives, in either
+    mode: those of the critical crossing.
 
     **Arguments:**
 
     - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][], with one control and one output.
-    - `throw`: raise if a search does not converge (default); if false, check `result`.
+    - `throw`: raise an error if a search does not converge (default). If false, check
+        `result`.
 
     **Returns:** [`delucax.analysis.Margins`][].
 
     **Raises:** `ValueError` if `loop` is not linear, is time-varying, or has more than
-    one control or output; an error at run time as `throw` says.
+    one control or output. With `throw`, an error at run time if a search does not
+    converge.
 
     Source: Seiler, Packard and Gahinet, 2020 (disk margins).
 
@@ -110,14 +116,18 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
         loop = dlx.systems.LinearSystem(upright.A, upright.B, C=K)
         dlx.analysis.margins(loop).phase_margin
         ```
+
+        ```text
+        Array(1.107, dtype=float32)
+        ```
     """
     where = "margins"
     system = state_space(loop, "controls", where)
     p, m = system.D.shape
     if not p == m == 1:
         raise ValueError(
-            f"{where}: loop must have one control and one output, got {m} and {p}; "
-            "`disk_margin` takes more."
+            f"{where}: loop must have one control and one output, got {m} and {p}. "
+            "For more, use `disk_margin`."
         )
     return raise_on_failure(_margins(system), where, throw)
 
@@ -131,12 +141,11 @@ def _margins(loop: StateSpace) -> Margins:
     omegas, crosses = crossings(frozen)
     values = gains(frozen, omegas)[0]
 
-    # Where the loop is real and negative, and where it is 1 in size.
-    # A loop gain above `huge` is at a pole on the axis, no crossing.
+    # A loop gain above `huge` is at a pole on the axis and is not a crossing.
     real = xp.real(values[0])
     huge = xp.finfo(dtype).eps ** -0.75
     negative = crosses[0] & (real < 0) & (real > -huge)
-    # Times these factors the loop gain is -1, and so it is after these turns and lags.
+    # The loop gain becomes -1 after these factors, turns and lags.
     factors = -1 / xp.where(negative, real, -1)
     turns = xp.angle(-values[1])
     lags = xp.mod(turns, 2 * xp.pi) / xp.where(crosses[1], omegas[1], 1)
@@ -148,12 +157,12 @@ def _margins(loop: StateSpace) -> Margins:
             xp.where(crosses[1], lags, xp.inf),
         ]
     )
-    # The kind of crossing of each margin: gain margins at phase crossings.
+    # The kind of crossing of each margin. Gain margins are where the loop is real.
     kinds = xp.array([0, 0, 1, 1])
     nearest = xp.argmin(candidates, axis=1)
     exists = xp.isfinite(xp.min(candidates, axis=1))
     followed = follow(loop, kinds, omegas[kinds, nearest], exists)
-    # A placeholder where there is no crossing, at which all is finite.
+    # Without a crossing, a placeholder at which everything is finite.
     followed = xp.where(exists, followed, 1)
     L = xp.where(exists, gains(loop, followed)[0], 1)
     factor = 1 / norm(L, ())

@@ -1,4 +1,4 @@
-"""Poles, zeros, and tests of modal controllability and observability."""
+"""Poles, zeros, and tests of the controllability and observability of modes."""
 
 import equinox as eqx
 import numpy as np
@@ -16,17 +16,18 @@ _SEARCHES = 3
 
 
 class ModalTest(eqx.Module):
-    """The distance of each mode to uncontrollability (to unobservability).
+    r"""The distance of each mode from being uncontrollable, or from being unobservable.
 
     **Attributes:**
 
-    - `modes`: the eigenvalues of `A`, shape `(n,)`, complex.
-    - `distances`: for each, the smallest singular value of
-        `[(A - mode I) / |A|, B / |B|]` (of `[(A - mode I)' / |A|, C' / |C|]` for
-        observability), shape `(n,)`: the relative change of the matrices that makes the
-        mode uncontrollable (unobservable); zero if it is so already.
-    - `unstable`: which modes are on or outside the boundary of stability.
-    - `tolerance`: distances up to it count as zero.
+    - `modes`: the eigenvalues $\lambda$ of $A$, shape `(n,)`, complex.
+    - `distances`: the smallest singular value of
+        $[(A - \lambda I) / |A|,\; B / |B|]$ for each mode, shape `(n,)`. For
+        observability $A^\top$ and $C^\top$ take the place of $A$ and $B$. It is the
+        relative change of the matrices that makes the mode uncontrollable, and zero if
+        the mode is uncontrollable.
+    - `unstable`: which modes are on or outside the boundary of stability, shape `(n,)`.
+    - `tolerance`: a distance up to this number counts as zero.
 
     The measurements have no gradient.
 
@@ -39,7 +40,12 @@ class ModalTest(eqx.Module):
         A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
         dynamics = dlx.LinearDynamics(A, jnp.array([[0.0], [1.0]]))
         test = dlx.analysis.modal_controllability(dynamics)
-        test.rank_deficient, test.worst  # the mode 1.1
+        test.rank_deficient, test.worst
+        ```
+
+        ```text
+        (Array([ True, False], dtype=bool),
+         (Array(1.1+0.j, dtype=complex64), Array(0., dtype=float32)))
         ```
     """
 
@@ -53,22 +59,23 @@ class ModalTest(eqx.Module):
     @property
     @host_unless_traced
     def rank_deficient(self) -> Bool[Array, " n"]:
-        """Which modes are uncontrollable (unobservable): the matrix of the test loses
-        rank there."""
-        # Negated, so that a NaN counts as one of them.
+        """Which modes are uncontrollable (or unobservable), because the matrix of the
+        test loses rank."""
+        # Negated, so that a NaN counts as uncontrollable.
         return ~(self.distances > self.tolerance)
 
     @property
     @host_unless_traced
     def worst(self) -> tuple[Complex[Array, ""], Scalar]:
-        """The least controllable (observable) mode, and its distance."""
+        """The least controllable (or observable) mode, and its distance."""
         k = xp.argmin(self.distances)
         return self.modes[k], self.distances[k]
 
     @property
     @host_unless_traced
     def worst_unstable(self) -> tuple[Complex[Array, ""], Scalar]:
-        """`worst` among the unstable modes; an infinite distance if there is none."""
+        """The least controllable (or observable) unstable mode, and its distance, which
+        is infinite if there is no unstable mode."""
         distances = xp.where(self.unstable, self.distances, xp.inf)
         k = xp.argmin(distances)
         return self.modes[k], distances[k]
@@ -78,22 +85,24 @@ class ModalTest(eqx.Module):
 def modal_controllability(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> ModalTest:
-    """The controllable modes, by the test of Popov, Belevitch and Hautus,
+    r"""The controllability of each mode, by the test of Popov, Belevitch and Hautus.
 
-    `rank [A - lambda I, B] = n` at each eigenvalue `lambda` of `A`.
+    The mode of an eigenvalue $\lambda$ of $A$ is controllable if
+
+    $$\mathrm{rank}\, [A - \lambda I,\; B] = n.$$
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `tolerance`: relative distances up to it count as zero; `10 n` rounding units by
-        default.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `tolerance`: a relative distance up to this number counts as zero; by default
+        `10 n` times machine epsilon.
 
     **Returns:** a [`delucax.analysis.ModalTest`][] of all modes.
 
-    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
-    unknown.
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, `inputs` is
+    unknown, or `tolerance` is not positive.
 
     Source: Hautus, 1969; Eising, 1984 (the distance).
 
@@ -105,6 +114,10 @@ def modal_controllability(
         upright = dlx.linearize(dlx.systems.Pendulum())
         dlx.analysis.modal_controllability(upright).distances
         ```
+
+        ```text
+        Array([0.184, 0.184], dtype=float32)
+        ```
     """
     where = "modal_controllability"
     return _modal_test(state_space(model, inputs, where), tolerance, where)
@@ -114,16 +127,19 @@ def modal_controllability(
 def modal_observability(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> ModalTest:
-    """The observable modes, by the same test of the transposed system,
+    r"""The observability of each mode, by the test of Popov, Belevitch and Hautus.
 
-    `rank [A' - lambda I, C'] = n` at each eigenvalue `lambda` of `A`.
+    The mode of an eigenvalue $\lambda$ of $A$ is observable if
+
+    $$\mathrm{rank}\, [A^\top - \lambda I,\; C^\top] = n.$$
 
     **Arguments:** `model` and `tolerance`: as in
     [`delucax.analysis.modal_controllability`][].
 
     **Returns:** a [`delucax.analysis.ModalTest`][] of all modes.
 
-    **Raises:** `ValueError` if `model` is not linear or is time-varying.
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `tolerance`
+    is not positive.
 
     !!! example
 
@@ -131,7 +147,11 @@ def modal_observability(
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.Pendulum())
-        dlx.analysis.modal_observability(upright).worst
+        dlx.analysis.modal_observability(upright).distances
+        ```
+
+        ```text
+        TODO1
         ```
     """
     where = "modal_observability"
@@ -149,7 +169,7 @@ def is_controllable(
 
     **Returns:** a boolean scalar.
 
-    **Raises:** `ValueError`, as there.
+    **Raises:** as in [`delucax.analysis.modal_controllability`][].
 
     !!! example
 
@@ -157,7 +177,11 @@ def is_controllable(
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.Pendulum())
-        assert dlx.analysis.is_controllable(upright)
+        dlx.analysis.is_controllable(upright)
+        ```
+
+        ```text
+        Array(True, dtype=bool)
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
@@ -175,7 +199,7 @@ def is_stabilizable(
 
     **Returns:** a boolean scalar.
 
-    **Raises:** `ValueError`, as there.
+    **Raises:** as in [`delucax.analysis.modal_controllability`][].
 
     !!! example
 
@@ -185,8 +209,11 @@ def is_stabilizable(
 
         A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
         dynamics = dlx.LinearDynamics(A, jnp.array([[1.0], [0.0]]))
-        assert dlx.analysis.is_stabilizable(dynamics)
-        assert not dlx.analysis.is_controllable(dynamics)
+        dlx.analysis.is_stabilizable(dynamics), dlx.analysis.is_controllable(dynamics)
+        ```
+
+        ```text
+        (Array(True, dtype=bool), Array(False, dtype=bool))
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
@@ -204,7 +231,7 @@ def is_observable(
 
     **Returns:** a boolean scalar.
 
-    **Raises:** `ValueError`, as there.
+    **Raises:** as in [`delucax.analysis.modal_observability`][].
 
     !!! example
 
@@ -212,7 +239,11 @@ def is_observable(
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.Pendulum())
-        assert dlx.analysis.is_observable(upright)
+        dlx.analysis.is_observable(upright)
+        ```
+
+        ```text
+        Array(True, dtype=bool)
         ```
     """
     return ~xp.any(modal_observability(model, tolerance=tolerance).rank_deficient)
@@ -229,7 +260,7 @@ def is_detectable(
 
     **Returns:** a boolean scalar.
 
-    **Raises:** `ValueError`, as there.
+    **Raises:** as in [`delucax.analysis.modal_observability`][].
 
     !!! example
 
@@ -239,7 +270,11 @@ def is_detectable(
 
         A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
         dynamics = dlx.LinearDynamics(A, jnp.eye(2), C=jnp.array([[1.0, 0.0]]))
-        assert dlx.analysis.is_detectable(dynamics)
+        dlx.analysis.is_detectable(dynamics)
+        ```
+
+        ```text
+        Array(True, dtype=bool)
         ```
     """
     test = modal_observability(model, tolerance=tolerance)
@@ -248,16 +283,17 @@ def is_detectable(
 
 @host_unless_traced
 def poles(model: LinearModel) -> Complex[Array, " n"]:
-    """The eigenvalues of `A`.
+    r"""The poles of a linear model: the eigenvalues of $A$.
 
-    They have first derivatives, in either mode, where they are simple. There is no
-    order among them.
+    A [`delucax.systems.LinearSystem`][] is stable if all poles have a negative real
+    part. [`delucax.LinearDynamics`][] are stable if all poles have a modulus below 1.
+    Simple poles have first derivatives, in either mode. The order of the poles is not
+    defined.
 
-    **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], stable if all poles
-    have a negative real part; or time-invariant [`delucax.LinearDynamics`][], stable if
-    all have a modulus below 1.
+    **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+    [`delucax.LinearDynamics`][].
 
-    **Returns:** shape `(n,)`, complex.
+    **Returns:** the poles, shape `(n,)`, complex.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying.
 
@@ -267,7 +303,11 @@ def poles(model: LinearModel) -> Complex[Array, " n"]:
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.Pendulum())
-        dlx.analysis.poles(upright)  # +3.87 and -3.87 per second
+        dlx.analysis.poles(upright)
+        ```
+
+        ```text
+        Array([ 3.873+0.j, -3.873+0.j], dtype=complex64)
         ```
     """
     return eigenvalues(state_space(model, "controls", "poles").A)
@@ -287,17 +327,17 @@ def _modal_test(
 def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
     system = stop_gradient(system)
     eps = xp.finfo(system.A.dtype).eps
-    # Scaled, so that a distance is relative to each of the matrices.
+    # Scaled, so that distances are relative to the sizes of A and B.
     scale_A, scale_B = (
         xp.where(norm > 0, norm, 1)
         for norm in (xp.linalg.norm(system.A), xp.linalg.norm(system.B))
     )
     A, B = system.A / scale_A, system.B / scale_B
-    # A defective eigenvalue is only known to a root of the rounding.
+    # A defective eigenvalue is known only up to a root of rounding.
     radius = eps ** (1 / 3)
 
     def distance(mode):
-        """The smallest singular value, and the best `mode` for its vector."""
+        """The smallest singular value, and a better mode from its singular vector."""
         pencil = xp.concatenate([A - mode * system.eye, B], axis=1)
         left, values, _ = xp.linalg.svd(pencil, full_matrices=False)
         vector = left[:, -1]
@@ -324,22 +364,27 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
 
 @host_unless_traced
 def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " zeros"]:
-    """The invariant zeros: where `[[A - z I, B], [C, 0]]` loses rank.
+    r"""The invariant zeros of a linear model.
 
-    Each step deflates the directly observable states, and then, in the transposed
-    system, the directly controllable ones, until the zeros remain. Their number depends
-    on the values, which therefore cannot be traced.
+    A number $z$ is a zero if this matrix has a lower rank than for other numbers:
+
+    $$\begin{bmatrix} A - z I & B \\ C & 0 \end{bmatrix}$$
+
+    The algorithm removes the states that the outputs observe directly. It then does the
+    same for the transposed system. The poles of the remaining system are the zeros.
+    Their number depends on the values of the matrices, so these cannot be traced.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
 
-    **Returns:** complex, as many as there are; those that are also poles included.
+    **Returns:** the zeros, complex, shape `(number of zeros,)`. A zero that is also a
+    pole is not cancelled.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, if `inputs` is
-    unknown, or under `jax.jit`, `jax.vmap` and `jax.grad`.
+    unknown, or if the model is traced by `jax.jit`, `jax.vmap` or `jax.grad`.
 
     Source: Emami-Naeini and Van Dooren, 1982.
 
@@ -352,39 +397,46 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
         A = jnp.array([[0.0, 1.0], [-2.0, -3.0]])
         B = jnp.array([[0.0], [1.0]])
         system = dlx.systems.LinearSystem(A, B, C=jnp.array([[5.0, 1.0]]))
-        dlx.analysis.zeros(system)  # -5
+        dlx.analysis.zeros(system)
+        ```
+
+        ```text
+        Array([-5.+0.j], dtype=complex64)
         ```
     """
     system = state_space(model, inputs, "zeros")
     if not all(is_concrete(M) for M in (system.A, system.B, system.C)):
         raise ValueError(
-            "zeros: model must be concrete, got one that is being traced (by jax.jit, "
-            "jax.vmap or jax.grad); how many zeros there are depends on its values."
+            "zeros: model must be concrete, got a model that is traced by jax.jit, "
+            "jax.vmap or jax.grad. The number of zeros depends on the values of the "
+            "model, so call it outside of these transformations."
         )
     A, B, C, D = (np.asarray(M) for M in system[:4])
-    # NumPy: the sizes of the reduced systems depend on ranks.
+    # By NumPy, because the sizes of the reduced systems depend on ranks.
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
     A, B, C, D = _hidden_part(A, B, C, D, tolerance)
-    # Of the transposed system: D is then of full row rank, so in the end it is square.
+    # D has full row rank now. The reduction of the transposed system makes it square.
     A, C, B, D = (M.T for M in _hidden_part(A.T, C.T, B.T, D.T, tolerance))
     if not len(A):
         return xp.zeros(0, complex)
-    # Closed by the input that keeps the outputs zero, the remaining modes are zeros.
+    # The zeros are the modes under the input that keeps the outputs at zero.
     left = A - B @ np.linalg.solve(D, C) if D.size else A
     return eigenvalues(left)
 
 
 def _hidden_part(A, B, C, D, tolerance):
-    """The states that the outputs do not observe under some input, by the reduction of
-    Emami-Naeini and Van Dooren."""
+    """The part of the states that some input can hide from the outputs.
+
+    Source: Emami-Naeini and Van Dooren, 1982 (the reduction).
+    """
     while True:
-        # Compress the rows of D: the outputs in `free` do not depend on the inputs.
+        # Compress the rows of D. The outputs of `free` do not depend on the inputs.
         left, values, _ = np.linalg.svd(D) if D.size else (np.eye(len(C)), [], None)
         rank = int(np.sum(np.asarray(values) > tolerance))
         C, D = left.T @ C, left.T @ D
         free = C[rank:]
-        # The states that are observed in these outputs.
+        # These outputs observe some states directly, which are removed.
         _, values, right = (
             np.linalg.svd(free) if free.size else ([], [], np.eye(len(A)))
         )

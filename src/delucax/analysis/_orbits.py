@@ -1,4 +1,4 @@
-"""Periodic orbits of hybrid systems: the map from event to event, its multipliers."""
+"""Periodic orbits of hybrid systems: the Poincare map and its multipliers."""
 
 from typing import Any
 
@@ -28,15 +28,14 @@ _FORWARD = diffrax.DirectAdjoint, diffrax.ForwardMode
 
 
 class Return(eqx.Module):
-    """The state after the next event of a kind, as [`delucax.analysis.poincare_map`][]
-    returns it.
+    """The result of [`delucax.analysis.poincare_map`][].
 
     **Attributes:**
 
-    - `state`: just after the event, shape `(n,)`.
-    - `time`: until the event, a scalar.
-    - `result`: success, `not_converged` if it did not fire within `max_steps`, or what
-        failed on the way.
+    - `state`: the state just after the next event, shape `(n,)`.
+    - `time`: the time until the event, a scalar.
+    - `result`: success; `RESULTS.not_converged` if the event did not fire within
+        `max_steps`; else the failure of a step.
 
     !!! example
 
@@ -46,6 +45,10 @@ class Return(eqx.Module):
         dynamics = dlx.Discretized(dlx.systems.BouncingBall(), dt=0.1)
         after = dlx.analysis.poincare_map(dynamics, "bounce", [0.0, 3.0])
         after.state, after.time
+        ```
+
+        ```text
+        (Array([0. , 2.4], dtype=float32), Array(0.612, dtype=float32))
         ```
     """
 
@@ -57,17 +60,17 @@ class Return(eqx.Module):
 
 
 class PeriodicOrbit(eqx.Module):
-    """An orbit that returns to itself, as [`delucax.analysis.periodic_orbit`][] finds.
+    """A periodic orbit, the result of [`delucax.analysis.periodic_orbit`][].
 
     **Attributes:**
 
-    - `state`: just after the event, shape `(n,)`.
-    - `period`: a scalar.
-    - `jacobian`: of the map from event to event, shape `(n, n)`.
-    - `multipliers`: its eigenvalues, shape `(n,)`, complex, the largest first. The
-        orbit is stable if all are inside the unit circle; those of directions that
-        leave the event's surface are zero.
-    - `result`: success, or why there is none.
+    - `state`: the state just after the event, shape `(n,)`.
+    - `period`: the period, in units of time, a scalar.
+    - `jacobian`: the Jacobian of the map from event to event, shape `(n, n)`.
+    - `multipliers`: the eigenvalues of `jacobian`, shape `(n,)`, complex, the largest
+        first. The orbit is stable if all of them are inside the unit circle. The
+        multiplier of a direction that leaves the surface of the event is zero.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     !!! example
 
@@ -99,26 +102,27 @@ def poincare_map(
     max_steps: int = 1000,
     throw: bool = True,
 ) -> Return:
-    """The state just after the next event of a kind, from a state just after one.
+    """The Poincare map: from a state after an event to the state after the next one.
 
-    Other events on the way happen, too. The time of return is free: the dynamics say
-    how the system is integrated, and their `dt` is that of its steps, in each of which
-    the same control is held. Differentiable with respect to every array.
+    Other events on the way are applied too. The dynamics determine how the system is
+    integrated, in intervals of `dt`, with the same control in all of them. The event
+    may be at any time within an interval. The map is differentiable with respect to
+    every array.
 
     **Arguments:**
 
     - `dynamics`: a discretised [`delucax.systems.AbstractHybridSystem`][].
-    - `event`: one of its `event_names`.
+    - `event`: the name of the event, one of `dynamics.event_names`.
     - `x`: the state, shape `(n,)`.
     - `u`: the control, shape `(m,)`; zero by default.
-    - `t0`: the time of `x`, 0 by default.
-    - `max_steps`: intervals of `dt` until the event, at most; 1000 by default.
-    - `throw`: raise if it fails (default).
+    - `t0`: the time of `x`, in units of time; 0 by default.
+    - `max_steps`: the largest number of intervals until the event; 1000 by default.
+    - `throw`: raise an error if the map fails (default). If false, check `result`.
 
     **Returns:** a [`delucax.analysis.Return`][].
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
-    time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong kind or shape. With `throw`,
+    an error at run time if a step fails or the event does not fire.
 
     Source: Guckenheimer and Holmes, 1983.
 
@@ -130,6 +134,10 @@ def poincare_map(
         wheel = dlx.systems.RimlessWheel(slope=0.1)
         dynamics = dlx.Discretized(wheel, dt=0.05)
         dlx.analysis.poincare_map(dynamics, "step", [-0.29, 1.2]).time
+        ```
+
+        ```text
+        Array(0.77, dtype=float32)
         ```
     """
     where = "poincare_map"
@@ -144,8 +152,8 @@ def _arguments(dynamics, event, x, u, where):
     check_instance(dynamics, Discretized, "dynamics", where)
     if not dynamics.event_names:
         raise ValueError(
-            f"{where}: dynamics must be of an AbstractHybridSystem, whose events it "
-            f"follows, got {type(dynamics.system).__name__}."
+            f"{where}: the system of dynamics must be an AbstractHybridSystem with "
+            f"events, got {type(dynamics.system).__name__}."
         )
     check_choice(event, tuple(dynamics.event_names), "event", where)
     x = as_vector(x, dynamics.state_size, "x", where)
@@ -159,7 +167,7 @@ def _return(dynamics, event, x, u, t0, max_steps) -> Return:
     def turn(carry):
         x, time, count, *_ = carry
         outcome = dynamics.until_event(t0 + time, x, u, None, event)
-        # By products, as a sum of steps would be rounded anew at each of them.
+        # A product, because a sum of steps would be rounded at each step.
         after = (count * dynamics.dt + outcome.s).astype(x.dtype)
         done = outcome.stopped | (outcome.result != RESULTS.successful)
         new = outcome.x, after, count + 1, done, outcome.result
@@ -185,26 +193,26 @@ def periodic_orbit(
     max_steps: int = 1000,
     throw: bool = True,
 ) -> PeriodicOrbit:
-    """The fixed point of [`delucax.analysis.poincare_map`][] near a guess, by Newton's
-    method, and its multipliers.
+    """A periodic orbit of a hybrid system and its multipliers, by Newton's method.
 
-    The field must not depend on time. The fixed point is differentiable with respect to
-    the dynamics, by the implicit function theorem.
+    The orbit is a fixed point of [`delucax.analysis.poincare_map`][] near a guess. The
+    vector field must not depend on time. The fixed point is differentiable with respect
+    to the dynamics, by the implicit function theorem.
 
     **Arguments:**
 
-    - `dynamics`, `event`, `u`, `max_steps`, `throw`: as for the map. With a
-        `stepsize_controller` its `adjoint` needs a forward mode,
-        `diffrax.DirectAdjoint()`.
+    - `dynamics`, `event`, `u`, `max_steps`, `throw`: as in
+        [`delucax.analysis.poincare_map`][]. Dynamics with a `stepsize_controller` need
+        an `adjoint` with a forward mode, for example `diffrax.DirectAdjoint()`.
     - `x0`: the guess, a state just after the event, shape `(n,)`.
-    - `tolerance`: of the state, absolute and relative, 1e-10 by default; not below the
-        rounding of single precision.
-    - `max_iterations`: 20 by default.
+    - `tolerance`: the absolute and relative tolerance of the state; 1e-10 by default,
+        and at least 8 times machine epsilon.
+    - `max_iterations`: the largest number of Newton steps; 20 by default.
 
     **Returns:** a [`delucax.analysis.PeriodicOrbit`][].
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
-    time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong kind or shape. With `throw`,
+    an error at run time if there is no orbit near the guess.
 
     Source: McGeer, 1990; Goswami, Thuilot and Espiau, 1998.
 
@@ -235,7 +243,8 @@ def periodic_orbit(
     orbit = _orbit(dynamics, *given)
     if is_concrete(x0) and is_concrete(orbit.state):
         if orbit.result != RESULTS.successful:
-            # Newton's method runs off where the guess itself does not return.
+            # Newton's method diverges if the guess itself does not return to the event.
+            # Then that failure is reported.
             zero = jnp.zeros((), x0.dtype)
             first = _return(dynamics, index, x0, u, zero, max_steps).result
             result = choose(first == RESULTS.successful, orbit.result, first)

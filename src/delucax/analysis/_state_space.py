@@ -19,7 +19,10 @@ LinearModel: TypeAlias = LinearSystem | LinearDynamics
 
 
 class StateSpace(NamedTuple):
-    """`y = (C (s I - A)^-1 B + D) u`, with `s = z` in discrete time, of step `dt`."""
+    """The model `y = (C (s I - A)^-1 B + D) u`, with `s = z` in discrete time.
+
+    `dt` is the step in discrete time, and `None` in continuous time.
+    """
 
     A: Square
     B: Float[Array, "n m"]
@@ -41,17 +44,17 @@ class StateSpace(NamedTuple):
         return StateSpace(self.A.T, self.C.T, self.B.T, self.D.T, self.dt)
 
     def growth(self, poles: Complex[Array, "*poles"]) -> Float[Array, "*poles"]:
-        """The real part of poles, or their modulus less 1: negative where stable."""
+        """The real part of poles, or their modulus minus 1: negative if stable."""
         return xp.abs(poles) - 1 if self.is_discrete else xp.real(poles)
 
     def is_stable(self) -> BoolScalar:
-        """Whether all poles are inside the boundary."""
+        """Whether all poles are inside the boundary of stability."""
         poles = eigenvalues(stop_gradient(self.A))
         return xp.all(self.growth(poles) < 0)
 
     def stable_or_placeholder(self, stable: BoolScalar) -> "StateSpace":
-        """This system, or a stable placeholder for an unstable one, so that results
-        that are then discarded have finite derivatives."""
+        """This system, or a stable placeholder if it is not stable, so that discarded
+        results have finite derivatives."""
         return self._replace(A=xp.where(stable, self.A, -self.eye / 2))
 
     def response(
@@ -63,11 +66,11 @@ class StateSpace(NamedTuple):
     def expansion(
         self, omega: Float[Array, "*frequencies"], order: int
     ) -> list[Complex[Array, "*frequencies p m"]]:
-        """The complex gain and its derivatives in the frequency, to second order at
-        most."""
+        """The complex gain and its derivatives with respect to the frequency, at most
+        of second order."""
         if omega.ndim and not on_host():
             return jax.vmap(lambda omega: self.expansion(omega, order))(omega)
-        # The point of the boundary of stability, and its derivatives.
+        # The point on the boundary of stability, and its derivatives.
         if self.dt is None:
             s = (1j * omega)[..., None, None]
             first, second = 1j, 0
@@ -76,7 +79,7 @@ class StateSpace(NamedTuple):
             first, second = 1j * self.dt * s, -(self.dt**2) * s
         matrix = s * self.eye - self.A
         resolvent = factorised(matrix, lx.LU())
-        # Each derivative in s is one of the resolvent: R' = -R^2, R'' = 2 R^3.
+        # The derivatives of the resolvent R with respect to s are -R^2 and 2 R^3.
         X = [resolvent(self.B.astype(matrix.dtype))]
         for _ in range(order):
             X.append(resolvent(X[-1]))
@@ -88,8 +91,8 @@ class StateSpace(NamedTuple):
         return gains
 
     def bilinear_transform(self) -> "StateSpace":
-        """The bilinear transform `z = (1 + s) / (1 - s)` of a discrete-time system: a
-        continuous-time one with the same gains."""
+        """The continuous-time system with the same gains as this discrete-time system,
+        by the bilinear transform `z = (1 + s) / (1 - s)`."""
         A, B, C, D, _ = self
         n = A.shape[0]
         both = lu_solve(self.eye + A, xp.concatenate([A - self.eye, B], axis=1))
@@ -99,7 +102,7 @@ class StateSpace(NamedTuple):
 
 
 def state_space(model: Any, inputs: str, where: str) -> StateSpace:
-    """The checked model from one kind of input to the outputs."""
+    """Check a model, and return its matrices from one kind of input to the outputs."""
     if not isinstance(model, LinearModel):
         raise ValueError(
             f"{where}: model must be a LinearSystem or LinearDynamics "
@@ -128,8 +131,8 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
 def norm(
     M: Inexact[Array, "..."], axes: tuple[int, ...] = (-2, -1)
 ) -> Float[Array, "..."]:
-    """The Frobenius norm, of complex entries too, with gradient 0 at 0."""
-    # By real parts: the modulus of a complex zero has no derivative.
+    """The Frobenius norm of a real or complex matrix, with the gradient 0 at 0."""
+    # By real and imaginary parts, because the modulus of zero has no derivative.
     square = xp.sum(xp.real(M) ** 2 + xp.imag(M) ** 2, axis=axes)
     is_zero = square == 0
     return xp.where(is_zero, 0.0, xp.sqrt(xp.where(is_zero, 1.0, square)))
@@ -138,9 +141,9 @@ def norm(
 def largest_gain(G: Inexact[Array, "*stack p m"]) -> Float[Array, "*stack"]:
     """The largest singular value, with derivatives to second order.
 
-    Those of `jnp.linalg.svd` divide by the gaps between all singular values, which are
-    zero as soon as two channels are alike. Here the singular vector follows `G` to
-    first order, and the gain is `|G v|`, which is second-order accurate in its error.
+    Derivatives of `jnp.linalg.svd` divide by the gaps between all singular values, which
+    are zero if two channels are equal. Here the singular vector `v` follows `G` to first
+    order. The gain is `|G v|`, in which an error of `v` has a second-order effect.
     """
     return norm(G) if 1 in G.shape[-2:] else norm(G @ _singular_vectors(G)[0])
 
@@ -148,15 +151,15 @@ def largest_gain(G: Inexact[Array, "*stack p m"]) -> Float[Array, "*stack"]:
 def expanded_gain(
     G: Inexact[Array, "p m"], G1: Inexact[Array, "p m"], G2: Inexact[Array, "p m"]
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """The largest singular value of `G + G1 h + G2 h^2 / 2`, and its first and second
-    derivative in `h` at zero."""
+    """The largest singular value of `G + G1 h + G2 h^2 / 2` at `h = 0`, and its first
+    and second derivatives with respect to `h`."""
     inner = lambda a, b: xp.sum(xp.real(a.conj() * b))
     if 1 in G.shape:
         G, G1, G2 = (M.reshape(-1, 1) for M in (G, G1, G2))
         vector, mixed = xp.ones((1, 1), G.dtype), 0
     else:
         vector, vectors, weights = _singular_vectors(G)
-        # The perturbation of G'G, on the top vector and each other one.
+        # The perturbation of G'G, between the top vector and each of the others.
         coupling = _adjoint(G1 @ vectors) @ (G @ vector)
         coupling = coupling + _adjoint(G @ vectors) @ (G1 @ vector)
         mixed = inner(coupling, weights * coupling)
@@ -169,15 +172,15 @@ def expanded_gain(
 
 
 def _singular_vectors(G):
-    """The right singular vector of the largest gain, which follows `G` to first order;
-    all of them; and their weights in a perturbation of it, the inverse gaps."""
+    """The right singular vector of the largest gain, which follows `G` to first order,
+    all right singular vectors, and the inverse gaps of the squared singular values."""
     frozen = stop_gradient(G)
     product = _adjoint(frozen) @ frozen
-    # NumPy refuses numbers that are not finite.
+    # NumPy raises an error for numbers that are not finite.
     product = xp.where(xp.isfinite(product), product, 0)
     squares, vectors = xp.linalg.eigh(product)
     gaps = (squares[..., -1:] - squares)[..., None]
-    # Across a closed gap any combination of the two vectors is a singular vector.
+    # If a gap is zero, any combination of the two vectors is a singular vector.
     is_open = gaps > xp.finfo(gaps.dtype).eps ** 0.5 * squares[..., -1:, None]
     weights = xp.where(is_open, 1 / xp.where(is_open, gaps, 1), 0)
     top = vectors[..., -1:]

@@ -79,8 +79,7 @@ class StagedMultipliers(eqx.Module):
 
 
 class Staged(eqx.Module):
-    r"""A convex quadratic program in stages: optimal control of a linear system with
-    constraints.
+    r"""A convex quadratic program in stages, for the control of a linear system.
 
     $$\min \; \sum_{k=0}^{T-1} \left( \tfrac12 x_k^\top Q x_k + x_k^\top S u_k
     + \tfrac12 u_k^\top R u_k + q^\top x_k + r^\top u_k \right)

@@ -97,8 +97,7 @@ def dre(
     parallel: bool = False,
     throw: bool = True,
 ) -> FiniteHorizonSolution:
-    r"""The discrete-time Riccati recursion: linear-quadratic control over a finite
-    horizon.
+    r"""The discrete-time Riccati recursion, for control over a finite horizon.
 
     It runs backwards in time, from $X_T = X_f$ (`final`):
 
@@ -229,8 +228,7 @@ def cre(
     final: Numbers | None = None,
     throw: bool = True,
 ) -> FiniteHorizonSolution:
-    r"""The Riccati differential equation: linear-quadratic control over a finite
-    horizon.
+    r"""The Riccati differential equation, for control over a finite horizon.
 
     It runs backwards in time, from $X(t_1) = X_f$ (`final`), with $t_1$ the last of
     `times`:

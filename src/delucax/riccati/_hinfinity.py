@@ -64,7 +64,7 @@ def hinf_dare(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The stationary H-infinity control in discrete time, as the solution of a game.
+    r"""Stationary H-infinity control in discrete time.
 
     $$X = Q + A^\top X M^{-1} A, \qquad
     M = I + (B R^{-1} B^\top - \gamma^{-2} D D^\top) X$$
@@ -146,7 +146,7 @@ def hinf_care(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The stationary H-infinity control in continuous time, as the solution of a game.
+    r"""Stationary H-infinity control in continuous time.
 
     $$A^\top X + X A - X (B R^{-1} B^\top - \gamma^{-2} D D^\top) X + Q = 0$$
 

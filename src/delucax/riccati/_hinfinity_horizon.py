@@ -56,8 +56,7 @@ def hinf_dre(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""H-infinity control over a finite horizon in discrete time, as the solution of a
-    game.
+    r"""H-infinity control over a finite horizon in discrete time.
 
     The recursion runs backwards in time, from $X_T = X_f$ (`final`):
 
@@ -144,8 +143,7 @@ def hinf_cre(
     tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""H-infinity control over a finite horizon in continuous time, as the solution of
-    a game.
+    r"""H-infinity control over a finite horizon in continuous time.
 
     The equation runs backwards in time, from $X(t_1) = X_f$ (`final`), with $t_1$ the
     last of `times`:
