@@ -81,7 +81,7 @@ def test_an_event_that_does_not_come():
 
 def test_dynamics_that_have_no_orbit():
     pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
-    with pytest.raises(ValueError, match="must be of an AbstractHybridSystem"):
+    with pytest.raises(ValueError, match="must be an AbstractHybridSystem"):
         dlx.analysis.poincare_map(pendulum, "step", [0.0, 0.0])
     steps = diffrax.PIDController(rtol=1e-5, atol=1e-5)
     wheel = dlx.systems.RimlessWheel()

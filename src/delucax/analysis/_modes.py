@@ -407,9 +407,8 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
     system = state_space(model, inputs, "zeros")
     if not all(is_concrete(M) for M in (system.A, system.B, system.C)):
         raise ValueError(
-            "zeros: model must be concrete, got a model that is traced by jax.jit, "
-            "jax.vmap or jax.grad. The number of zeros depends on the values of the "
-            "model, so call it outside of these transformations."
+            "zeros: model must be concrete, got one that is being traced (by jax.jit, "
+            "jax.vmap or jax.grad). The number of zeros depends on its values."
         )
     A, B, C, D = (np.asarray(M) for M in system[:4])
     # By NumPy, because the sizes of the reduced systems depend on ranks.

@@ -141,9 +141,10 @@ def norm(
 def largest_gain(G: Inexact[Array, "*stack p m"]) -> Float[Array, "*stack"]:
     """The largest singular value, with derivatives to second order.
 
-    Derivatives of `jnp.linalg.svd` divide by the gaps between all singular values, which
-    are zero if two channels are equal. Here the singular vector `v` follows `G` to first
-    order. The gain is `|G v|`, in which an error of `v` has a second-order effect.
+    Derivatives of `jnp.linalg.svd` divide by the gaps between all singular values,
+    which are zero if two channels are equal. Here the singular vector `v` follows `G`
+    to first order. The gain is `|G v|`, in which an error of `v` has a second-order
+    effect.
     """
     return norm(G) if 1 in G.shape[-2:] else norm(G @ _singular_vectors(G)[0])
 
