@@ -28,16 +28,17 @@ def dare(
     The gain $K = (R + B^\top X B)^{-1} (B^\top X A + S^\top)$ gives the optimal control
     $u_k = -K x_k$ of $E x_{k+1} = A x_k + B u_k$ over an infinite horizon. It minimises
 
-    $$\sum_{k=0}^\infty x_k^\top Q x_k + 2 x_k^\top S u_k + u_k^\top R u_k,$$
+    $$\sum_{k=0}^\infty \left( x_k^\top Q x_k + 2 x_k^\top S u_k + u_k^\top R u_k
+    \right),$$
 
     and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 
-    The solver doubles the horizon of the Riccati recursion, in a form that keeps its
-    structure, from a positive final cost. It then takes Newton steps while the residual
-    is large. Both need only products and linear solves, no eigenvalues, which suits
-    accelerators and `jax.vmap`. In a batch, a member that fails does not affect the
-    others. Derivatives follow from the implicit function theorem, to any order and in
-    either mode.
+    The solver is structure-preserving doubling: each iteration doubles the horizon of
+    the Riccati recursion, from a positive final cost. Newton steps follow while the
+    residual is large. Both need only products and linear solves, no eigenvalues, which
+    suits accelerators and `jax.vmap`. In a batch, a member that fails does not affect
+    the others. The solution is differentiable to any order, in either mode, by the
+    implicit function theorem.
 
     If $(A, Q)$ is not detectable, the stabilising solution is not the minimal solution
     of the equation: a control that lets the state grow costs less.
@@ -106,7 +107,8 @@ def care(
     The gain $K = R^{-1} (B^\top X E + S^\top)$ gives the optimal control $u = -K x$ of
     $E \dot{x} = A x + B u$ over an infinite horizon. It minimises
 
-    $$\int_0^\infty x^\top Q x + 2 x^\top S u + u^\top R u \,\mathrm{d}t,$$
+    $$\int_0^\infty \left( x^\top Q x + 2 x^\top S u + u^\top R u \right)
+    \mathrm{d}t,$$
 
     and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 

@@ -230,16 +230,16 @@ def cre(
 ) -> FiniteHorizonSolution:
     r"""The Riccati differential equation, for control over a finite horizon.
 
-    It runs backwards in time, from $X(t_1) = X_f$ (`final`), with $t_1$ the last of
-    `times`:
+    It runs backwards in time, from $X(t_1) = X_f$ (`final`). $t_0$ and $t_1$ are the
+    first and the last of `times`:
 
     $$-\dot{X} = A^\top X + X A - (X B + S) R^{-1} (B^\top X + S^\top) + Q$$
 
     For the system $\dot{x} = A x + B u$, the control $u = -K(t)\, x$ with
     $K = R^{-1} (B^\top X + S^\top)$ minimises
 
-    $$\int^{t_1} x^\top Q x + 2 x^\top S u + u^\top R u \,\mathrm{d}t
-    + x(t_1)^\top X_f\, x(t_1).$$
+    $$\int_{t_0}^{t_1} \left( x^\top Q x + 2 x^\top S u + u^\top R u \right)
+    \mathrm{d}t + x(t_1)^\top X_f\, x(t_1).$$
 
     The solution is exact except for rounding, for stiff equations and coarse grids too.
     The flow of $[I; X]$ is linear, so a matrix exponential gives it over a short

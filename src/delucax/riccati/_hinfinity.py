@@ -72,7 +72,7 @@ def hinf_dare(
     For the system $x_{k+1} = A x_k + B u_k + D w_k$ with $x_0 = 0$, the control
     $u = -K x$, $K = R^{-1} B^\top X M^{-1} A$, ensures for every disturbance $w$ that
 
-    $$\sum_{k=0}^\infty x_k^\top Q x_k + u_k^\top R u_k \le
+    $$\sum_{k=0}^\infty \left( x_k^\top Q x_k + u_k^\top R u_k \right) \le
     \gamma^2 \sum_{k=0}^\infty w_k^\top w_k.$$
 
     The worst disturbance is $w = \gamma^{-2} D^\top X M^{-1} A x$. The control does not
@@ -153,17 +153,18 @@ def hinf_care(
     For the system $\dot{x} = A x + B u + D w$ with $x(0) = 0$, the control $u = -K x$,
     $K = R^{-1} B^\top X$, ensures for every disturbance $w$ that
 
-    $$\int_0^\infty x^\top Q x + u^\top R u \,\mathrm{d}t \le
+    $$\int_0^\infty \left( x^\top Q x + u^\top R u \right) \mathrm{d}t \le
     \gamma^2 \int_0^\infty w^\top w \,\mathrm{d}t.$$
 
     The worst disturbance is $w = \gamma^{-2} D^\top X x$.
 
     The solver doubles the interval of the Riccati differential equation, and then takes
     Newton steps. At the end it checks that $X$ is positive semidefinite and that the
-    closed loop is stable. The derivatives are as in [`delucax.riccati.hinf_dare`][]: of
-    any order at a given `gamma`; without `gamma`, the first of the smallest level, and
-    all others with the level held fixed. As `gamma` approaches the smallest level, $X$
-    may grow without bound: for a controller, take a `gamma` a few percent higher.
+    closed loop is stable. The solution is differentiable to any order at a given
+    `gamma`. Without `gamma`, the smallest level has first derivatives, and the other
+    results are differentiated with the level held fixed, as in
+    [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the smallest level, $X$ may
+    grow without bound: for a controller, take a `gamma` a few percent higher.
 
     **Arguments:** `A`, `B`, `D`, `Q`, `gamma` and `throw`: as in
     [`delucax.riccati.hinf_dare`][].
@@ -171,8 +172,8 @@ def hinf_care(
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
     - `tolerance`: the relative tolerance of the smallest level; by default 1e-6, or
         1e-3 in float32. If $X$ grows without bound, the result is the smallest level at
-        which $X$ has enough correct digits to be accepted, about 1e-5 above the exact
-        one.
+        which $X$ has enough correct digits to be accepted. It is above the exact level
+        by about 1e-5, relatively.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
     no solution.

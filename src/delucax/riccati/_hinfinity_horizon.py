@@ -72,9 +72,10 @@ def hinf_dre(
     The control does not know $w$, and $\gamma^2 I - D^\top X_{t+1} D$ must be positive
     definite at each step.
 
-    All matrices except `final` may vary in time. The derivatives are as in
-    [`delucax.riccati.hinf_dare`][]: of any order at a given `gamma`; without `gamma`,
-    the first of the smallest level, and all others with the level held fixed.
+    All matrices except `final` may vary in time. The solution is differentiable to any
+    order at a given `gamma`. Without `gamma`, the smallest level has first derivatives,
+    and the other results are differentiated with the level held fixed, as in
+    [`delucax.riccati.hinf_dare`][].
 
     **Arguments:**
 
@@ -145,22 +146,23 @@ def hinf_cre(
 ) -> GameSolution:
     r"""H-infinity control over a finite horizon in continuous time.
 
-    The equation runs backwards in time, from $X(t_1) = X_f$ (`final`), with $t_1$ the
-    last of `times`:
+    The equation runs backwards in time, from $X(t_1) = X_f$ (`final`). $t_0$ and $t_1$
+    are the first and the last of `times`:
 
     $$-\dot{X} = A^\top X + X A - X (B R^{-1} B^\top - \gamma^{-2} D D^\top) X + Q$$
 
-    For the system $\dot{x} = A x + B u + D w$, which starts at $x = 0$, the control
+    For the system $\dot{x} = A x + B u + D w$ with $x(t_0) = 0$, the control
     $u = -K(t)\, x$ with $K = R^{-1} B^\top X$ ensures for every disturbance $w$ that
 
-    $$\int^{t_1} x^\top Q x + u^\top R u \,\mathrm{d}t + x(t_1)^\top X_f\, x(t_1)
-    \le \gamma^2 \int^{t_1} w^\top w \,\mathrm{d}t.$$
+    $$\int_{t_0}^{t_1} \left( x^\top Q x + u^\top R u \right) \mathrm{d}t
+    + x(t_1)^\top X_f\, x(t_1) \le \gamma^2 \int_{t_0}^{t_1} w^\top w \,\mathrm{d}t.$$
 
-    The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. The
-    derivatives are as in [`delucax.riccati.hinf_dare`][]: of any order at a given
-    `gamma`; without `gamma`, the first of the smallest level, and all others with the
-    level held fixed. As `gamma` approaches the smallest level, $X$ grows without bound
-    at the first time: for a controller, take a `gamma` a few percent higher.
+    The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. It is
+    differentiable to any order at a given `gamma`. Without `gamma`, the smallest level
+    has first derivatives, and the other results are differentiated with the level held
+    fixed, as in [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the smallest
+    level, $X$ grows without bound at the first time: for a controller, take a `gamma` a
+    few percent higher.
 
     **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as in
     [`delucax.riccati.hinf_care`][].

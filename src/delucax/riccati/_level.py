@@ -189,8 +189,8 @@ def bisect_level(
 
     The first trial starts at `start` and has no disturbance. It shows whether any level
     is feasible, and gives the scale of the bracket. The other trials start at its
-    solution. The level is the upper end of a bracket of relative width `tolerance`,
-    which is feasible. It is 0 if the disturbance has no effect on the cost.
+    solution. The level is the feasible, upper end of a bracket of relative width
+    `tolerance`, or 0 if the disturbance has no effect on the cost.
     """
     problem, start, gamma = stop_gradient((problem, start, gamma))
     A, B, D, *others = problem
@@ -209,8 +209,8 @@ def bisect_level(
     def body(now):
         first = now.trials == 0
         if gamma is None:
-            # Increase the level until it is feasible, decrease it until it is not, then
-            # bisect. Factors and the mean of logarithms, as the level has any size.
+            # Increase the level by factors until it is feasible, decrease it until it
+            # is not, then bisect the logarithms: the level may have any size.
             known = xp.where(xp.isinf(now.high), 1, now.high)
             up = xp.where(now.low == 0, now.start, _FACTOR * now.low)
             down = xp.where(now.low == 0, known / _FACTOR, _within(now, tolerance))

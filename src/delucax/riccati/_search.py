@@ -55,7 +55,7 @@ _BALANCE_THRESHOLD = 4
 
 
 class Attempt(NamedTuple):
-    """A candidate for the stabilising solution, and the quantities that judge it.
+    """A candidate for the stabilising solution, and the quantities to judge it.
 
     `point` holds the matrices of the candidate, one below the other.
     """
@@ -118,7 +118,8 @@ def search(
 
     def body(carry):
         best, so_far = carry
-        # The kind is data: branches would each be compiled, and run all under vmap.
+        # The kind is data, because branches would all be compiled, and all run under
+        # vmap.
         before = Verdict(*so_far)
         kind = before.kind
         at = attempt(kind)
@@ -175,8 +176,8 @@ def search(
 
 
 def no_verdict(kind: Any, dtype: Any) -> Array:
-    """The verdict before any attempt, with `kind` the first. The pair counts as
-    stabilisable, and residuals are infinite."""
+    """The verdict before the first attempt, which is of this `kind`. Residuals are
+    infinite, and the pair counts as stabilisable."""
     most = xp.inf
     return numbers(kind, most, most, most, -most, 0, 0, 0, 1, 0, 0, dtype=dtype)
 
@@ -223,7 +224,7 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
         exponent = xp.log2(M.ravel())
         return xp.where(xp.isfinite(exponent), exponent, lowest).reshape(M.shape)
 
-    # The quadratic blocks are products of B R^-1/2 and Q^1/2, which have the scale of
+    # The quadratic blocks are squares of B R^-1/2 and Q^1/2, which have the scale of
     # one state and of the cost. The unit of the cost is free: it is one more row and
     # column, and its factor balances the two. All sizes are base-2 logarithms.
     effort = xp.sqrt(_diagonal_sizes(R))

@@ -128,7 +128,7 @@ def _growth(A, probing, limit=None):
 
     def squared(power, logarithm, weight):
         grown = largest(power)
-        # The power of a nilpotent matrix, whose radius is zero, is not scaled.
+        # A power of a nilpotent matrix becomes zero, and then is not scaled.
         finished = ~(grown > 0)
         scaled = power * (1 / xp.where(finished, 1, grown))
         # log |A^2N| / 2N is this sum, because each squared matrix has norm one. The
