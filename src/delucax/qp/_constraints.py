@@ -233,8 +233,8 @@ def as_matrices(value: Any, name: str, where: str) -> Array:
     if array.ndim not in (2, 3):
         raise ValueError(
             f"{where}: {name} must be a matrix"
-            f"{'' if where == 'Dense' else ', or one for each stage in a stack'}, got "
-            f"shape {array.shape}."
+            f"{'' if where == 'Dense' else ', or a stack of matrices for the stages'}, "
+            f"got shape {array.shape}."
         )
     return array
 

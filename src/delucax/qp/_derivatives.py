@@ -179,7 +179,7 @@ def _change(form: AbstractForm, change: AbstractForm, point: Any, pushes: Any):
         off = [jnp.max(jnp.abs(a - b), initial=0) for a, b in pairs]
         return system, jnp.max(jnp.stack(off))
 
-    # The derivative of a linear solve does not need that of its factors.
+    # A linear solve needs no derivatives of its factors.
     fixed = lax.stop_gradient((scaled, system_sides, compliance, probe, product(probe)))
     system, off = by_lanes(factorised, *fixed)
     unique = jnp.all(clear) & (off < 1e-2)

@@ -144,5 +144,5 @@ def both(row: Array) -> Array:
 
 
 def signed(z: Array) -> Array:
-    """The multiplier of each row: that of the upper minus that of the lower side."""
+    """The multiplier of each row: upper minus lower."""
     return z[0] - z[1]

@@ -20,7 +20,7 @@ from ._form import AbstractForm, both, Sides, signed
 
 
 _TO_BOUNDARY = 0.99
-"""The taken share of the step to the boundary."""
+"""The share of the step to the boundary that the method takes."""
 _NEGLIGIBLE = 1e-2
 """An error of this share of the tolerance is no reason to refine a linear system."""
 _PATIENCE = 5

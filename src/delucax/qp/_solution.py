@@ -15,8 +15,9 @@ class Solution(eqx.Module):
     If `result` is `RESULTS.no_feasible_point`, the multipliers are a certificate. The
     multipliers of inequalities are not negative, their combination of the constraints,
     $E^\top y + G^\top (\mu_\mathrm{upper} - \mu_\mathrm{lower})$, is zero, and the same
-    combination of the bounds is $-1$. This contradicts any feasible point. `x` and `u`
-    are NaN, and `cost` is infinite.
+    combination of the right sides is $-1$. ($G$ has a row for each bound of a variable
+    here.) A feasible point would contradict this. `x` and `u` are NaN, and `cost` is
+    infinite.
 
     If `result` is `RESULTS.unbounded`, `x` and `u` are a direction. It stays within all
     constraints, the Hessian is zero along it, and the linear cost decreases by 1 per

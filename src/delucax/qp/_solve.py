@@ -94,8 +94,8 @@ def solve(
         ```
 
         ```text
-        Array([[-0., -0.],
-               [-0., -1.]], dtype=float32)
+        Array([[ 0.,  0.],
+               [ 0., -1.]], dtype=float32)
         ```
     """
     where = "solve"

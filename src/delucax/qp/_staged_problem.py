@@ -118,7 +118,7 @@ class Staged(eqx.Module):
     **Raises:** `ValueError` if an array has the wrong shape or has NaN, if it is not
     finite (only bounds may be infinite), if arrays are for different horizons, if there
     is no finite number between two bounds, or if the weights are not symmetric and
-    positive semidefinite. The message names the stage and the entry.
+    positive semidefinite. The message names the stage, and the entry of a bound.
 
     Source: Rao, Wright and Rawlings, 1998.
 
