@@ -61,12 +61,12 @@ def disk_margin(
 ) -> DiskMargin:
     r"""The disk margin of a loop: how much its gain and its phase may change together.
 
-    $$\alpha = \left( \max_\omega \sigma_{\max}
-    \left( S(j\omega) + \tfrac{\sigma - 1}{2} I \right) \right)^{-1},
+    $$\frac{1}{\alpha} = \max_\omega
+    \left\| S(j\omega) + \tfrac{\sigma - 1}{2} I \right\|,
     \qquad S = (I + L)^{-1}$$
 
-    with the skew $\sigma$. The closed loop stays stable if the loop gain is multiplied
-    by any complex factor
+    with the skew $\sigma$ and the largest singular value as the norm. The closed loop
+    stays stable if the loop gain is multiplied by any complex factor
 
     $$\frac{2 + (1 - \sigma)\, \delta}{2 - (1 + \sigma)\, \delta}, \qquad
     |\delta| < \alpha.$$

@@ -151,7 +151,7 @@ def modal_observability(
         ```
 
         ```text
-        TODO1
+        Array([0.707, 0.707], dtype=float32)
         ```
     """
     where = "modal_observability"
