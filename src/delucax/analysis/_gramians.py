@@ -96,8 +96,8 @@ def controllability_gramian(
     \text{or in discrete time} \quad
     W = \sum_{k=0}^{T-1} A^k B B^\top (A^\top)^k$$
 
-    The horizon $T$ is infinite by default. The white noise acts at the inputs, with unit
-    intensity (unit covariance in discrete time). The minimal energy of inputs that
+    The horizon $T$ is infinite by default. The white noise acts at the inputs and has
+    unit intensity (unit covariance in discrete time). The minimal energy of inputs that
     reach $x$ from rest is $x^\top W^{-1} x$. $W$ is differentiable to any order, in
     either mode.
 
