@@ -80,7 +80,7 @@ def disk_margin(
     - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][], with as many controls as outputs.
     - `skew`: $\sigma$, a number. 0 (default) balances the sensitivity $S$ and the
-        complementary sensitivity $T = I - S$; 1 uses $S$, and -1 uses $T$.
+        complementary sensitivity $T = I - S$. 1 uses $S$, and -1 uses $T$.
     - `channel`: the index of the only channel that is perturbed, with the others
         closed; by default all channels are.
     - `throw`: raise an error if the search does not converge (default). If false, check

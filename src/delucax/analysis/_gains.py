@@ -225,7 +225,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 def _h2_norm(system: StateSpace) -> Scalar:
     stable = system.is_stable()
     W = stable_gramian(system.stable_or_placeholder(stable))
-    # The square root has no derivative at zero, so the unused branch takes that of 1.
+    # The square root has no derivative at zero, so the unused branch uses 1.
     square = xp.trace(system.C @ W @ system.C.T)
     positive = square > 0
     norm = xp.where(positive, xp.sqrt(xp.where(positive, square, 1)), 0)
@@ -307,7 +307,7 @@ def peak_gain(system: StateSpace) -> PeakGain:
     step = -rise / curvature
     gain = gain + step * slope + step**2 * curvature / 2
     gain, frequency = xp.where(finite, gain, largest_gain(safe.D)), top + step
-    # An unstable model has no peak. Its frequency is that of the least stable pole.
+    # An unstable model has no peak. Take the frequency of the least stable pole.
     least = poles[xp.argmax(growth)]
     if system.dt is None:
         at_pole = xp.abs(xp.imag(least))

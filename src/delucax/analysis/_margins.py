@@ -25,7 +25,8 @@ class Margins(eqx.Module):
 
     - `gain_margin`: the smallest factor above 1 on the loop gain that moves a pole to
         the boundary of stability; infinite if there is none.
-    - `gain_reduction`: the largest such factor below 1; zero if there is none.
+    - `gain_reduction`: the largest factor below 1 that moves a pole to the boundary;
+        zero if there is none.
     - `phase_margin`: the smallest phase change, of either sign, that moves a pole to
         the boundary, in radians; infinite if there is none.
     - `delay_margin`: the smallest delay that moves a pole to the boundary, in units of

@@ -177,8 +177,8 @@ def filter_dare(
 
     $X$ is the covariance of the prediction error: of $x_k$ given all measurements
     before time $k$. The gain of the measurement update of a Kalman filter is
-    $X C^\top (V + C X C^\top)^{-1}$. The equation is that of
-    [`delucax.riccati.dare`][] for the transposed system.
+    $X C^\top (V + C X C^\top)^{-1}$. The equation is the same as in
+    [`delucax.riccati.dare`][], for the transposed system.
 
     **Arguments:**
 
@@ -242,7 +242,8 @@ def filter_care(
     $$\dot{\hat{x}} = A \hat{x} + K (y - C \hat{x}), \qquad
     K = (X C^\top + S) V^{-1}.$$
 
-    The equation is that of [`delucax.riccati.care`][] for the transposed system.
+    The equation is the same as in [`delucax.riccati.care`][], for the transposed
+    system.
 
     **Arguments:** `A`, `C`, `S` and `throw`: as in [`delucax.riccati.filter_dare`][],
     with intensities instead of covariances.
@@ -279,7 +280,7 @@ def filter_care(
 
 
 def _filter(discrete, where, A, C, W, V, S, throw) -> RiccatiSolution:
-    """The solution of a filter equation: that of control for the transposed system."""
+    """Solve a filter equation as the control equation of the transposed system."""
     A, C = as_matrix(A, "A", where), as_matrix(C, "C", where)
     transposed = A.conj().T, C.conj().T, W, V, S, None
     data = riccati_arguments(

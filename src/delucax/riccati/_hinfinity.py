@@ -1,8 +1,8 @@
 """The stationary H-infinity games.
 
-The Riccati equation of a game is that of control for the joint control `[u; w]`. Its
-weight is indefinite: `R` for the control, and `-gamma^2 I` for the disturbance, which
-maximises the cost.
+A game has the same Riccati equation as a control problem with the joint control
+`[u; w]`. Its weight is indefinite: `R` for the control, and `-gamma^2 I` for the
+disturbance, which maximises the cost.
 """
 
 import functools

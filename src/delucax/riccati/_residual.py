@@ -296,9 +296,11 @@ def _twice(M):
 
 
 def linear_residual(discrete, A, B, C, X) -> Array:
-    """The residual of `A X + X B = C`, divided by `(|A| + |B|) |X| + |C|`. In discrete
-    time that of `X - A X B = C`, divided by `(|A| |B| + 1) |X| + |C|`.
+    """The relative residual of a linear matrix equation.
 
+    The equation is `A X + X B = C`, and the residual is divided by
+    `(|A| + |B|) |X| + |C|`. In discrete time these are `X - A X B = C` and
+    `(|A| |B| + 1) |X| + |C|`.
     This is the backward error: the relative change of the data that makes `X` exact. A
     bound on its rounding, which is small, is added.
     """
