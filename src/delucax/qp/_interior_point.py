@@ -140,8 +140,8 @@ def direction(method, at: Iterate, left: Residuals, first, guess: Guess, count, 
         dm = jnp.where(hinge, rm - stay * dt, 0)
         return method.joined(dx, dp, dz, ds, dt, dm)
 
-    # A loop over three right sides, so that the solve is compiled once: for tau, for the
-    # affine step, and for the step with the second-order correction.
+    # A loop over three right sides, so that the solve is compiled once: for tau, for
+    # the affine step, and for the step with the second-order correction.
     def turn(k, carry):
         along, d, sigma, _ = carry
         is_tau = k == 0

@@ -301,6 +301,7 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     The equation is `A X + X B = C`, and the residual is divided by
     `(|A| + |B|) |X| + |C|`. In discrete time these are `X - A X B = C` and
     `(|A| |B| + 1) |X| + |C|`.
+
     This is the backward error: the relative change of the data that makes `X` exact. A
     bound on its rounding, which is small, is added.
     """
