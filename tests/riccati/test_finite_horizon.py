@@ -326,7 +326,7 @@ def test_derivatives_of_the_differential_equation():
         ({"horizon": None}, "horizon must be given"),
         ({"horizon": 0}, "horizon must be a whole number"),
         ({"q": np.ones((3, 2))}, r"length of the time axis of q \(3\), got 4"),
-        ({"q": np.ones((4, 2)), "d": np.ones((3, 2))}, "must have one length"),
+        ({"q": np.ones((4, 2)), "d": np.ones((3, 2))}, "must have the same length"),
     ],
 )
 def test_wrong_arguments_of_the_recursion(change, match):

@@ -374,11 +374,12 @@ class Staged(eqx.Module):
         return x, y.costates, jnp.stack([side(1), side(0)])
 
     def equation(self, stage: int, row: int) -> str:
-        """The words for an equation of a `stage`, for an error message."""
+        """The words for the equation in `row` of a `stage`, for an error message."""
         return f"entry {row} of the step to stage {stage}" if stage else "the start"
 
     def place(self, side: int, stage: int, row: int) -> str:
-        """The words for a `side` (1 is the lower one), for an error message."""
+        """The words for a `side` of a `row` of a `stage` (1: the lower side), for an
+        error message."""
         n, m = self.B.shape[-2:]
         end = "lower" if side else "upper"
         for name, limits, size in (("x", self.states, n), ("u", self.controls, m)):
