@@ -209,7 +209,8 @@ class Dense(eqx.Module):
         return f"row {row} of equalities"
 
     def place(self, side: int, row: int) -> str:
-        """The words for a `side` (1: the lower one) of a `row`, for an error message."""
+        """The words for a `side` of a `row` (1: the lower side), for an error
+        message."""
         n = 0 if self.bounds is None else self.q.shape[0]
         end = "lower" if side else "upper"
         return f"the {end} bound of " + (f"x[{row}]" if row < n else f"row {row - n}")
