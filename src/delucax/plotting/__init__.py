@@ -1,7 +1,7 @@
-"""Matplotlib views of trajectories, animations and phase portraits.
+"""Plots of trajectories, animations and phase portraits, with Matplotlib.
 
-Needs the extra: `pip install "delucax[plot]"`. Figures are made without pyplot, so none
-is kept alive, no backend is chosen and no global setting is changed.
+They need an extra: `pip install "delucax[plot]"`. Figures are made without pyplot, so
+no figure is kept alive, no backend is chosen and no global setting is changed.
 """
 
 try:

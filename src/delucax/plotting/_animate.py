@@ -27,16 +27,16 @@ from ._runs import as_runs, HELD, Panel, panels_of, Run
 
 
 SIZE = 11.0
-# Inches: without the traces and with them, the least height, and what the texts take.
+# In inches: the size without and with traces, the least height, the height of the text.
 ALONE, BESIDE, LOWEST, HEADER = (5.0, 4.4), (10.0, 4.6), 1.5, 0.35
-FLASH = 4  # frames that show an event in its colour
+FLASH = 4  # the number of frames for which the name of an event is in colour
 
 
 class Scene:
-    """Draws the frames of an animation, one step of a trajectory each.
+    """Draws the frames of an animation. Each frame shows one step of a trajectory.
 
-    The frame that is nearest to an event shows the moment of the event in place of its
-    step, so that a ball touches the floor where it bounces.
+    The frame nearest to an event shows the moment of the event instead, so that a ball
+    is seen to touch the floor when it bounces.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Scene:
         moments = map(self._moment, self.rows.values())
         self.plant = PlantArtist(ax, episode, moments, visited)
 
-        if not traces and self.plant.ax.get_aspect() == 1:  # no higher than it must be
+        if not traces and self.plant.ax.get_aspect() == 1:  # no margin above and below
             left, right, low, high = self.plant.ax.axis()
             aspect = (high - low) / (right - left)
             height = min(height, max(LOWEST, width * aspect + HEADER))
@@ -89,13 +89,13 @@ class Scene:
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def _rows_of(self, indices: np.ndarray) -> dict[int, int]:
-        """The row of the path that the frame of each step shows."""
+        """From each step to the row of the path that its frame shows."""
         path = self.path
         rows = path.samples[indices]
         times = path.times[rows]
         for jump in path.jumps:
             i = int(np.argmin(np.abs(times - path.times[jump])))
-            if 0 < i < len(rows) - 1:  # the first and the last stay what they are
+            if 0 < i < len(rows) - 1:  # the first and the last frame keep their steps
                 rows[i] = jump
         return dict(zip(indices.tolist(), rows.tolist(), strict=True))
 
@@ -104,8 +104,8 @@ class Scene:
         return self.path.states[row], self.controls[step]
 
     def _panels(self, panels: Sequence[Panel], grid: Any) -> list[tuple[Line2D, Any]]:
-        """Faint traces of the whole run; the lines over them that grow, and their dots,
-        each with the values that it shows."""
+        """Draw faint traces of the whole run. Returns the lines that grow over them and
+        the dots at their ends, each with its times and values."""
         lines, axes = [], []
         for i, panel in enumerate(panels):
             ax = self.figure.add_subplot(grid[i], sharex=axes[0] if axes else None)
@@ -139,7 +139,7 @@ class Scene:
             self.texts[1].set_text(f"cost so far {np.nansum(costs[:k]):.4g}")
         self._tell_event(row)
         for line, (times, values) in self.lines:
-            # Costs have no value at the end; their dot stays at the last one.
+            # The last time has no cost: the dot stays at the last cost.
             shown = np.flatnonzero((times <= time) & np.isfinite(values))
             start = shown[-1:] if line.get_marker() == "o" else slice(max(shown) + 1)
             line.set_data(times[start], values[start])
@@ -152,8 +152,8 @@ class Scene:
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
     def _tell_event(self, row: int) -> None:
-        """The name of the last event and how often it has fired; in colour and bold
-        when it does."""
+        """Show the name of the last event and how often it has fired, in bold and in
+        colour if it has just fired."""
         path, text = self.path, self.texts[2]
         count = int(np.searchsorted(path.jumps, row, side="right"))
         if not count:
@@ -174,8 +174,8 @@ FASTEST, SLOWEST = 30.0, 5.0
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Animation:
-    """An animation: its frames show the steps `indices` of the trajectory. They are
-    drawn when they are first asked for."""
+    """An animation, whose frames show the steps `indices` of a trajectory. They are
+    drawn when they are first needed."""
 
     environment: Environment
     trajectory: Trajectory
@@ -215,40 +215,43 @@ def animate(
     dpi: float | int = 60,
     traces: bool = True,
 ) -> Animation:
-    """An animation of a trajectory: the plant, and its states, controls and costs.
+    """Animate a trajectory: the plant beside its states, controls and costs.
 
-    The drawing is chosen by the type of the system; every system of the library has
-    one, and [`delucax.plotting.register_drawing`][] gives one to yours. A system
-    without one is shown as a dot in the plane of its two states, or, if it has more or
-    fewer, as bars. The animation ends where the episode ends.
+    The type of the system decides how the plant looks. Register a drawing for your own
+    system with [`delucax.plotting.register_drawing`][]. A system without a drawing is
+    shown as a dot in the plane of its states if it has two states, and as bars
+    otherwise. The animation ends when the episode ends.
 
-    Of a system with events the frame that is nearest to an event shows the moment just
-    after it, and its name is told in colour. Events that the rollout did not keep are
-    located by taking its steps again, which needs the disturbances, if there were any.
+    If the system has events, the frame nearest to an event shows the moment just after
+    it, and the name of the event appears in colour. If the rollout did not keep its
+    events, its steps are computed again to locate them. This needs the disturbances, if
+    there were any.
 
     **Arguments:**
 
     - `environment`: the environment that was run.
     - `trajectory`: one trajectory with its states and controls.
-    - `path`: a file to save it to at once, ending in `.gif`, `.html` (a page that needs
-        nothing else) or `.mp4` (needs ffmpeg). None by default.
-    - `fps`: frames per second. By default it plays in real time, but with at least 5
-        frames per second: a longer run plays faster than real time.
-    - `max_frames`: the most frames, 100 by default; they are spread evenly over the
-        steps.
-    - `dpi`: pixels per inch, 60 by default: a picture 600 pixels wide, or half of that
+    - `path`: the file to which the animation is saved at once. It ends in `.gif`,
+        `.html` (a page that needs no other file) or `.mp4` (needs ffmpeg). By default
+        nothing is saved.
+    - `fps`: frames per second. By default the animation plays in real time, unless this
+        takes fewer than 5 frames per second: then it plays 5 frames per second, faster
+        than real time.
+    - `max_frames`: the largest number of frames, 100 by default. They are spread evenly
+        over the steps.
+    - `dpi`: pixels per inch, 60 by default. The picture is then 600 pixels wide, or 300
         without `traces`.
     - `traces`: whether to draw states, controls and costs beside the plant, True by
         default.
 
-    **Returns:** an animation, which a notebook plays. `animation.save(path)` writes it
-    to a file, as `path` does here; `len(animation)` is the number of frames, and
-    `animation.indices` has the step that each shows; `animation.fps`.
+    **Returns:** an animation. A notebook plays it, and `animation.save(path)` writes it
+    to a file. `len(animation)` is the number of frames, `animation.indices` the step
+    that each frame shows, and `animation.fps` the frames per second.
 
     **Raises:** `ValueError` if the trajectory is a batch, holds no states or controls,
-    or is not of this environment; if a number is not positive; if the ending of `path`
-    is another, its folder does not exist or cannot be written to, or there is no ffmpeg
-    for an `.mp4`.
+    has no step, or does not fit the environment; if a number is not positive; if `path`
+    has another ending, its folder does not exist, or it cannot be written; or if
+    `path` ends in `.mp4` and ffmpeg is not installed.
 
     !!! example
 

@@ -1,4 +1,4 @@
-"""Frames as files and as a page: GIF, HTML and MP4."""
+"""Writes frames to GIF, HTML and MP4 files."""
 
 import base64
 import hashlib
@@ -25,13 +25,13 @@ Pixels: TypeAlias = UInt8[np.ndarray, "... 3"]
 Indices: TypeAlias = Int[np.ndarray, "..."]
 Palette: TypeAlias = UInt8[np.ndarray, "_ 3"]
 
-TRANSPARENT = 63  # the palette's index that stands for "as in the first frame"
+TRANSPARENT = 63  # the entry of the palette that means "as in the first frame"
 # The script is deferred: some notebooks run it before the page's elements exist.
 PLAYER = string.Template(Path(__file__).with_name("_player.html").read_text("utf-8"))
 
 
 def check_path(path: Any, where: str) -> Path:
-    """`path` as a file that can be written, or an error, before anything is drawn."""
+    """Return `path` as a `Path`, or raise an error if it cannot be written."""
     path = as_path(path, "path", where)
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(
@@ -39,8 +39,7 @@ def check_path(path: Any, where: str) -> Path:
         )
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(
-            f"{where}: path must be a file in a folder that is there, got "
-            f"{str(path)!r}."
+            f"{where}: path must be a file in an existing folder, got {str(path)!r}."
         )
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise ValueError(f"{where}: path cannot be written to, got {str(path)!r}.")
@@ -59,10 +58,11 @@ def _ffmpeg() -> str:
 def reduced_palette(
     colours: Palette, counts: Num[np.ndarray, " _"], most: int
 ) -> tuple[Indices, Palette]:
-    """A palette of at most `most` colours, and the entry in it for each of `colours`.
+    """Reduce `colours` to a palette of at most `most`. Returns the entry of the palette
+    for each colour, and the palette.
 
-    The most frequent are kept exactly, which avoids ghosts of earlier frames by
-    quantisation.
+    The most frequent colours are kept exactly. Rounded colours would leave ghosts of
+    earlier frames.
     """
     if len(colours) <= most:
         return np.arange(len(colours)), colours
@@ -76,8 +76,8 @@ def reduced_palette(
 
 
 def _distinct(pixels: Pixels) -> tuple[Palette, Indices, Indices]:
-    """The distinct colours of pixels, which of them each pixel has, and how often each
-    occurs."""
+    """The distinct colours of pixels, the index of the colour of each pixel, and the
+    number of pixels of each colour."""
     packed = pixels.reshape(-1, 3).astype(int) @ np.array([65536, 256, 1])
     packed, index, counts = np.unique(packed, return_inverse=True, return_counts=True)
     colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=-1)
@@ -98,8 +98,8 @@ def _image(entries: Int[np.ndarray, "height width"], palette: Palette) -> Image.
 
 
 def compressed(frames: Iterable[Pixels]) -> list[Image.Image]:
-    """Frames of shape `(height, width, 3)` in few colours: the first whole, the others
-    transparent where they are as the first, so that a page of them is small."""
+    """Frames with few colours, from frames of shape `(height, width, 3)`. All but the
+    first are transparent where they equal the first, so that a page is small."""
     frames = iter(frames)
     first = next(frames)
     images = [_image(*_reduced(first, 255))]
@@ -107,7 +107,7 @@ def compressed(frames: Iterable[Pixels]) -> list[Image.Image]:
         changed = np.any(frame != first, axis=-1)
         entries = np.full(changed.shape, TRANSPARENT)
         entries[changed], palette = _reduced(frame[changed], TRANSPARENT)
-        # Filled up to the clear colour: a PNG knows only of those in its palette.
+        # A PNG can use only entries of its palette, so it must reach TRANSPARENT.
         image = _image(entries, np.resize(palette, (TRANSPARENT + 1, 3)))
         image.info["transparency"] = TRANSPARENT
         images.append(image)
@@ -115,14 +115,14 @@ def compressed(frames: Iterable[Pixels]) -> list[Image.Image]:
 
 
 def expanded(images: Sequence[Image.Image]) -> Iterator[Image.Image]:
-    """The whole frames, in full colour, that were compressed."""
+    """Undo `compressed`: yield whole frames in full colour."""
     first = images[0].convert("RGBA")
     for image in images:
         yield Image.alpha_composite(first, image.convert("RGBA")).convert("RGB")
 
 
 def write(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
-    """Write frames in the form that the ending of `path` names."""
+    """Write frames in the format that the ending of `path` names."""
     _WRITERS[path.suffix.lower()](path, frames, fps)
 
 
@@ -142,7 +142,7 @@ def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     for entry, table in zip(entries[1:], shared[which[1:]], strict=True):
         entry = np.where(entry == TRANSPARENT, first, table[entry])
         images.append(_image(entry, palette))
-    # The format counts in hundredths of a second; browsers take less than 2 for 10.
+    # GIF counts hundredths of a second, and browsers take a value below 2 as 10.
     options = {"duration": max(20, 10 * round(100 / fps)), "loop": 0, "optimize": True}
     images[0].save(path, save_all=True, append_images=images[1:], **options)
 
@@ -160,7 +160,7 @@ def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     width, height = frames[0].size
     command = [_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo"]
     command += ["-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6g}"]
-    # The pixel format that every player knows needs even sizes.
+    # yuv420p, the pixel format that every player knows, needs an even width and height.
     even = "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"
     command += ["-i", "-", "-vf", even, "-pix_fmt", "yuv420p", str(path)]
     data = b"".join(image.tobytes() for image in expanded(frames))
@@ -174,16 +174,16 @@ _WRITERS = {".gif": _write_gif, ".html": _write_html, ".mp4": _write_mp4}
 
 
 def html_player(frames: Sequence[Image.Image], fps: float) -> str:
-    """A player with a button and a slider, of compressed frames.
+    """The HTML of a player for compressed frames, with a button and a slider.
 
-    It needs nothing from the network; Matplotlib's own has its icons from another site.
+    It loads nothing from the network. Matplotlib's player loads its icons.
     """
     encoded = []
     for image in frames:
         buffer = io.BytesIO()
         image.save(buffer, "PNG")
         encoded.append(base64.b64encode(buffer.getvalue()).decode())
-    # A name from the content: the same animation makes the same page.
+    # A hash of the frames as the name: the same animation makes the same page.
     name = hashlib.sha256("".join(encoded).encode()).hexdigest()[:12]
     return PLAYER.substitute(
         id=f"delucax-{name}",

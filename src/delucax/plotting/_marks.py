@@ -1,4 +1,4 @@
-"""Marks of events in panels over time, and their entries in a legend."""
+"""Marks of events in the panels of a plot, and their entries in the legend."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,17 +11,17 @@ from .._figures import color_of, NEUTRAL
 from ._runs import Run
 
 
-MOST = 40  # lines across the panels; more are ticks above them
+MOST = 40  # more events than this are ticks above the panels, not lines across them
 
 
 def event_color(kind: int) -> str:
-    """Of a kind of event; states and controls have the first colours."""
+    """The colour of a kind of event; states and controls have the first colours."""
     return color_of((3, 2, 4, 5)[kind % 4])
 
 
 def _style(runs: Sequence[Run]) -> dict[str, Any]:
-    """A line across the panels for each event of one run, if they are few; else a tick
-    above them."""
+    """The style of event marks: lines across the panels if there is one run with few
+    events, else ticks above the panels."""
     counts = [len(path.jumps) for run in runs for path in run.paths]
     if len(counts) == 1 and counts[0] <= MOST:
         return {"linestyle": (0, (1, 1.5)), "linewidth": 1.2}
@@ -29,13 +29,14 @@ def _style(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _times(run: Run, name: str) -> list[np.ndarray]:
-    """When an event of a name fired in each member."""
+    """The times at which the event `name` fired, for each member."""
     kind = run.trajectory.event_names.index(name)
     return [path.times[path.jumps[path.kinds == kind]] for path in run.paths]
 
 
 def _kinds(runs: Sequence[Run]) -> dict[str, list[int]]:
-    """The kinds of event that fired in any run, and in which runs."""
+    """From the name of each event that fired to the indices of the runs in which it
+    fired."""
     runs_of: dict[str, list[int]] = {}
     for i, run in enumerate(runs):
         if run.trajectory.recorded_events is None:
@@ -48,8 +49,11 @@ def _kinds(runs: Sequence[Run]) -> dict[str, list[int]]:
 
 
 def mark_events(axes: Sequence[Axes], runs: Sequence[Run]) -> None:
-    """Mark the events of runs in the panels of their states: by lines across each of
-    them, or by ticks above the first, a row for each kind, or for each run."""
+    """Mark the events of runs in the panels of their states.
+
+    The marks are lines across each panel, or ticks above the first panel. The ticks
+    have a row for each kind of event, or for each run if runs are compared.
+    """
     compared = len(runs) > 1
     for name, where in _kinds(runs).items():
         style = _style(runs)
@@ -70,7 +74,7 @@ def mark_events(axes: Sequence[Axes], runs: Sequence[Run]) -> None:
 
 
 def event_entries(runs: Sequence[Run]) -> list[tuple[Line2D, str]]:
-    """What the marks mean, such as `"bounce: 6, first at 0.45"`."""
+    """The legend entries of the marks, such as `"bounce: 6, first at 0.45"`."""
     entries, compared = [], len(runs) > 1
     for name, where in _kinds(runs).items():
         times = [t for i in where for t in _times(runs[i], name)]

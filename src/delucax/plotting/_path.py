@@ -1,4 +1,4 @@
-"""The path of a run through its events."""
+"""The path of a run: its states, with the jumps at events."""
 
 import dataclasses
 from typing import NamedTuple
@@ -15,13 +15,14 @@ from ..simulation import Trajectory
 
 
 class Path(NamedTuple):
-    """Where one run has been: its samples, and the states before and after each event.
+    """The path of one run: its samples, and the states before and after each event.
 
     - `times`, `states`: shapes `(rows,)` and `(rows, n)`.
-    - `steps`: the step that begins at a row, or within which it is.
+    - `steps`: the step that starts at each row or contains it.
     - `samples`: the rows of the samples.
-    - `jumps`: the rows just after the events; those before them are just before.
-    - `kinds`: of the events.
+    - `jumps`: the rows just after the events. The row before each of these is just
+        before the event.
+    - `kinds`: the kinds of the events.
     """
 
     times: Float[np.ndarray, " rows"]
@@ -32,7 +33,7 @@ class Path(NamedTuple):
     kinds: Int[np.ndarray, " events"]
 
     def broken(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times and states as a line that is broken at each event."""
+        """Times and states, with NaN at each event so that a line breaks there."""
         times = np.insert(self.times, self.jumps, np.nan)
         return times, np.insert(self.states, self.jumps, np.nan, axis=0)
 
@@ -42,7 +43,7 @@ def path_of(
     states: Float[np.ndarray, "times n"],
     events: Events | None,
 ) -> Path:
-    """The path through samples and the events between them, of one run."""
+    """The path of one run through its samples and the events between them."""
     steps = np.arange(len(times))
     if events is None:
         none = np.zeros(0, int)
@@ -50,7 +51,8 @@ def path_of(
     at = np.asarray(events.kinds) >= 0
     where, _ = np.nonzero(at)
     fired = np.asarray(events.times, float)[at]
-    # What is not the plant's own, such as controls that wait, does not jump.
+    # Events hold the plant's own states. Other states, such as delayed controls, do not
+    # jump: interpolate them.
     share = (fired - times[where]) / (times[where + 1] - times[where])
     between = states[where] + share[:, None] * (states[where + 1] - states[where])
     ends = []
@@ -72,8 +74,8 @@ def path_of(
 
 
 def with_events(environment: Environment, trajectory: Trajectory) -> Trajectory:
-    """One trajectory with its events: where they were not kept its steps are taken
-    again, all at once, as far as all that acted on them is known."""
+    """One trajectory with its events. If they were not kept, its steps are computed
+    again, unless the disturbances are unknown."""
     dynamics, w = environment.dynamics, trajectory.disturbances
     if not dynamics.event_names or trajectory.recorded_events is not None or w is None:
         return trajectory

@@ -1,4 +1,4 @@
-"""The phase portrait of a planar system."""
+"""Phase portraits of systems with two states."""
 
 from typing import Any, TypeAlias
 
@@ -33,27 +33,31 @@ def phase_portrait(
     control: Any = None,
     trajectories: Trajectories = (),
 ) -> Figure:
-    """Draw the flow of a system with two states, and trajectories in it.
+    r"""Draw the phase portrait of a system with two states, and trajectories in it.
 
-    Streamlines follow dx/dt at time 0, thicker where it is faster. A dot marks where a
-    trajectory starts. A state that is an angle (the system's `difference` wraps it)
-    shows its trajectories in every turn that is within the limits. Of a system with
-    events the flow is left out beyond the guards, and their zero lines are dashed; a
-    dotted line leads from before to after each event that a trajectory kept.
+    Streamlines follow $\dot x$ at time 0. They are thicker where the state moves
+    faster. A dot marks the start of each trajectory. If a state is an angle (the
+    system's `difference` wraps it), trajectories are repeated in every turn within the
+    limits.
+
+    If the system has events, dashed lines show where their guards are zero, and the
+    flow is left out beyond the guards. A dotted line joins the states before and after
+    each event that a trajectory kept.
 
     **Arguments:**
 
     - `system`: a system with two states.
-    - `limits`: `((low, high), (low, high))`, of the first and the second state.
-    - `control`: a vector, or a function of the state to one (for a closed loop); zero
-        by default.
-    - `trajectories`: a [`delucax.Trajectory`][] (or a batch of them), a sequence, or a
-        dictionary from labels to them; none by default.
+    - `limits`: the ranges of the first and the second state, `((low, high), (low,
+        high))`.
+    - `control`: a vector, shape `(m,)`, or a function from the state to such a vector
+        (for a closed loop); zero by default.
+    - `trajectories`: a [`delucax.Trajectory`][], a batch of them, a sequence of them,
+        or a dictionary from labels to trajectories; none by default.
 
     **Returns:** a `matplotlib.figure.Figure`.
 
-    **Raises:** `ValueError` if the system does not have two states, if limits cross, or
-    if the control or a trajectory does not fit the system.
+    **Raises:** `ValueError` if the system does not have two states, if a lower limit is
+    not below the upper one, or if the control or a trajectory does not fit the system.
 
     !!! example
 
@@ -90,7 +94,7 @@ def phase_portrait(
     ax = figure.add_subplot()
     figures.style_axes(ax, size=SIZE, ticks=(8, 6))
     ax.grid(False)
-    # Speed as seen in the picture, so that neither axis outweighs the other.
+    # Speed relative to the limits, so that neither axis outweighs the other.
     speed = np.linalg.norm(field / (limits[:, 1] - limits[:, 0]), axis=-1)
     top = np.nanmax(np.where(np.isfinite(speed), speed, 0.0), initial=0.0) or 1.0
     if np.any(speed > 0):
@@ -150,8 +154,8 @@ def _checked_limits(limits: Any, where: str) -> Limits:
 def _field(
     system: AbstractSystem, control: Any, states: Float[Array, "n 2"], where: str
 ) -> tuple[Float[np.ndarray, "n 2"], dict[str, np.ndarray]]:
-    """dx/dt at each row of `states`, NaN beyond a guard; and, by their names, the
-    guards that are zero somewhere, NaN where they are not enabled."""
+    """The derivative at each row of `states`, NaN beyond a guard. Also, by name, the
+    values of the guards that change sign, NaN where a guard is not enabled."""
     if not callable(control):
         given = np.zeros(system.control_size) if control is None else control
         control = as_vector(given, system.control_size, "control", where)
@@ -190,7 +194,7 @@ def _compiled_field(
 def _turns(
     system: AbstractSystem, path: Float[np.ndarray, "times 2"], limits: Limits
 ) -> list[np.ndarray]:
-    """The shifts by whole turns of its angles that bring `path` into the limits."""
+    """The shifts by whole turns of the angles that bring `path` within the limits."""
     turns, zero = [np.zeros(2)], jnp.zeros(2)
     for i, (low, high) in enumerate(limits):
         full = 2 * np.pi * np.eye(2)[i]

@@ -1,4 +1,4 @@
-"""States, controls and costs against time."""
+"""Plots of states, controls and costs against time."""
 
 import math
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ Values: TypeAlias = Float[np.ndarray, "batch times"]
 WIDTH = 7.0
 PANEL_HEIGHT = 1.35
 SIZE = 9.0
-# Of a legend beside a panel.
+# The style of a legend beside a panel.
 COMPACT: dict[str, Any] = {"handlelength": 1.4, "handletextpad": 0.5}
 COMPACT |= {"labelspacing": 0.3, "borderaxespad": 0.3}
-# Markers at the end of a member of a run.
+# The markers at the end of each member of a run.
 END_MARKS: dict[str, dict[str, Any]] = {
     "failed": {"marker": "x"},
     "terminated": {"marker": "o", "markerfacecolor": "none"},
@@ -43,35 +43,39 @@ def plot(
 ) -> Figure:
     """Draw states, controls and costs against time, in stacked panels.
 
-    States that share a unit share a panel. Controls are drawn as the steps they are. Of
-    a batch of at most 8 every member is drawn as a thin line; of a larger one the
-    median and the band between the quartiles of those that have not ended. Several
-    trajectories are laid over each other, with a panel for each state. A ring marks
-    where an episode terminated, a cross where it failed. Above the controls a tick
-    marks each step at which something went wrong in the controller, such as a failed
-    plan, or, of one trajectory, at which the bounds clipped the control. Events, if
-    they were kept, break the lines of the states; each is a dotted line across their
-    panels, or, where they are many or several trajectories are drawn, a tick above.
+    States that share a unit share a panel. Controls are drawn as steps, because they
+    are held over each step. Each member of a batch of at most 8 is drawn as a thin
+    line. A larger batch is drawn as the median and the band between the quartiles of
+    the members that have not ended. Several trajectories are drawn over each other,
+    with a panel for each state.
 
-    The figure is not registered with pyplot: a notebook shows it, and
-    `figure.savefig("run.pdf")` writes it.
+    A ring marks where an episode terminated, and a cross where it failed. A tick above
+    the controls marks a step at which something went wrong in the controller, such as a
+    failed plan. For a single trajectory, ticks also mark the steps at which the bounds
+    clipped the control. Events, if they were kept, break the lines of the states. A
+    dotted line across the panels of the states marks each event. If there are many
+    events, or several trajectories, a tick above the panels marks each event instead.
+
+    The figure is not registered with pyplot. A notebook shows it, and
+    `figure.savefig("run.pdf")` writes it to a file.
 
     **Arguments:**
 
     - `trajectory`: a [`delucax.Trajectory`][], a batch of them, or several to compare:
         a dictionary from labels to trajectories, or a sequence.
-    - `labels`: strings, one a trajectory, where a sequence is given; or the title of
-        one trajectory. None by default.
-    - `environment`: the environment that was run; its control bounds are then drawn as
-        dashed lines. None by default.
+    - `labels`: one label for each trajectory of a sequence, or the title of a single
+        trajectory. None by default.
+    - `environment`: the environment that was run. If it is given, its control bounds
+        are drawn as dashed lines. None by default.
     - `show`: what to draw, and in which order: `"states"`, `"controls"`, `"costs"`,
         `"observations"`, `"disturbances"`, or the name of one state or control. By
-        default the first three, as far as they were kept.
+        default states, controls and costs, if they were kept.
 
-    **Returns:** a `matplotlib.figure.Figure`, with one entry of `axes` a panel.
+    **Returns:** a `matplotlib.figure.Figure`. Its `axes` has one entry for each panel.
 
     **Raises:** `ValueError` if there is nothing to draw, if states were not kept, if
-    the trajectories are not of the same plant, or if `show` names what is not there.
+    the trajectories are not of the same plant, or if `show` names something that the
+    trajectory does not hold.
 
     !!! example
 
@@ -96,7 +100,7 @@ def plot(
         if missing:
             raise ValueError(
                 f"plot: trajectory[{run.label!r}] holds no "
-                f"{', '.join(sorted(missing))}, which the first trajectory does; keep "
+                f"{', '.join(sorted(missing))}, but the first trajectory does; keep "
                 "them in both rollouts."
             )
     env = environment
@@ -127,7 +131,8 @@ def plot(
 
 
 def control_bounds(environment: Any, run: Run, where: str) -> Bounds | None:
-    """The bounds of each control, shape `(2, m)`, or `None`; checked against a run."""
+    """The bounds of each control, shape `(2, m)`, or `None` without bounds. Raises an
+    error if the environment does not fit the run."""
     check_instance(environment, Environment, "environment", where)
     for name in ("state_names", "control_names"):
         expected = getattr(run.trajectory, name)
@@ -159,9 +164,9 @@ def draw_panel(
     size: float = SIZE,
     faint: float = 1.0,
 ) -> list[Line2D]:
-    """One panel: its series, its names, and the bounds of its controls.
+    """Draw one panel: its series, its names, and the bounds of its controls.
 
-    Returns a handle a line, which has its colour and style.
+    Returns a handle for each line, with its colour and style.
     """
     figures.style_axes(ax, size=size)
     compared = len(runs) > 1
@@ -192,14 +197,14 @@ def _label(ax: Axes, panel: Panel, width: int, size: float) -> None:
     joined = ", ".join(panel.names)
     length = len(figures.with_unit(joined, panel.unit))
     if len(panel.names) > 1 and length > 2.5 * width:
-        # The names are in the legend; here the kind and the unit say enough.
+        # The legend has the names: the kind and the unit are enough here.
         joined = panel.kind
     text = figures.wrapped(figures.with_unit(joined, panel.unit), width)
     ax.set_ylabel(text, fontsize=size if text.count("\n") < 2 else size - 1)
 
 
 def _total(run: Run) -> str:
-    """`"total cost 12.3"`, or the median over a batch of those that are finite."""
+    """`"total cost 12.3"`, or the median of the finite total costs of a batch."""
     totals = run.total_costs
     if totals.size == 1:
         return f"total cost {totals[0]:.4g}"
@@ -210,7 +215,7 @@ def _total(run: Run) -> str:
 def _draw_series(
     ax: Axes, run: Run, kind: str, column: int, style: dict[str, Any], faint: float
 ) -> None:
-    """One series of a run: a line a member, or the median and a band."""
+    """Draw one series of a run: a line for each member, or the median and a band."""
     held = kind in HELD
     style = style | {"drawstyle": "steps-post" if held else "default"}
     if run.as_band:
@@ -233,9 +238,9 @@ def _draw_series(
 
 
 def _mark_ends(ax: Axes, run: Run, values: Values, color: str) -> None:
-    """A cross where a member failed, a ring where it terminated.
+    """Draw a cross where a member failed, and a ring where it terminated.
 
-    Of a band, whose members are not drawn, the marks stand on the time axis.
+    If a band is drawn in place of the members, the marks lie on the time axis.
     """
     style: dict[str, Any] = {"markersize": 6, "markeredgewidth": 1.5}
     if run.as_band:
@@ -251,7 +256,7 @@ def _mark_ends(ax: Axes, run: Run, values: Values, color: str) -> None:
 
 
 def _mark_incidents(ax: Axes, runs: Sequence[Run]) -> None:
-    """Ticks above the panel, a row for each kind of incident."""
+    """Draw ticks above the panel, in a row for each kind of incident."""
     style = {"markersize": 4, "markeredgewidth": 1.2, "clip_on": False}
     style["transform"] = ax.get_xaxis_transform()
     for row, (name, own_color) in enumerate(_incident_colors(runs).items()):
@@ -265,8 +270,8 @@ def _mark_incidents(ax: Axes, runs: Sequence[Run]) -> None:
 
 
 def _incident_colors(runs: Sequence[Run]) -> dict[str, str]:
-    """The kinds of incident that happened in any run, and their colours. Where runs are
-    compared, those of the controllers alone: every one of them may be clipped."""
+    """The kinds of incident that happened in any run, and their colours. If runs are
+    compared, clipped controls are left out, because they can be common to all runs."""
     colors = {name: figures.color_of(3) for run in runs for name in run.incidents}
     if "clipped_control" in colors:
         colors["clipped_control"] = figures.NEUTRAL
@@ -276,7 +281,8 @@ def _incident_colors(runs: Sequence[Run]) -> dict[str, str]:
 
 
 def _incident_label(name: str, runs: Sequence[Run]) -> str:
-    """`"failed plan: 12 steps, first at 0.55"`, or in how many members of a batch."""
+    """`"failed plan: 12 steps, first at 0.55"`, or `"failed plan: in 3 of 8"` for a
+    batch."""
     steps = [run.incidents[name] for run in runs if name in run.incidents]
     words = name.replace("_", " ")
     members = sum(len(run.failed) for run in runs)
@@ -289,7 +295,8 @@ def _incident_label(name: str, runs: Sequence[Run]) -> str:
 
 
 def _draw_bounds(ax: Axes, panel: Panel, bounds: Bounds, compared: bool) -> None:
-    """A dashed line a bound: neutral where the controls of the panel share it."""
+    """Draw a dashed line for each bound, in grey if the controls of the panel share the
+    bounds."""
     chosen = bounds[:, list(panel.columns)]
     shared = np.all(chosen == chosen[:, :1])
     for j in range(1 if shared else chosen.shape[1]):
@@ -299,7 +306,7 @@ def _draw_bounds(ax: Axes, panel: Panel, bounds: Bounds, compared: bool) -> None
 
 
 def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
-    """The legend above the panels: the labels, and what the marks mean."""
+    """Draw the legend above the panels: the labels, and the meaning of the marks."""
     compared = len(runs) > 1
     entries: list[tuple[Line2D, str]] = []
     for i, run in enumerate(runs if compared else ()):
@@ -327,7 +334,7 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
     if not entries:
         figure.suptitle(title, fontsize=SIZE + 1)
         return
-    # Lengths in characters, of which eleven fit an inch, and six more for the handle.
+    # Lengths in characters: eleven fit an inch, and a handle takes six.
     lengths = [6 + max(map(len, label.split("\n"))) for _, label in entries]
     room = int(11 * figure.get_figwidth())
     columns = len(entries) if sum(lengths) <= room else room // max(lengths)

@@ -1,4 +1,4 @@
-"""One moment of a plant as a picture: on given axes, or by itself, or in a window."""
+"""Pictures of a plant at one moment: on given axes, as an array, or in a window."""
 
 from collections.abc import Iterable
 from typing import Any, TypeAlias
@@ -24,9 +24,9 @@ Moments: TypeAlias = Iterable[tuple[Vector, Vector]]
 class PlantArtist:
     """Draws the plant of an environment, moment by moment.
 
-    The limits are those that the drawing chose, or that hold all of `moments`, pairs of
-    state and control. Where the drawing leaves a path, that of all of `states` is drawn
-    faint.
+    The drawing sets the limits of the axes, or they fit all `moments`, pairs of state
+    and control. If the drawing leaves a path, the path of all `states` is drawn
+    faintly.
     """
 
     def __init__(
@@ -51,8 +51,8 @@ class PlantArtist:
             self.ax.plot(*path.T, color=PALETTE[0], lw=1.8, alpha=alpha, zorder=1)
 
     def draw(self, x: Vector, u: Vector, past: Past | None = None) -> None:
-        """Draw one moment in the place of the one before, and the path up to it of the
-        `past` times and states, the last of which is `x`."""
+        """Draw one moment in place of the previous one. If `past` is given, the times
+        and states up to now with `x` as the last, draw the path so far too."""
         for artist in self.ax.get_children():
             if id(artist) not in self._fixed:
                 artist.remove()
@@ -69,12 +69,12 @@ _INCHES, _DPI = (5.0, 5.0), 100
 class Renderer:
     """Draws the plant of an environment, one state at a time.
 
-    The limits of the axes are those of a rollout without control.
+    The limits of the axes fit a rollout with zero control.
 
     **Arguments:**
 
     - `environment`: a [`delucax.Environment`][].
-    - `window`: show each picture in a window too; `False` by default.
+    - `window`: whether to also show each picture in a window; `False` by default.
 
     **Raises:** `RuntimeError` if a window is asked for and there is no display.
 
@@ -108,7 +108,7 @@ class Renderer:
         else:
             self.figure = Figure(_INCHES, _DPI, layout="constrained")
             FigureCanvasAgg(self.figure)
-        # A reference rollout, which sets the limits of the axes.
+        # This rollout sets the limits of the axes.
         idle = Zero(environment.control_size)
         trajectory = rollout(environment, idle, key=jax.random.key(0), throw=False)
         states = np.asarray(trajectory.states, float)
@@ -130,7 +130,7 @@ class Renderer:
         canvas: Any = self.figure.canvas
         canvas.draw()
         if self.pyplot is not None:
-            self.pyplot.pause(1e-3)  # shows it, where there is a screen
+            self.pyplot.pause(1e-3)  # updates the window
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Trajectories as labelled arrays, and panels for them."""
+"""Trajectories as labelled arrays, and the panels that show them."""
 
 import dataclasses
 import functools
@@ -29,11 +29,11 @@ FEW = 8
 class Run:
     """A labelled trajectory, or a batch of them, ready to draw.
 
-    Every array of `series` has shape `(batch, T + 1, size)`, and is NaN where the
-    trajectory has ended or is not finite. A series that is held over a step has its
-    last value repeated at the end of the last step. Of `incidents` there are those that
-    happened, booleans of shape `(batch, T)`. A member has `failed`, has `terminated`,
-    or neither.
+    Every array of `series` has shape `(batch, T + 1, size)`. It is NaN after the end of
+    the trajectory and where it is not finite. A series that is held over each step
+    repeats its last value at the end of the last step. `incidents` holds the kinds that
+    happened, as booleans of shape `(batch, T)`. A member has `failed`, has
+    `terminated`, or neither.
     """
 
     label: str
@@ -47,7 +47,7 @@ class Run:
 
     @functools.cached_property
     def as_band(self) -> bool:
-        """Whether it is drawn as quartiles: a large batch whose members share times."""
+        """Whether to draw quartiles: for a large batch whose members share times."""
         return len(self.times) > FEW and bool(np.all(self.times == self.times[:1]))
 
     @functools.cached_property
@@ -59,7 +59,7 @@ class Run:
 
     @functools.cached_property
     def paths(self) -> list[Path]:
-        """Where each member has been, through its events if they were kept."""
+        """The path of each member, with its events if they were kept."""
         events, batch = self.trajectory.recorded_events, self.trajectory.batch_shape
         flat = lambda a: np.asarray(a).reshape(len(self.times), *a.shape[len(batch) :])
         events = jax.tree.map(flat, events)
@@ -70,7 +70,7 @@ class Run:
         ]
 
     def lines(self, kind: str, column: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The times and values of one series, a line for each member."""
+        """The times and values of one series, a pair for each member."""
         if kind == "states":
             broken = [path.broken() for path in self.paths]
             return [(times, states[:, column]) for times, states in broken]
@@ -78,13 +78,14 @@ class Run:
 
     @property
     def time_label(self) -> str:
-        """`"time [s]"`, in the unit of a plant that names units; else `"time"`."""
+        """`"time [s]"`, in the time unit of the plant, if it names units; else
+        `"time"`."""
         trajectory = self.trajectory
         named = any((*trajectory.state_units, *trajectory.control_units))
         return f"time [{trajectory.time_unit}]" if named else "time"
 
     def names_and_units(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Those of a kind of series; `""` for a unit that is not known."""
+        """The names and units of a kind of series; `""` for an unknown unit."""
         run, size = self.trajectory, self.series[kind].shape[-1]
         letter = "w" if kind == "disturbances" else "y"
         names, units = {
@@ -97,7 +98,7 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """Columns of one kind of series that share a unit, and so an axis."""
+    """Columns of one kind of series that share an axis, and so a unit."""
 
     kind: str
     columns: tuple[int, ...]
@@ -106,7 +107,8 @@ class Panel:
 
 
 def as_runs(given: Any, labels: Any, argument: str, where: str) -> list[Run]:
-    """`given` (a trajectory, a mapping or a sequence of them) as runs, or an error."""
+    """Convert `given` (a trajectory, or a mapping or sequence of them) to runs. Raises
+    an error if it cannot be drawn."""
     if isinstance(given, Trajectory):
         names, trajectories = [""], [given]
     elif isinstance(given, Mapping):
@@ -129,7 +131,7 @@ def as_runs(given: Any, labels: Any, argument: str, where: str) -> list[Run]:
         labels = [labels] if isinstance(labels, str) else labels
         if not isinstance(labels, Sequence) or len(labels) != len(trajectories):
             raise ValueError(
-                f"{where}: labels must be {len(trajectories)} strings, one a "
+                f"{where}: labels must be {len(trajectories)} strings, one for each "
                 f"trajectory, got {labels!r}."
             )
         names = map(str, labels)
@@ -162,7 +164,7 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
     batch, steps = trajectory.batch_shape, trajectory.steps
 
     def flat(array: Any) -> np.ndarray:
-        """With one axis for all those of the batch."""
+        """Merge the axes of the batch into one."""
         array = np.asarray(array)
         return array.reshape((math.prod(batch), *array.shape[len(batch) :]))
 
@@ -204,7 +206,8 @@ def _until(
 
 
 def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
-    """The panels for what `show` names: one a unit if `grouped`, else one a series."""
+    """The panels for what `show` names: one for each unit if `grouped`, else one for
+    each column."""
     chosen: dict[str, list[int]] = {}
     kept = {kind: run.names_and_units(kind) for kind in run.series}
     if show is None:

@@ -1,1 +1,1 @@
-"""How plants look: draw functions, found by the type of the system."""
+"""The drawings of plants, chosen by the type of the system."""

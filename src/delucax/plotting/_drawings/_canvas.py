@@ -45,10 +45,10 @@ def box(width: Number, height: Number, corner: Number) -> Points:
 def arc_arrow(
     radius: Number, start: Number, sweep: Number, slimness: Number = 1.0
 ) -> Points:
-    """The corners of an arrow bent about the origin: from the angle `start`, through
-    `sweep`, both in radians."""
+    """The corners of an arrow bent about the origin. It starts at the angle `start` and
+    turns by `sweep`, both in radians."""
     width = 0.16 * radius / slimness
-    head = min(0.5 / slimness, 0.6 * abs(sweep))  # the angle that the head takes of it
+    head = min(0.5 / slimness, 0.6 * abs(sweep))  # the angle that the head takes up
     end = start + sweep - np.sign(sweep) * head
     angles = np.linspace(start, end, 40)
     along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -61,8 +61,8 @@ def arc_arrow(
 
 @dataclasses.dataclass(frozen=True)
 class Canvas:
-    """Axes, the colours of drawings, and the shapes that they put on the axes. Keywords
-    are Matplotlib's."""
+    """Axes, the colours of drawings, and methods that draw shapes on the axes. Keywords
+    are passed on to Matplotlib."""
 
     ax: Axes
 
@@ -84,7 +84,7 @@ class Canvas:
         self.circle(at, radius, color=color, **{"lw": 0, "zorder": 2} | style)
 
     def bar(self, at: Point, width: Number, top: Number, **style: Any) -> None:
-        """A filled bar that stands on the point `at`, up to the height `top`."""
+        """A filled bar that stands on the point `at` and reaches the height `top`."""
         corner, height = (at[0] - width / 2, float(at[1])), top - at[1]
         style = {"lw": 0, "zorder": 2} | style
         self.ax.add_artist(Rectangle(corner, width, height, **style))
@@ -92,13 +92,13 @@ class Canvas:
     def polygon(
         self, corners: Points, at: Point = (0, 0), angle: Number = 0.0, **style: Any
     ) -> None:
-        """A filled shape, turned about its origin and put somewhere."""
+        """A filled shape, turned by `angle` about its origin and moved to `at`."""
         points = np.asarray(at, float) + corners @ rotation(angle).T
         style = {"color": self.BODY, "lw": 0, "zorder": 2} | style
         self.ax.add_artist(Polygon(points, **style))
 
     def link(self, start: Point, end: Point, width: Number = 9, **style: Any) -> None:
-        """A rod with round ends, of a width in points."""
+        """A rod with round ends. The width is in points."""
         style = {"color": self.BODY, "zorder": 2} | style
         self.line([start, end], linewidth=width, solid_capstyle="round", **style)
 
@@ -117,12 +117,12 @@ class Canvas:
         self.disc(at, 0.3 * radius, self.GOAL, zorder=1)
 
     def reach(self, radius: Number, room: Number = 1.2) -> None:
-        """The circle about the origin that a tip goes round, and the view of it."""
+        """The circle about the origin that a tip moves on, and the view of it."""
         self.circle((0, 0), radius, fill=False, color=self.NEUTRAL, alpha=0.25, lw=1)
         self.view((0.0, 0.0), (room * radius, room * radius))
 
     def view(self, centre: Point, half: Point) -> "View":
-        """Set the limits to a part of the plane, of this centre and half extent."""
+        """Set the limits of the axes to a centre and half an extent."""
         view = View(self, np.asarray(centre, float), np.asarray(half, float))
         (left, low), (right, high) = view.centre - view.half, view.centre + view.half
         self.ax.set(xlim=(left, right), ylim=(low, high))
@@ -141,15 +141,15 @@ class Canvas:
         color: str = ACTION,
         slimness: Number = 1.0,
     ) -> None:
-        """A torque, by its share of the largest: an arrow about a point of up to 240
-        degrees, from the angle `start`."""
+        """A torque, as an arrow about a point that starts at the angle `start`. `share`
+        is the torque relative to the largest, which turns by 240 degrees."""
         if abs(share) > 0.01:
             arrow = arc_arrow(radius, start, FULL_TURN * share, slimness)
             self.polygon(arrow, at, color=color, zorder=3)
 
     def force(self, start: Point, vector: Point, full: Number, **style: Any) -> None:
-        """A force: a straight arrow along `vector`, its width that of one whose largest
-        length is `full`."""
+        """A force, as a straight arrow along `vector`. `full` is the length of the
+        largest force, which sets the width of the arrow."""
         x, y = (float(part) for part in vector)
         length = math.hypot(x, y)
         if length < 0.01 * full:
@@ -164,23 +164,25 @@ class Canvas:
     def push(
         self, at: Point, gap: Number, full: Number, share: Number, angle: Number = 0.0
     ) -> None:
-        """A force on what lies `gap` around a point, by its share of the largest, which
-        is `full` long: from the side that it leads to, along or against an angle."""
+        """A force on a body, along `angle` or against it. `share` is the force relative
+        to the largest, whose arrow is `full` long. The arrow starts `gap` from the
+        point `at`, on the side to which the force points."""
         along = rotation(angle)[:, 0]
         start = np.asarray(at, float) + math.copysign(gap, share) * along
         self.force(start, full * share * along, full)
 
 
 class View(NamedTuple):
-    """A part of the plane: `centre` and half of its extent, `half`, each `(2,)`."""
+    """A part of the plane: its `centre`, and `half` its extent, both of shape
+    `(2,)`."""
 
     canvas: Canvas
     centre: Float[np.ndarray, "2"]
     half: Float[np.ndarray, "2"]
 
     def follow(self, at: Point, room: Number) -> None:
-        """Set the limits to this part, moved only as far as keeps `at` inside, `room`
-        from the edge."""
+        """Set the limits to this part, moved as little as needed to keep `at` inside,
+        at least `room` from the edge."""
         inner = np.maximum(self.half - room, 0.0)
         shift = at - np.clip(at, self.centre - inner, self.centre + inner)
         self.canvas.view(self.centre + shift, self.half)
@@ -194,11 +196,12 @@ Past: TypeAlias = tuple[Float[np.ndarray, " times"], States]
 class Drawing(NamedTuple):
     """How the plant of one episode is drawn.
 
-    - `draw(x, u)` draws one moment.
-    - `path(states)` is where the plant has been, shape `(times, 2)`, if it leaves one.
-    - `autoscale`: whether the limits of the axes are to fit all that is drawn.
-    - `walks`: whether it is `draw(x, u, past)`, which is given the times and the states
-        up to now, too, as they tell how far the plant has come.
+    - `draw(x, u)`: draws one moment.
+    - `path(states)`: the path that the plant leaves, shape `(times, 2)`; `None` if it
+        leaves no path.
+    - `autoscale`: whether the limits of the axes must fit all that is drawn.
+    - `walks`: whether `draw` takes a third argument `past`, the times and states up to
+        now, which tell how far the plant has moved.
     """
 
     draw: Callable[..., Any]
@@ -209,26 +212,28 @@ class Drawing(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """The run that is drawn, in the terms that drawings ask for."""
+    """The run that is drawn, and the values that drawings take from it."""
 
     environment: Environment
     trajectory: Trajectory
 
     @functools.cached_property
     def system(self) -> Any:
-        """The innermost system of the environment; its dynamics if they hold none."""
+        """The innermost system of the environment, or the dynamics if they hold no
+        system."""
         return layers(self.environment)[-1]
 
     @functools.cached_property
     def states(self) -> States:
-        """The states without those that are not finite; one of zeros if all are."""
+        """The finite states; a single state of zeros if none is finite."""
         states = np.asarray(self.trajectory.states, float)
         finite = states[np.all(np.isfinite(states), axis=-1)]
         return finite if len(finite) else np.zeros_like(states[:1])
 
     @functools.cached_property
     def target(self) -> Vector | None:
-        """The target state of the cost, by default the origin; `None` without any."""
+        """The target state of the cost. It is the origin if the cost has only a target
+        control, and `None` if it has no target."""
         if self.environment.cost.targets is None:
             return None
         x, _ = self.environment.cost.targets
@@ -236,7 +241,8 @@ class Episode:
         return zero if x is None else np.asarray(x, float)
 
     def visited(self, columns: Sequence[int]) -> Float[np.ndarray, "_ columns"]:
-        """Some entries of the states, and last of the target, if there is one."""
+        """Some columns of the states, with the target as the last row if there is
+        one."""
         states = self.states
         if self.target is not None:
             states = np.concatenate([states, self.target[None]])
@@ -244,8 +250,8 @@ class Episode:
 
     @functools.cached_property
     def largest_controls(self) -> Vector:
-        """The magnitude of a full arrow, per control: its bound if it has one, else the
-        largest that was applied, else 1."""
+        """The magnitude of each control whose arrow has full length: its bound, else
+        the largest value that was applied, else 1."""
         bounds = self.environment.control_bounds or (0.0, 0.0)
         low, high = (np.abs(np.asarray(end, float)) for end in bounds)
         largest = np.broadcast_to(np.maximum(low, high), self.environment.control_size)
@@ -255,12 +261,12 @@ class Episode:
         return np.where(largest > 0, largest, 1.0)
 
     def shares(self, u: Vector) -> Vector:
-        """Controls as shares of the largest, between -1 and 1."""
+        """Controls relative to the largest, clipped to [-1, 1]."""
         return np.clip(u / self.largest_controls, -1, 1)
 
 
 Setup: TypeAlias = Callable[[Canvas, Episode], Drawing]
-"""Draws static artists, sets the limits of the axes, and returns the `Drawing`."""
+"""Draws what does not move, sets the limits of the axes, and returns the `Drawing`."""
 
 
 def layers(environment: Environment) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Machines that stand still: a lung, a motor, and two tanks."""
+"""Plants that stay in place: a lung, a motor, and two tanks."""
 
 import math
 
@@ -15,8 +15,8 @@ _SCALE = 60.0  # cmH2O at the top of the gauge
 
 
 def lung(canvas: Canvas, episode: Episode) -> Drawing:
-    """A lung drawn by its fill level, a pressure gauge with the target levels, and the
-    opening of the valves."""
+    """A lung whose size shows how full it is, a pressure gauge with the target
+    pressures, and the openings of the valves."""
     environment, states = episode.environment, episode.states
     names = list(environment.dynamics.state_names)
     pressure = next((names.index(name) for name in _PRESSURES if name in names), 0)
@@ -61,8 +61,8 @@ CURRENT = color_of(4)
 
 
 def motor(canvas: Canvas, episode: Episode) -> Drawing:
-    """The stator, and the rotor with its magnets along d; the voltage and the current,
-    as arrows in the plane of d and q, and the speed, as an arc about the stator."""
+    """The stator, and the rotor with its magnets along d. The voltage and the current
+    are arrows in the plane of d and q, and the speed is an arc about the stator."""
     ax, states, target = canvas.ax, episode.states, episode.target
     ax.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4))
     style = {"width": STATOR - GAP, "color": canvas.NEUTRAL, "alpha": 0.25}
@@ -93,14 +93,14 @@ def motor(canvas: Canvas, episode: Episode) -> Drawing:
     return Drawing(draw)
 
 
-HEIGHT, FALL = 1.0, 0.42  # of a tank, and of the water between them
+HEIGHT, FALL = 1.0, 0.42  # the height of a tank, and the gap between the tanks
 BOTTOMS = (HEIGHT + FALL, 0.0)
 TOP = BOTTOMS[0] + 1.12 * HEIGHT
 
 
 def two_tank(canvas: Canvas, episode: Episode) -> Drawing:
-    """The tanks, as wide as the roots of their areas; their levels, and the one to
-    hold; what runs out of each, and what the pump pours in."""
+    """Two tanks with their levels, the target level, the flow out of each tank, and the
+    flow from the pump. The width of a tank is the square root of its area."""
     system, target = episode.system, episode.target
     roots = np.sqrt([float(system.upper_area), float(system.lower_area)])
     widths = 1.1 * roots / roots.max()
@@ -132,7 +132,7 @@ def two_tank(canvas: Canvas, episode: Episode) -> Drawing:
         for i, bottom in enumerate(BOTTOMS):
             top = bottom + heights[i]
             canvas.bar((0, bottom), widths[i], top, color=canvas.BODY, alpha=0.75)
-            # By Torricelli's law the stream is as the root of the level.
+            # By Torricelli's law the flow is proportional to the root of the level.
             stream = holes[i] * float(np.sqrt(heights[i] / HEIGHT))
             canvas.bar((0, ends[i]), stream, bottom, color=canvas.SECOND)
 

@@ -12,8 +12,9 @@ from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector
 
 
 def pendulum(canvas: Canvas, episode: Episode) -> Drawing:
-    """A rod of length 1 with a bob, hinged at the origin, angle 0 upright and growing
-    anticlockwise; the torque is an arc of up to 240 degrees about the hinge."""
+    """A rod of length 1 with a bob, hinged at the origin. Angle 0 is upright, and the
+    angle grows anticlockwise. The torque is an arc of up to 240 degrees about the
+    hinge."""
     canvas.reach(1, room=1.25)
     canvas.line([(0, 1.06), (0, 1.16)], color=canvas.NEUTRAL, linewidth=2)
 
@@ -34,8 +35,8 @@ def arm_points(
     lengths: tuple[float, float],
     zero: float = 0.0,
 ) -> Float[np.ndarray, "*times 3 2"]:
-    """The hinge, the elbow and the tip of two links, which are `zero` from hanging at
-    angle 0."""
+    """The hinge, the elbow and the tip of two links. At angle 0 they are turned by
+    `zero` from hanging."""
     first = x[..., 0] + zero
     both = first + x[..., 1]
     elbow = lengths[0] * np.stack([np.sin(first), -np.cos(first)], axis=-1)
@@ -56,9 +57,10 @@ def _draw_arm(canvas: Canvas, points: Points, reach: float, bob: float = 0.0) ->
 
 def acrobot(canvas: Canvas, episode: Episode) -> Drawing:
     """Two links that hang at angle 0, with the torque as an arc about the elbow, and
-    the line above which the tip is to come."""
+    the line that the tip must reach."""
     system = episode.system
-    # The second link has no length: its centre of mass is taken for its middle.
+    # The system does not hold the length of the second link. Take the centre of mass as
+    # its middle.
     lengths = float(system.length_1), 2 * float(system.center_2)
     reach = sum(lengths)
     canvas.reach(reach)
@@ -77,8 +79,8 @@ def acrobot(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def reacher(canvas: Canvas, episode: Episode) -> Drawing:
-    """Two links along x at angle 0, with masses at their ends, and a torque as an arc
-    about each joint; the hand leaves a path."""
+    """Two links that lie along x at angle 0, with masses at their ends, and the torque
+    as an arc about each joint. The hand leaves a path."""
     system = episode.system
     lengths = float(system.length_1), float(system.length_2)
     reach = sum(lengths)
@@ -97,7 +99,7 @@ def reacher(canvas: Canvas, episode: Episode) -> Drawing:
     return Drawing(draw, lambda states: points(states)[:, 2])
 
 
-# Of the cart under a pole, in lengths of the pole.
+# The size of the cart under a pole, relative to the length of the pole.
 WIDTH, HEIGHT, WHEEL = 0.56, 0.26, 0.08
 HINGE = WHEEL + HEIGHT
 
@@ -111,8 +113,8 @@ def _cart_pole(
     bob: float = 0.0,
 ) -> Drawing:
     """A cart on its track, and a chain of poles that lean to the right by `lean(x)`,
-    with a mass at the tip if `bob` is not 0. The track ends where the task says, and
-    the view goes lower if the poles hang at times."""
+    with a mass at the tip if `bob` is not 0. The track ends at the limits of the task,
+    if it has any. The view reaches lower if `hangs`."""
     canvas.ground()
     whole, size = sum(lengths), sum(lengths) / len(lengths)
     end = getattr(episode.environment.terminated, "max_position", None)
@@ -154,7 +156,7 @@ def _cart_pole(
 
 
 def _hangs(angles: Float[np.ndarray, "times poles"]) -> bool:
-    """Whether a pole hangs at times."""
+    """Whether a pole hangs down at any time."""
     return bool(np.cos(angles).min(initial=1.0) < 0.3)
 
 
@@ -174,12 +176,13 @@ def double_pendulum_cart(canvas: Canvas, episode: Episode) -> Drawing:
 
 def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
     """A rod with a mass at its tip, which leans to the left for positive angles. Its
-    length shows in how much more a force accelerates the cart than the angle."""
+    length is the acceleration of the cart over that of the angle, for the same
+    force."""
     B = np.asarray(episode.system.B, float).reshape(-1, 4, 1)
     cart, turning = B[0, 2:, 0]
     length = float(cart / turning) if turning * cart > 0 else 1.0
     lean = lambda x: -x[1:2]
-    # The model is true near the upright alone, so its pole never hangs.
+    # The model holds only near the upright, so its pole never hangs.
     return _cart_pole(canvas, episode, [length], lean, hangs=False, bob=0.09)
 
 
@@ -213,8 +216,8 @@ def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def mass_spring_damper(canvas: Canvas, episode: Episode) -> Drawing:
-    """A chain of masses from the wall, with marks where they rest, and the force on
-    the last of them."""
+    """A chain of masses attached to a wall, with marks at their rest positions, and the
+    force on the last mass."""
     count = int(episode.system.masses)
     places = episode.states[:, :count]
     stretch = np.abs(np.diff(places, axis=1, prepend=0.0)).max(initial=0.0)
@@ -257,7 +260,7 @@ def zigzag(start: float, end: float, height: float, swing: float) -> Points:
 def _draw_damper(
     canvas: Canvas, start: float, end: float, height: float, rest: float, size: float
 ) -> None:
-    """A cup on the left and a piston on the right, which moves in it."""
+    """A cup on the left and a piston on the right that moves in the cup."""
     near, far = start + 0.12 * rest, start + 0.34 * rest
     cup = np.array([[far, size], [near, size], [near, -size], [far, -size]])
     share = np.clip((end - start) / rest - 0.3, 0.05, 1.3) / 1.4
@@ -275,8 +278,7 @@ CAR_LENGTH, CAR_HEIGHT, CAR_WHEEL = 0.17, 0.06, 0.028
 
 
 def mountain_car(canvas: Canvas, episode: Episode) -> Drawing:
-    """The car on the slope, pushed along it, between hills and walls, and a flag at
-    the goal."""
+    """A car on hilly ground, with the force along the slope, and a flag at the goal."""
     ax, environment = canvas.ax, episode.environment
     positions = episode.states[:, 0]
     low = getattr(environment.dynamics, "min_position", -1.2)

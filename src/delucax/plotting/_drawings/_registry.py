@@ -1,4 +1,4 @@
-"""The drawing of each plant, and those of states without a picture: a plane or bars."""
+"""The drawing of each plant, and the default drawings: a plane of states, or bars."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -24,7 +24,7 @@ MOST_NAMES = 16
 
 
 def state_space(canvas: Canvas, episode: Episode) -> Drawing:
-    """A plane if there are two states, else bars."""
+    """The default drawing: a plane if there are two states, else bars."""
     planar = episode.environment.state_size == 2
     return plane(canvas, episode) if planar else bars(canvas, episode)
 
@@ -32,8 +32,8 @@ def state_space(canvas: Canvas, episode: Episode) -> Drawing:
 def plane(
     canvas: Canvas, episode: Episode, columns: tuple[int, int] = (0, 1)
 ) -> Drawing:
-    """A dot in the plane of two states, with the goal, and with the flow where there
-    are but two; the view grows where the dot would leave it."""
+    """A dot in the plane of two states, with the goal, and with the flow if there are
+    no other states. The view grows if the dot would leave it."""
     ax, dynamics, target = canvas.ax, episode.environment.dynamics, episode.target
     units = dynamics.state_units or ("",) * dynamics.state_size
     ax.set_axis_on()
@@ -63,8 +63,8 @@ def plane(
 
 
 def _draw_flow(canvas: Canvas, episode: Episode, view: View) -> None:
-    """Faint arrows along which the states go, all of one length: under the control of
-    the equilibrium, or without control if none is named."""
+    """Draw the directions of the flow as faint arrows, under the control of the
+    equilibrium, or zero control if the plant defines no equilibrium."""
     ends = view.centre - view.half, view.centre + view.half
     sides = np.linspace(*ends, ARROWS + 2)[1:-1].T
     places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
@@ -85,12 +85,12 @@ def _draw_flow(canvas: Canvas, episode: Episode, view: View) -> None:
 
 
 def bars(canvas: Canvas, episode: Episode) -> Drawing:
-    """States in blue and controls in orange, each as a bar from zero, named beneath,
-    with the range that the state goes through."""
+    """A bar from zero for each state, in blue, and each control, in orange, with its
+    name below and its range as a faint bar."""
     ax, dynamics, states = canvas.ax, episode.environment.dynamics, episode.states
     n, m = dynamics.state_size, dynamics.control_size
     largest = np.abs(states).max(axis=0, initial=0.0)
-    # States of one unit are drawn to one scale.
+    # States with the same unit share a scale.
     units = np.array(dynamics.state_units or ("",) * n)
     scale = np.array([largest[units == unit].max() for unit in units])
     scale = np.where(scale > 0, scale, 1.0)
@@ -128,7 +128,7 @@ _BY_TYPE: dict[type, Setup] = {
     systems.DynamicBicycle: _vehicles.car,
     systems.FurutaPendulum: _vehicles.furuta,
     systems.KinematicBicycle: _vehicles.car,
-    # The plane of x and z, in which the wings are drawn.
+    # The plane of x and z, which shows the two wings of the attractor.
     systems.Lorenz: functools.partial(plane, columns=(0, 2)),
     systems.MassSpringDamper: _mechanics.mass_spring_damper,
     systems.MountainCar: _mechanics.mountain_car,
@@ -144,9 +144,9 @@ _BY_TYPE: dict[type, Setup] = {
     systems.Thermostat: _switches.thermostat,
     systems.TwoTank: _machines.two_tank,
     systems.ValveWithStops: _switches.valve,
-    AbstractDynamics: state_space,  # what has no drawing of its own
+    AbstractDynamics: state_space,  # plants without a drawing of their own
 }
-# Lungs, and linear models, which keep the names of the plant that they approximate.
+# Lungs and linear models are known by the names of their states and controls.
 _LUNG_CONTROLS = ("u_in", "u_out")
 _LINEAR_CART_POLE = ("position", "angle", "velocity", "spin"), ("force",)
 
@@ -156,25 +156,26 @@ def register_drawing(
     draw: Callable[..., Any],
     setup: Callable[..., Any] | None = None,
 ) -> None:
-    """Tell [`delucax.animate`][] how a kind of plant looks.
+    """Set how [`delucax.animate`][] draws a kind of plant.
 
-    It is used for environments whose system, or whose dynamics, is of that class or a
-    subclass of it. A later registration for the same class replaces the earlier one.
+    The drawing is used for environments whose system or dynamics is of this class or a
+    subclass of it. Registering the class again replaces its drawing.
 
     **Arguments:**
 
     - `system_class`: a subclass of [`delucax.AbstractSystem`][] or of
         [`delucax.AbstractDynamics`][].
-    - `draw`: `draw(ax, x, u)` draws one moment on Matplotlib axes of equal aspect: `x`
-        is the state and `u` the control, NumPy vectors. It is called afresh for each
-        frame; what it drew before is removed.
-    - `setup`: `setup(ax, environment, trajectory)`, called once, draws what stays and
-        sets the limits of the axes. A dictionary that it returns is passed on to `draw`
-        as keyword arguments: lengths of the plant, for example. None by default; the
-        limits then fit all that is drawn.
+    - `draw`: a function `draw(ax, x, u)` that draws one moment on Matplotlib axes of
+        equal aspect. `x` is the state, shape `(n,)`, and `u` the control, shape `(m,)`,
+        both NumPy arrays. It is called for each frame, and what it drew for the
+        previous frame is removed first.
+    - `setup`: a function `setup(ax, environment, trajectory)` that is called once. It
+        draws what does not move and sets the limits of the axes. It may return a
+        dictionary, with the lengths of the plant, for example: `draw` gets its entries
+        as keyword arguments. None by default: the limits then fit all that is drawn.
 
-    **Raises:** `ValueError` if the class is not one of systems or dynamics, or if
-    `draw` or `setup` cannot be called.
+    **Raises:** `ValueError` if the class is not a subclass of `AbstractSystem` or
+    `AbstractDynamics`, or if `draw` or `setup` is not a function.
 
     !!! example
 
@@ -224,10 +225,11 @@ def register_drawing(
 
 
 def drawing_for(environment: Environment) -> Setup:
-    """The drawing for the plant of an environment, the most particular one first.
+    """The drawing for the plant of an environment.
 
-    Looks at the dynamics and at what they wrap, the innermost system first. What has no
-    drawing of its own has that of all dynamics.
+    The innermost system is looked up first, then the dynamics around it. Of each of
+    these, the class comes first, then its base classes. If none of them has a drawing,
+    the default drawing is returned.
     """
     inner, *outer = reversed(layers(environment))
     for layer in (inner, *outer):

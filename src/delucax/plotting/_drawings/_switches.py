@@ -7,8 +7,8 @@ from ._mechanics import zigzag
 
 
 def ball(canvas: Canvas, episode: Episode) -> Drawing:
-    """The ball above the floor, what it has reached on each flight as a mark on a
-    ruler, and the height to reach."""
+    """A ball above the floor, a ruler that marks the top of each flight, and the height
+    to reach."""
     cost = episode.environment.cost
     goals = [getattr(term, "height", None) for term in getattr(cost, "terms", [cost])]
     goals = [float(goal) for goal in goals if goal is not None]
@@ -26,12 +26,12 @@ def ball(canvas: Canvas, episode: Episode) -> Drawing:
 
     def draw(x: Vector, u: Vector, past: Past) -> None:
         heights, speeds = past[1][:, 0], past[1][:, 1]
-        # A flight is over its top where the ball no longer rises.
+        # A flight has passed its top when the ball no longer rises.
         tops = np.flatnonzero((speeds[:-1] > 0) & (speeds[1:] <= 0))
         for height in np.maximum(heights[tops], heights[tops + 1]):
             ends = [(-0.95 * side, height), (-0.3 * side, height)]
             canvas.line(ends, color=canvas.BODY, lw=1.5, alpha=0.4, zorder=1)
-        # The lowest point of the ball is at its height.
+        # The height in the state is that of the lowest point of the ball.
         middle = (0.0, float(x[0]) + radius)
         canvas.disc(middle, radius)
         share = float(episode.shares(u)[0])
@@ -48,8 +48,8 @@ TUBE, BULB = (0.62, -0.55), 0.13
 
 
 def thermostat(canvas: Canvas, episode: Episode) -> Drawing:
-    """A house with a thermometer, the band of the thermostat beside it, the heater,
-    which glows while it is on, and the second source as an arrow."""
+    """A house with a heater that glows while it is on, a thermometer with the band of
+    the thermostat beside it, and the second source of heat as an arrow."""
     system, states = episode.system, episode.states
     low, high = float(system.low), float(system.high)
     ends = min(low, states[:, 0].min()), max(high, states[:, 0].max())
@@ -84,7 +84,7 @@ def thermostat(canvas: Canvas, episode: Episode) -> Drawing:
         for place in -0.75 + 0.13 * np.arange(5):
             rib = box(0.1, 0.42, 0.045)
             canvas.polygon(rib, (place, -0.6), color=color, alpha=1 if is_on else 0.5)
-        if is_on:  # what rises from it
+        if is_on:  # warm air rises from the heater
             ys = np.linspace(0, 0.4, 30)
             for place in (-0.7, -0.5, -0.28):
                 wave = np.stack([place + 0.035 * np.sin(16 * ys), ys - 0.3], axis=-1)
@@ -96,8 +96,8 @@ def thermostat(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def stick_slip(canvas: Canvas, episode: Episode) -> Drawing:
-    """A block on a belt over two rollers, which turn, held by a spring; it is dark
-    where it sticks. A mark shows where it is to rest."""
+    """A block on a belt over two turning rollers, held by a spring. The block is dark
+    while it sticks. A mark shows its target."""
     belt, places = float(episode.system.belt), episode.states[:, 0]
     reach = float(max(np.abs(places).max(initial=0.0), 1e-3))
     side, roller = 0.9 * reach, 0.35 * reach
@@ -149,8 +149,9 @@ DISC, CAP, STEM = 0.12, 1.65, 1.7  # in units of the valve's travel
 
 
 def valve(canvas: Canvas, episode: Episode) -> Drawing:
-    """A disc on a stem between its seat and its stop, which turn green while it rests
-    on them, with the spring, what flows through the port, and the force on the stem."""
+    """A disc on a stem between its seat and its stop, with the spring, the flow through
+    the port, and the force on the stem. The seat and the stop are green while the disc
+    rests on them."""
     seat, stop = -0.06, 1.06 + DISC
     for sign in (-1, 1):
         wall = np.array([(0.75, -0.45), (0.75, CAP), (0.1, CAP)]) * [sign, 1]

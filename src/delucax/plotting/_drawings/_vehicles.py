@@ -1,4 +1,4 @@
-"""Cars from above, and what flies or turns in space."""
+"""Cars seen from above, and plants that fly or turn in space."""
 
 import math
 from collections.abc import Callable
@@ -30,8 +30,8 @@ LANES = 3
 
 
 def car(canvas: Canvas, episode: Episode) -> Drawing:
-    """A car with its front wheels steered, and its acceleration, on a road of three
-    lanes, the middle one along `y = 0`; the view goes along with it."""
+    """A car with its steered front wheels and its acceleration, on a road of three
+    lanes. The middle lane lies along `y = 0`, and the view follows the car."""
     ax, system = canvas.ax, episode.system
     front, rear = float(system.front), float(system.rear)
     base = front + rear
@@ -58,8 +58,8 @@ def car(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def _car_of(canvas: Canvas, front: float, rear: float) -> Callable[..., None]:
-    """`draw(place, heading, steering, share)` of a car from above, `share` being that
-    of the largest force along it."""
+    """A function `draw(place, heading, steering, share)` that draws a car from above.
+    `share` is the force along the car, relative to the largest."""
     base = front + rear
     width = 0.64 * base
     hood, boot = front + 0.3 * base, -rear - 0.28 * base
@@ -88,8 +88,8 @@ def _car_of(canvas: Canvas, front: float, rear: float) -> Callable[..., None]:
 
 
 def drifting_car(canvas: Canvas, episode: Episode) -> Drawing:
-    """The car on an open field with a grid, where its velocities lead it from the
-    origin, with its wheels steered and the force of the rear tyre."""
+    """A car on an open field with a grid, with its steered wheels and the force of the
+    rear tyre. Its velocities are integrated from the origin to find where it is."""
     front, rear = float(episode.system.front), float(episode.system.rear)
     base = front + rear
     half = np.full(2, 3.2 * base)
@@ -108,7 +108,8 @@ def drifting_car(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def _course(times: Vector, states: States) -> tuple[Vector, Points]:
-    """Headings and places of a car with states (vx, vy, rate), from (0, 0) along x."""
+    """The headings and places of a car with the states (vx, vy, yaw rate), which starts
+    at (0, 0) along x."""
     steps = np.diff(times)
     middle = (states[1:] + states[:-1]) / 2
     headings = np.append(0.0, np.cumsum(steps * middle[:, 2]))
@@ -119,7 +120,7 @@ def _course(times: Vector, states: States) -> tuple[Vector, Points]:
 
 
 def _draw_grid(canvas: Canvas, view: View, pitch: float) -> None:
-    """The lines of a grid that stays where it is on the ground."""
+    """Draw the lines of a grid that is fixed to the ground."""
     low, high = view.centre - view.half, view.centre + view.half
     style: dict[str, Any] = {"color": canvas.NEUTRAL, "alpha": 0.25, "lw": 1}
     for column, line in enumerate((canvas.ax.axvline, canvas.ax.axhline)):
@@ -129,7 +130,7 @@ def _draw_grid(canvas: Canvas, view: View, pitch: float) -> None:
 
 
 def _draw_dashes(canvas: Canvas, middle: float, half: float, base: float) -> None:
-    """The dashes between the lanes, which stay where they are on the road."""
+    """Draw the dashes between the lanes, which are fixed to the road."""
     pitch = 2.4 * base
     first = math.floor((middle - half) / pitch)
     last = math.ceil((middle + half) / pitch)
@@ -141,18 +142,18 @@ def _draw_dashes(canvas: Canvas, middle: float, half: float, base: float) -> Non
 
 
 def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
-    """A body with a rotor at each end and its thrust above it, the goal, and the wind
-    where there is one."""
+    """A body with a rotor at each end and the thrust above each rotor, the goal, and
+    the wind if there is one."""
     system, target = episode.system, episode.target
     visited = episode.visited((0, 1))
     length = float(system.length)
     low, high = visited.min(axis=0), visited.max(axis=0)
     half = 0.5 * float(np.max(high - low)) + 2 * length
-    # About all of it; of what is too large, about its end.
+    # The centre of the run, or its end if the run is too large to show.
     centre = (low + high) / 2 if half <= 20 * length else visited[-1]
     half = np.full(2, min(max(half, 4 * length), 20 * length))
     view = canvas.view(centre, half)
-    arm = max(length, 0.16 * float(half[0]))  # in a wide view it is drawn larger
+    arm = max(length, 0.16 * float(half[0]))  # drawn larger in a wide view
     if target is not None:
         canvas.goal(target[:2], 0.3 * arm)
     if system.wind is not None:
@@ -171,7 +172,8 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
 def _draw_two_rotors(
     canvas: Canvas, centre: Point, angle: float, arm: float, shares: Vector
 ) -> None:
-    """A body with a rotor at each end, and above it the share of its thrust."""
+    """Draw a body with a rotor at each end, and above each rotor its thrust relative to
+    the largest."""
     turned = rotation(angle)
     canvas.polygon(box(2 * arm, 0.16 * arm, 0.07 * arm), centre, angle)
     canvas.disc(centre, 0.2 * arm)
@@ -191,7 +193,7 @@ def slung_load(canvas: Canvas, episode: Episode) -> Drawing:
     visited, cable = episode.visited((0, 1)), float(system.cable)
     low, high = visited.min(axis=0), visited.max(axis=0) + [0, cable]
     half = 0.5 * float(np.max(high - low)) + cable
-    # About all of it; of what is too large, about its end.
+    # The centre of the run, or its end if the run is too large to show.
     centre = (low + high) / 2 if half <= 10 * cable else visited[-1]
     view = canvas.view(centre, np.full(2, min(half, 10 * cable)))
     arm = max(float(system.arm), 0.12 * float(view.half[0]))
@@ -210,7 +212,7 @@ def slung_load(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def _draw_wind(canvas: Canvas, wind: Callable[..., Array], view: View) -> None:
-    """Arrows of the force that the wind has at time 0 on what is at rest."""
+    """Draw arrows of the force of the wind at time 0 on a body at rest."""
     side = np.linspace(-0.9, 0.9, 9) * view.half[0]
     places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) + view.centre
     states = jnp.zeros((len(places), 6)).at[:, :2].set(places)
@@ -222,13 +224,13 @@ def _draw_wind(canvas: Canvas, wind: Callable[..., Array], view: View) -> None:
     canvas.ax.quiver(*places.T, *arrows.T, pivot="middle", **style)
 
 
-AZIMUTH, ELEVATION = math.radians(-62), math.radians(24)  # of the eye, far away
+AZIMUTH, ELEVATION = math.radians(-62), math.radians(24)  # the direction of the eye
 HORIZONTAL = np.array([math.cos(AZIMUTH), math.sin(AZIMUTH), 0.0])
 RIGHT = np.array([-math.sin(AZIMUTH), math.cos(AZIMUTH), 0.0])
 UP = -math.sin(ELEVATION) * HORIZONTAL + np.array([0.0, 0.0, math.cos(ELEVATION)])
 SCREEN = np.stack([RIGHT, UP])  # the axes of the picture, in space
 FRONT = color_of(4)
-# Front, left, back and right, as the thrusts are ordered.
+# Front, left, back and right: the order of the thrusts.
 ARMS = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], float)
 RIM = np.array(
     [[np.cos(a), np.sin(a), 0.0] for a in np.linspace(0, 2 * np.pi, 33)[:-1]]
@@ -236,13 +238,14 @@ RIM = np.array(
 
 
 def projected(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-    """Points in space as they lie in the picture."""
+    """Project points in space onto the picture."""
     return points @ SCREEN.T
 
 
 def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
-    """Two crossed arms with four rotors, the front one in amber; their thrusts, or the
-    thrust of all; a floor with a grid and the shadow on it, and the goal above it."""
+    """Two crossed arms with four rotors, the front one in amber, and their thrusts, or
+    the total thrust if the inputs are a wrench. Also a floor with a grid and the shadow
+    on it, and the goal above the floor."""
     system, target = episode.system, episode.target
     visited = episode.visited((0, 1, 2))
     length = float(system.arm)
@@ -251,7 +254,7 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     half = np.clip(0.5 * np.max(high - low) + 2 * length, 5 * length, 15 * length)
     centre = np.where(high - low < 2 * half, (low + high) / 2, middle)
     floor = float(max(low[2], centre[2] - half) - 2.5 * length)
-    arm = max(length, 0.16 * float(half))  # in a wide view it is drawn larger
+    arm = max(length, 0.16 * float(half))  # drawn larger in a wide view
 
     ends = np.array([-half, half])
     lines = []
@@ -279,7 +282,7 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
         for rotor in (*discs, place + 0.3 * arm * RIM @ turned.T):
             shadow = projected(rotor * [1, 1, 0] + [0, 0, floor])
             canvas.polygon(shadow, color=canvas.NEUTRAL, alpha=0.3, zorder=1)
-        # What is farther away is drawn first.
+        # The arms that are farther away are drawn first.
         order = np.argsort(hubs @ np.cross(RIGHT, UP))
         for i in order:
             color = FRONT if i == 0 else canvas.BODY
@@ -301,8 +304,8 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def furuta(canvas: Canvas, episode: Episode) -> Drawing:
-    """An arm that turns in the plane, and a pendulum at its end, seen from above at an
-    angle, with the voltage as an arc about the motor."""
+    """An arm that turns in the horizontal plane, and a pendulum at its end, seen from
+    above at an angle. The voltage is an arc about the motor."""
     arm, length = float(episode.system.arm_length), 2 * float(episode.system.center)
     reach = arm + length
     canvas.view((0.0, 0.0), (1.15 * reach, 1.15 * reach))
@@ -324,7 +327,7 @@ def furuta(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def _tips(states: States, arm: float, length: float) -> Float[np.ndarray, "times 3"]:
-    """Where the pendulum of an arm ends, in space."""
+    """The tip of the pendulum at the end of an arm, in space."""
     turn, angle = states[:, 0], states[:, 1]
     c, s, aside = np.cos(turn), np.sin(turn), length * np.sin(angle)
     flat = [arm * c - aside * s, arm * s + aside * c]

@@ -1,4 +1,4 @@
-"""A wheel of spokes and two walkers, on their slopes."""
+"""A rimless wheel and two walkers, on their slopes."""
 
 import math
 from collections.abc import Callable
@@ -9,8 +9,8 @@ from jaxtyping import Float
 from ._canvas import Canvas, Drawing, Episode, Past, Point, Vector
 
 
-# By how much the angle between the legs falls at a step, at least: legs that swing back
-# past each other between two samples are no step.
+# The least drop of the angle between the legs at a step. It tells a step from legs that
+# swing back past each other between two samples.
 LEAST_DROP = 0.15
 
 
@@ -19,13 +19,14 @@ def _downhill(slope: float) -> Float[np.ndarray, "2"]:
 
 
 def _spoke(angle: float, length: float) -> Float[np.ndarray, "2"]:
-    """From the foot to the hip of a leg that leans to the left by an angle."""
+    """The vector from the foot to the hip of a leg that leans to the left by
+    `angle`."""
     return length * np.array([-math.sin(angle), math.cos(angle)])
 
 
 class _Slope:
-    """The ground, hatched below, and the view that goes along with a hip: `wide` to
-    both sides, and from 0.4 legs below the foot to `above` the hip."""
+    """The hatched ground, and a view that follows the hip. In lengths of the leg, the
+    view reaches `wide` to both sides, 0.4 below the foot and `above` over the hip."""
 
     def __init__(
         self, canvas: Canvas, angle: float, length: float, wide: float, above: float
@@ -39,7 +40,7 @@ class _Slope:
         canvas.ax.axline((0, 0), **line, zorder=1)
 
     def follow(self, hip: Point) -> None:
-        """The view about a hip, with the hatching in it."""
+        """Move the view to a hip, and draw the hatching in it."""
         canvas, half = self.canvas, self.view.half[0]
         self.view.follow(np.asarray(hip) + self.middle, 0.55 * half)
         along, down = _downhill(self.angle), _downhill(self.angle + math.pi / 2)
@@ -53,8 +54,8 @@ class _Slope:
 
 
 def rimless_wheel(canvas: Canvas, episode: Episode) -> Drawing:
-    """The spokes, one of them in a colour of its own, the foot on which the wheel
-    stands, and the torque as an arc about the hub."""
+    """A wheel of spokes that stands on one of them, one spoke in another colour, and
+    the torque as an arc about the hub."""
     system = episode.system
     length, half, slope = (float(a) for a in (system.length, system.half, system.slope))
     ground = _Slope(canvas, slope, length, wide=2.1, above=1.15)
@@ -63,7 +64,8 @@ def rimless_wheel(canvas: Canvas, episode: Episode) -> Drawing:
 
     def draw(x: Vector, u: Vector, past: Past) -> None:
         _, states = past
-        # Between samples it turns by less than half of what it jumps.
+        # Between samples the wheel turns by less than half a jump, so that rounding
+        # counts the jumps.
         turned = np.round(np.diff(states[:, 0]) / (2 * half))
         steps = -int(np.nansum(turned))
         foot = steps * chord
@@ -91,8 +93,8 @@ def _walker(
     slope: float,
     mass: float | None,
 ) -> Drawing:
-    """Two legs, whose swing and stance angles are `legs(states)`, both from the
-    vertical and to the left; with masses at a distance from the feet."""
+    """Two legs with the swing and stance angles `legs(states)`, which are measured from
+    the vertical to the left. `mass` is the distance of the masses from the feet."""
     ground = _Slope(canvas, slope, length, wide=1.8, above=0.25)
 
     def draw(x: Vector, u: Vector, past: Past) -> None:
@@ -100,13 +102,14 @@ def _walker(
         gap = swing - stance
         strikes = (gap[:-1] > 0) & (gap[1:] < 0) & (gap[:-1] - gap[1:] > LEAST_DROP)
         strikes = np.flatnonzero(strikes)
-        # Each step leads from the stance foot to the swing foot just before it.
+        # A step moves the foot from the stance foot to the swing foot, as they were
+        # just before.
         leads = [np.sin(swing) - np.sin(stance), np.cos(stance) - np.cos(swing)]
         foot = length * np.sum(np.stack(leads, axis=-1)[strikes], axis=0)
         swing, stance = (float(a) for a in legs(x))
         hip = foot + _spoke(stance, length)
         colors = (canvas.BODY, canvas.SECOND)
-        # The legs change their names at each step, but not their colours.
+        # The legs swap their roles at each step, but keep their colours.
         own = colors if len(strikes) % 2 == 0 else colors[::-1]
         for angle, color in zip((stance, swing), own, strict=True):
             tip = hip - _spoke(angle, length)
