@@ -379,7 +379,7 @@ def test_a_device_is_no_store():
     def one(n):
         return n
 
-    with user_error(match="no regular file"):
+    with user_error(match="is not a regular file"):
         experiments.run(one, store="/dev/zero", progress=False)
 
 
@@ -490,9 +490,9 @@ WRONG = {
     ),
     "not to be told apart": (
         lambda: quiet(experiment.parametrize("x", [(i for i in "ab")])(use_x)),
-        "the parameter 'x' of case .* cannot be written down",
+        "the parameter 'x' of case .* cannot be identified by its content",
     ),
-    "seeds": (lambda: experiment.seeds(0)(use_x), "seeds must be how many"),
+    "seeds": (lambda: experiment.seeds(0)(use_x), "seeds must be a number"),
     "seeds twice": (lambda: experiment.seeds([1, 1])(use_x), "seeds must differ"),
     "seeds for nothing": (
         lambda: quiet(
@@ -532,7 +532,7 @@ WRONG = {
     "workers": (lambda: quiet(stored, workers=0), "workers"),
     "mesh": (
         lambda: quiet(stored, mesh=jax.make_mesh((jax.device_count(),), ("seeds",))),
-        "mesh spreads what takes a key",
+        "mesh needs experiments that take a key",
     ),
     "backend": (
         lambda: quiet(stored, backend="mpi"),

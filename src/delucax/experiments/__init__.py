@@ -1,4 +1,4 @@
-"""Experiments, declared as pytest declares tests."""
+"""Experiments over parameters and seeds, declared as tests are declared in pytest."""
 
 from ._experiment import Experiment as Experiment, experiment as experiment
 from ._report import report as report

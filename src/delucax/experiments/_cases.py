@@ -1,4 +1,4 @@
-"""Cases: products of parameters with ids and marks; expressions that select them."""
+"""Cases: combinations of parameters, with ids and marks. Expressions select cases."""
 
 import dataclasses
 import re
@@ -13,8 +13,8 @@ from ._fingerprint import fingerprint
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
-    `skip` and `xfail` have a meaning, other names are there to select by."""
+    """A label of a case, such as `experiment.mark.skip("does not converge")`. `slow`,
+    `skip` and `xfail` change how a case is run. Other names serve to select cases."""
 
     name: str
     reason: str = ""
@@ -22,7 +22,7 @@ class Mark:
 
 @dataclasses.dataclass(frozen=True)
 class Param:
-    """A value of each name of an axis, with an id and marks of its own."""
+    """One value for each name of an axis, with its own id and marks."""
 
     values: tuple
     id: str | None = None
@@ -30,7 +30,7 @@ class Param:
 
 
 class Choice(NamedTuple):
-    """One of the values of an axis: its place, what the table shows, and its hash."""
+    """One of the values of an axis: its index, what the table shows, and its hash."""
 
     index: int
     param: Param
@@ -40,13 +40,13 @@ class Choice(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One `parametrize`: names, and what they are called with, each with its id."""
+    """One `parametrize`: the names of arguments, and their values with ids."""
 
     names: tuple[str, ...]
     params: tuple[Param, ...]
 
     def choices(self, where: str) -> Iterator[Choice]:
-        """The choices; `where` is named in errors."""
+        """The choices of this axis. Errors name `where`."""
         for index, param in enumerate(self.params):
             shown, hashes = {}, []
             for name, value in zip(self.names, param.values, strict=True):
@@ -56,13 +56,14 @@ class Axis:
                 except (TypeError, RecursionError) as error:
                     raise ValueError(
                         f"{where}: the parameter {name!r} of case {param.id!r} cannot "
-                        f"be written down: it holds {error}. Give a name instead, and "
-                        "make the thing in the function or in a fixture."
+                        f"be identified by its content: it holds {error}. Pass a name "
+                        "instead, and make the object in the function or in a fixture."
                     ) from error
             yield Choice(index, param, shown, fingerprint(hashes))
 
     def _shown(self, value: Any, param: Param) -> Any:
-        """A value as the table shows it: a simple one as it is, else its name or id."""
+        """A value as the table shows it: itself if it is simple, else its name or
+        id."""
         value = _as_python(value)
         if isinstance(value, _SIMPLE):
             return value
@@ -71,7 +72,7 @@ class Axis:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One call of an experiment: a value of each axis, for all seeds."""
+    """One case of an experiment: a value of each axis. It is run for all seeds."""
 
     experiment: str
     id: str
@@ -97,16 +98,16 @@ class Case:
         }
 
     def mark(self, name: str) -> Mark | None:
-        """The mark of that name, if it has it."""
+        """The mark of that name, or `None` if the case does not have it."""
         return next((mark for mark in self.marks if mark.name == name), None)
 
     def matches(self, word: str) -> bool:
-        """Whether a word is in its name, whatever its case."""
+        """Whether a word is in the name of the case, in upper or lower case."""
         return word.lower() in self.id.lower()
 
 
 def axis_of(names: Any, values: Any, ids: Any) -> Axis:
-    """The axis of a `parametrize`, checked."""
+    """Check the arguments of `parametrize`, and make their axis."""
     where = "experiment.parametrize"
     if isinstance(names, str):
         names = [name.strip() for name in names.split(",") if name.strip()]
@@ -166,16 +167,16 @@ def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
 
 
 _SIMPLE = bool | int | float | str | None
-"""Values that a table can hold."""
+"""The types of values that a table can hold."""
 
 
 def _as_python(value: Any) -> Any:
-    """A number of NumPy as one of Python."""
+    """Convert a NumPy scalar to a Python number."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 def _label(value: Any) -> str | None:
-    """The label of a value that is simple or has a name."""
+    """The label of a value that is simple or has a name, else `None`."""
     value = _as_python(value)
     if isinstance(value, _SIMPLE):
         return str(value)
@@ -184,14 +185,14 @@ def _label(value: Any) -> str | None:
 
 
 def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
-    """Seeds from 0 on, or those given."""
+    """Check seeds. A single number is a number of seeds, which count from 0."""
     is_whole = lambda s: isinstance(s, int | np.integer) and not isinstance(s, bool)
     several = range(seeds) if is_whole(seeds) else seeds
     chosen = tuple(several) if isinstance(several, Iterable) else ()
     if not chosen or not all(is_whole(seed) and 0 <= seed < 2**31 for seed in chosen):
         raise ValueError(
-            f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
-            f"2**31 - 1, got {seeds!r}."
+            f"{where}: seeds must be a number of seeds, at least 1, or whole numbers "
+            f"from 0 to 2**31 - 1, got {seeds!r}."
         )
     if len(set(chosen)) < len(chosen):
         raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
@@ -205,12 +206,13 @@ _TOKEN = re.compile(r"[()]|[^\s()]+")
 def selector(
     expression: str, argument: str, where: str
 ) -> Callable[[Callable[[str], Any]], Any]:
-    """Compile an expression of words into a predicate of a test of single words.
+    """Compile an expression of words into a function.
 
+    The function takes a test of single words and returns whether the expression holds.
     Words are joined by `and`, `or`, `not` and parentheses, as in pytest's `-k`. An
-    empty expression holds always.
+    empty expression always holds.
 
-    **Raises:** `ValueError` naming the place where the expression cannot be read.
+    **Raises:** `ValueError` if the expression cannot be read. It names the place.
     """
     if not isinstance(expression, str):
         raise ValueError(
@@ -220,7 +222,7 @@ def selector(
     tokens = [t.lower() if t.lower() in _OPERATORS else t for t in words(expression)]
     if not tokens:
         return lambda holds: True
-    # Converted to a Python expression, which has the same operators; words are quoted,
+    # Convert it to a Python expression, which has the same operators. Words are quoted,
     # so that `eval` is safe.
     python: list[str] = []
     depth, wants_word = 0, True

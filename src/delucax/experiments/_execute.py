@@ -1,4 +1,4 @@
-"""One case after another, in the process that it is called in."""
+"""Runs cases one after another, in the calling process."""
 
 import contextlib
 import contextvars
@@ -22,11 +22,11 @@ from ._experiment import arguments_of, Experiment
 from ._store import RESERVED
 
 
-# Programs that are kept compiled. A sweep over something static would fill the memory.
+# The most compiled programs to keep: a sweep over a static value would fill the memory.
 _PROGRAMS = 128
-# The characters of an error or its traceback that are stored.
+# The most characters of an error or a traceback to store.
 _LONGEST = 8000
-# The kinds of numbers that are traced: tried in this order.
+# The types of numbers to trace, tried in this order.
 _TRACED_KINDS = (bool, int, float, complex), (float, complex), ()
 
 
@@ -43,18 +43,19 @@ class Outcome(NamedTuple):
 
 
 class Runner:
-    """Runs cases of an experiment, and keeps what they share: programs and fixtures."""
+    """Runs the cases of an experiment. It keeps the programs and fixtures that they
+    share."""
 
     def __init__(self, experiment: Experiment):
         self.experiment, self.axes = experiment, experiment.all_axes()
         self.fixtures = experiment.used_fixtures()
-        # The values of fixtures of the process, and their teardown.
+        # The values of the fixtures whose scope is the process, and their teardown.
         self.process: tuple[dict, Any] = {}, contextlib.ExitStack()
         self.is_traceable: dict[Any, bool] = {}
         self.program: Any = jax.jit(self._all_seeds, static_argnums=0)
 
     def run(self, index: tuple[int, ...], seeds: tuple[int, ...], mesh: Any) -> Outcome:
-        """Run one case; whatever it raises is recorded."""
+        """Run one case, and record any error that it raises."""
         clock = _Clock()
         error = trace = where = None
         values: dict[str, list] = {}
@@ -76,8 +77,8 @@ class Runner:
         return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
-        """Tear down the fixtures of the process. An error is a warning, because the
-        results are there."""
+        """Tear down the fixtures of the process. An error becomes a warning, because
+        the results are already stored."""
         made, end = self.process
         made.clear()
         try:
@@ -86,15 +87,15 @@ class Runner:
             raise
         except BaseException as raised:
             warnings.warn(
-                f"{self.experiment.name}: a fixture of the process could not be let "
-                f"go: {type(raised).__name__}: {raised}",
+                f"{self.experiment.name}: a fixture of the process could not be torn "
+                f"down: {type(raised).__name__}: {raised}",
                 stacklevel=2,
             )
 
     def _arguments(self, index: tuple[int, ...], stack: Any) -> dict[str, Any]:
         given: dict[str, Any] = {}
-        # The places on the axes that a value follows from: those of a fixture are its
-        # own and its arguments'.
+        # The points on the axes that determine each value. A fixture has its own point
+        # and those of its arguments.
         origins: dict[str, frozenset] = {}
         for i, (axis, k) in enumerate(zip(self.axes, index, strict=True)):
             given |= zip(axis.names, axis.params[k].values, strict=True)
@@ -116,13 +117,14 @@ class Runner:
         return {name: v for name, v in given.items() if takes_any or name in takes}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
-        """Call the function: returns a list by seed, or all seeds at once."""
+        """Call the function. Returns a list with an entry for each seed, or arrays over
+        all seeds."""
         function, known = self.experiment.function, self.experiment.arguments
         if "seed" in known:
             return [function(**arguments, seed=seed) for seed in seeds]
         if "key" not in known:
             return [function(**arguments)]
-        # Keys are made of the numbers inside, so that another seed compiles nothing.
+        # The program makes the keys from numbers, so that other seeds reuse it.
         numbers = np.asarray(seeds, np.int32)
         if mesh is not None:
             spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
@@ -130,11 +132,12 @@ class Runner:
         return self._traced(arguments, numbers)
 
     def _traced(self, arguments: dict[str, Any], numbers: Any) -> Any:
-        """Call for all seeds at once, with as much traced as can be.
+        """Call the function for all seeds at once, and trace as many numbers as
+        possible.
 
-        Tracing is tried with all numbers, then with floats only, then with none. The
-        choice is cached by the signature, so that it does not depend on the cases that
-        ran before.
+        Tracing is tried with all numbers, then with floats only, then with no numbers.
+        The choice is cached by the signature, so that it does not depend on the cases
+        that ran before.
         """
         for kinds in _TRACED_KINDS:
             dynamic, rest = _split(arguments, kinds)
@@ -162,7 +165,8 @@ class Runner:
         return jax.vmap(call)(numbers)
 
     def _columns(self, returned: Any) -> dict[str, list]:
-        """Lists with an entry for each seed, by name, of things that JSON knows."""
+        """The results by name, as lists with an entry for each seed that JSON can
+        store."""
         where = self.experiment.name
         if isinstance(returned, list):
             rows = [_as_mapping(row) for row in returned]
@@ -190,8 +194,8 @@ class Runner:
 
 
 class _Static:
-    """The part of the arguments that is no array, comparable by `jax.jit`: by its
-    content, or as the same object where that cannot be hashed."""
+    """The static part of the arguments, which `jax.jit` compares: by its content, or by
+    identity if a value cannot be hashed."""
 
     def __init__(self, tree: Any):
         self.tree = tree
@@ -210,15 +214,15 @@ def _comparable(leaf: Any) -> tuple:
         hash(leaf)
     except TypeError:
         return (id(leaf),)
-    return type(leaf), leaf  # 1 and True are equal, and are traced differently
+    return type(leaf), leaf  # 1 and True are equal, but are traced differently
 
 
 def _split(arguments: dict[str, Any], kinds: tuple[type, ...]) -> tuple[dict, dict]:
-    """The arguments that are traced, and the static rest; numbers of `kinds` are
-    traced."""
+    """Split the arguments into traced and static ones. Arrays, and numbers of `kinds`,
+    are traced."""
 
     def is_traced(value: Any) -> Any:
-        # A whole number inside a module is part of its structure.
+        # A number inside a module is part of its structure.
         plain = type(value) in (*_TRACED_KINDS[0], list, tuple, dict)
         traced = kinds if plain else ()
         is_array = lambda leaf: isinstance(leaf, jax.Array | np.ndarray | np.generic)
@@ -247,7 +251,7 @@ def _simple(value: Any, name: str, where: str) -> Any:
     array = np.empty((), object)
     with contextlib.suppress(Exception):
         array = np.asarray(value)
-    if jnp.issubdtype(array.dtype, jnp.floating):  # of bfloat16 and its kin as well
+    if jnp.issubdtype(array.dtype, jnp.floating):  # bfloat16 too
         return (array if array.dtype.kind == "f" else array.astype(np.float32)).tolist()
     if array.dtype.kind not in "biu":
         raise ValueError(
@@ -258,7 +262,7 @@ def _simple(value: Any, name: str, where: str) -> Any:
 
 
 class _Clock:
-    """The time of a call, and how much of it went into tracing and compiling."""
+    """Measures the time of a call, and how much of it is tracing and compiling."""
 
     compiling = running = 0.0
 
@@ -268,7 +272,7 @@ class _Clock:
 
     def __exit__(self, *_: Any) -> None:
         total = time.perf_counter() - self._begin
-        # One function is traced within another: what is covered counts once.
+        # A function can be traced within another one: count overlapping spans once.
         covered, last = 0.0, self._begin
         for begin, end in sorted(_spans.get() or ()):
             covered += max(end - max(begin, last), 0.0)
@@ -279,7 +283,7 @@ class _Clock:
 
 
 _spans = contextvars.ContextVar[list | None]("spans", default=None)
-"""When programs were traced and compiled, while a clock runs in this thread."""
+"""The spans of tracing and compiling, while a clock runs in this thread."""
 
 
 def _note(event: str, duration_secs: float, **_: str | int) -> None:
@@ -299,13 +303,13 @@ _LIMIT = Path("/proc/sys/vm/max_map_count")
 def clear_programs(limit: int | None = None) -> bool:
     """Clear the caches of JAX if its compiled programs hold too many memory maps.
 
-    A program that XLA has compiled holds tens of the maps that Linux allows a process,
-    65,530 by default, and a compilation without any left ends in a
-    segmentation fault. Programs that are still needed are compiled anew. Elsewhere than
-    on Linux nothing is done.
+    Linux allows a process 65,530 memory maps by default. A compiled program holds tens
+    of them, and a compilation that finds no map left ends in a segmentation fault.
+    Programs that are still needed are compiled again. On other systems than Linux,
+    nothing is done.
 
-    `limit` is how many maps are too many, by default half of what is allowed. Returns
-    whether the caches were cleared.
+    `limit` is the number of maps above which the caches are cleared, by default half of
+    what Linux allows. Returns whether the caches were cleared.
     """
     try:
         limit = int(_LIMIT.read_text()) // 2 if limit is None else limit

@@ -18,7 +18,7 @@ from ._store import RESERVED
 
 class _MarkDecorator(Mark):
     def __call__(self, what: Any) -> Any:
-        """The mark with the reason `what`, or the experiment `what` with the mark."""
+        """Give the mark the reason `what`, or give the experiment `what` the mark."""
         if isinstance(what, str):
             return dataclasses.replace(self, reason=what)
         made = as_experiment(what)
@@ -26,7 +26,7 @@ class _MarkDecorator(Mark):
 
 
 class Marks:
-    """`experiment.mark.slow`, and any other name."""
+    """Makes the marks of `experiment.mark.slow`, and of any other name."""
 
     def __getattr__(self, name: str) -> _MarkDecorator:
         if name.startswith("_"):
@@ -36,7 +36,7 @@ class Marks:
 
 @dataclasses.dataclass(frozen=True)
 class Fixture:
-    """A resource of cases, made by a function; see `experiment.fixture`."""
+    """A resource that cases use, made by a function; see `experiment.fixture`."""
 
     function: Callable
     scope: str
@@ -45,19 +45,20 @@ class Fixture:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A function with its parameters, seeds, fixtures and marks; made by
-    [`delucax.experiments.experiment`][].
+    """A function with its parameters, seeds, fixtures and marks.
 
-    Calling it calls the function.
+    You make one with [`delucax.experiments.experiment`][]. Calling it calls the
+    function.
 
     **Arguments:**
 
-    - `function`: what to run, see [`delucax.experiments.experiment`][].
-    - `name`: the function's by default.
+    - `function`: the function to run; see [`delucax.experiments.experiment`][].
+    - `name`: the name of the experiment; that of the function by default.
     - `axes`: the parameters; none by default.
-    - `seeds`: the seeds; 0 alone by default.
-    - `marks`: of all cases; none by default.
-    - `fixtures`: by name, those that are not globals of the function; none by default.
+    - `seeds`: the seeds; `(0,)` by default.
+    - `marks`: the marks of all cases; none by default.
+    - `fixtures`: a dictionary from names to the fixtures that are not globals of the
+        function's module; empty by default.
 
     !!! example
 
@@ -69,7 +70,11 @@ class Experiment:
             return x**2
 
         results = run(square, progress=False)
-        assert [row["value"] for row in results.rows] == [1.0, 4.0, 9.0]
+        [row["value"] for row in results.rows]
+        ```
+
+        ```text
+        [1.0, 4.0, 9.0]
         ```
     """
 
@@ -85,7 +90,7 @@ class Experiment:
         check_function(f, "function", "experiment")
         name = self.name or getattr(f, "__name__", type(f).__name__)
         own = {n: getattr(f, n, None) for n in ("__doc__", "__module__")}
-        # A frozen dataclass takes no assignment.
+        # A frozen dataclass does not allow assignment.
         vars(self).update(own, name=name, __wrapped__=f)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -103,8 +108,8 @@ class Experiment:
         return not {"key", "seed"}.isdisjoint(self.arguments)
 
     def used_fixtures(self) -> dict[str, Fixture]:
-        """The fixtures that it uses, directly or through others, by name; each after
-        those that it needs itself."""
+        """The fixtures that it uses, directly or through other fixtures, by name. Each
+        fixture comes after the fixtures that it needs."""
         used: dict[str, Fixture] = {}
         known = {**getattr(self.function, "__globals__", {}), **self.fixtures}
         given = {name for axis in self.axes for name in axis.names}
@@ -124,7 +129,7 @@ class Experiment:
         return used
 
     def all_axes(self) -> tuple[Axis, ...]:
-        """The axes, those of its fixtures last."""
+        """The axes of its parameters, and then those of its fixtures."""
         own = ((f.axis, name) for name, f in self.used_fixtures().items())
         return (*self.axes, *(Axis((name,), a.params) for a, name in own if a))
 
@@ -135,21 +140,21 @@ class Experiment:
 
         **Arguments:**
 
-        - `select`: words that occur in the case's name, joined by `and`, `or`, `not`
-            and parentheses; case does not matter. All by default.
-        - `marks`: likewise, of the names of its marks.
-        - `slow`: whether those marked `slow` are among them; not by default, unless
-            `marks` names the mark.
+        - `select`: words in the name of a case, joined by `and`, `or`, `not` and
+            parentheses. Upper and lower case are the same. All cases by default.
+        - `marks`: names of marks, joined in the same way. All cases by default.
+        - `slow`: whether to include cases that are marked `slow`; `False` by default.
+            They are also included if `marks` names the mark.
 
-        **Raises:** `ValueError` on a parameter that the function does not have, an
-        argument without a value, or a value that cannot be told from others by its
-        content.
+        **Raises:** `ValueError` if the function has no argument for a parameter, if an
+        argument has no value, or if a value cannot be identified by its content.
         """
         self._check()
         where = self.name
         functions = [fixture.function for fixture in self.used_fixtures().values()]
         precise = bool(jax.config.jax_enable_x64)
-        # What all cases share. The experiment's own module counts also in a library.
+        # What all cases share. The code of the experiment's own module counts even if
+        # the module belongs to a library.
         content = [self.function, functions, precise, version("delucax")]
         code = fingerprint(content, root=getattr(self.function, "__module__", None))
         is_selected = selector(select, "select", where)
@@ -209,7 +214,7 @@ class Experiment:
             )
 
     def _check_given(self, function: Callable, label: str, given: set[str]) -> None:
-        """Raise where an argument of a function has no value."""
+        """Raise an error if an argument of a function has no value."""
         for name, p in arguments_of(function).items():
             open_ended = p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
             if name not in given and p.default is p.empty and not open_ended:
@@ -221,19 +226,20 @@ class Experiment:
 
 
 class experiment:  # noqa: N801
-    """Make an experiment of a function, with decorators in the manner of pytest.
+    """Make an experiment from a function. Its decorators are like those of pytest.
 
-    The function is called once for each case, with its parameters and fixtures as
-    arguments, and returns a number, or a dictionary of names to numbers, strings or
-    arrays. How it is called follows from its arguments:
+    The function is called for each case, with the parameters and fixtures as arguments.
+    It returns a number, or a dictionary from names to numbers, strings or arrays. The
+    arguments of the function decide how it is called:
 
     - with `key`: it is traced, compiled, and called for all seeds at once by `vmap`,
-      each with `jax.random.key(seed)`. Parameters that are arrays, modules' arrays or
-      numbers are traced, so that other values compile nothing again; where a number
-      must be known when it is traced (a horizon, a width), it is static: tracing is
-      tried first with all numbers, then with fewer.
-    - with `seed`: it is called without `jit`, once for each seed, with an integer. For
-      code that cannot be traced, such as `fit`.
+      each with `jax.random.key(seed)`. Arrays, the arrays of modules, and numbers among
+      the parameters are traced, so that other values need no new compilation. A number
+      that must be known when the function is traced (a horizon, a width) is static.
+      To find these, tracing is tried with all numbers first, then with floats only,
+      then with no numbers.
+    - with `seed`: it is called once for each seed, with an integer and without `jit`.
+      Use this for code that cannot be traced, such as `fit`.
     - with neither: it is called once, without `jit`.
 
     **Arguments:**
@@ -258,7 +264,11 @@ class experiment:  # noqa: N801
             return dlx.rollout(env, controller, key=key, horizon=10).total_cost
 
         results = run(cost, progress=False)
-        assert len(results.rows) == 24
+        len(results.rows)  # 3 lengths, 2 gains, 4 seeds
+        ```
+
+        ```text
+        24
         ```
     """
 
@@ -274,18 +284,21 @@ class experiment:  # noqa: N801
         *,
         ids: Sequence[str] | Callable[[Any], str] | None = None,
     ) -> Callable[[Any], Experiment]:
-        """Call the function with each of `values`; stacked, with all combinations.
+        """Call the function with each of `values`. Stacked decorators give all
+        combinations.
 
         **Arguments:**
 
-        - `names`: of the arguments, `"controller, environment"` or a sequence.
-        - `values`: one for each case; a tuple each if there are several names. Wrap one
-            in `experiment.param` to give it an id or marks.
-        - `ids`: what to call them, or a function from a value to that; by default
-            numbers and strings are their own, functions and classes their names.
+        - `names`: the names of arguments, such as `"controller, environment"`, or a
+            sequence of names.
+        - `values`: a value for each case. With several names, each value is a tuple.
+            Wrap a value in `experiment.param` to give it an id or marks.
+        - `ids`: the ids of the values, or a function from a value to its id. By default
+            a number or a string is its own id, the id of a function or a class is its
+            name, and other values are numbered.
 
-        **Raises:** `ValueError` on a name that is given twice, or if values or ids do
-        not fit the names.
+        **Raises:** `ValueError` if a name is given twice, or if values or ids do not
+        fit the names.
         """
         axis = axis_of(names, values, ids)
 
@@ -306,9 +319,10 @@ class experiment:  # noqa: N801
 
         **Arguments:**
 
-        - `seeds`: how many, from 0 on; or which.
+        - `seeds`: a number of seeds, which count from 0, or the seeds themselves.
 
-        **Raises:** `ValueError` if they are no whole numbers, negative, or repeated.
+        **Raises:** `ValueError` if there are no seeds, or if they are not whole
+        numbers, negative, or repeated.
         """
         chosen = as_seeds(seeds, "experiment.seeds")
         return lambda what: dataclasses.replace(as_experiment(what), seeds=chosen)
@@ -321,21 +335,23 @@ class experiment:  # noqa: N801
         params: Iterable | None = None,
         ids: Sequence[str] | Callable[[Any], str] | None = None,
     ) -> Any:
-        """Make a fixture: what a function returns, or yields once, is the argument of
-        its name in experiments of the same module, and in other fixtures.
+        """Make a fixture from a function that returns a value, or yields it once.
 
-        What comes after the `yield` is run when the scope ends. Arguments of a fixture
-        are parameters of the experiment or other fixtures.
+        An experiment of the same module, or another fixture, gets this value for its
+        argument with the name of the fixture. The code after the `yield` runs when the
+        scope ends. The arguments of a fixture are parameters of the experiment or other
+        fixtures.
 
         **Arguments:**
 
-        - `function`: what makes it.
-        - `scope`: `"case"` (default), made for each case; `"process"`, once in each
-            process for each value of the parameters that it takes.
-        - `params`: values to run every case with; the function takes them as `param`.
-        - `ids`: what to call `params`.
+        - `function`: the function that makes the value.
+        - `scope`: `"case"` (default) makes a value for each case. `"process"` makes one
+            in each process for each combination of the parameters that it takes.
+        - `params`: values of the fixture. Every case is run with each of them, and the
+            function takes them as `param`. None by default.
+        - `ids`: the ids of `params`, as in `parametrize`.
 
-        **Raises:** `ValueError` on another scope.
+        **Raises:** `ValueError` if the scope is unknown.
         """
         check_choice(scope, ("case", "process"), "scope", "experiment.fixture")
         axis = None if params is None else axis_of("param", params, ids)
@@ -348,7 +364,7 @@ class experiment:  # noqa: N801
 
         **Arguments:**
 
-        - `**fixtures`: by the name of the argument.
+        - `**fixtures`: the fixtures, by the names of the arguments.
         """
 
         def decorate(what: Any) -> Experiment:
@@ -365,16 +381,16 @@ class experiment:  # noqa: N801
 
         **Arguments:**
 
-        - `*values`: one for each name.
-        - `id`: what to call it; as `parametrize` does by default.
-        - `marks`: one mark or several; none by default.
+        - `*values`: one value for each name.
+        - `id`: the id; that of `parametrize` by default.
+        - `marks`: one mark or several marks; none by default.
         """
         marks = (marks,) if isinstance(marks, Mark) else tuple(marks)
         return Param(values, id, marks)
 
 
 def as_experiment(what: Any) -> Experiment:
-    """The experiment, or one made of a function."""
+    """The experiment itself, or an experiment made from a function."""
     return what if isinstance(what, Experiment) else Experiment(what)
 
 

@@ -24,14 +24,15 @@ _STANDARD = os.path.realpath(sysconfig.get_paths()["stdlib"])
 
 
 def fingerprint(value: Any, *, root: str | None = None) -> str:
-    """A hash of what `value` is, the same in another process.
+    """A hash of the content of `value`, which is the same in another process.
 
-    A function is its source without comments, docstring and decorators, what it closes
-    over, and the functions, classes and values that it names, as long as they are the
-    user's own: libraries count by their names alone. An object is what it holds and the
-    code of its class. `root` is a module whose code counts although it is a library's.
+    A function is hashed by its source without comments, docstring and decorators, by
+    the values that it closes over, and by the functions, classes and values that it
+    names. Only the user's code counts: functions and classes of libraries are hashed by
+    name. An object is hashed by its content and the code of its class. `root` is a
+    module whose code counts even if it belongs to a library.
 
-    **Raises:** `TypeError` if something in it cannot be hashed by its content.
+    **Raises:** `TypeError` if a value in it cannot be hashed by its content.
     """
     hasher = _Hasher(root)
     hasher.add(value)
@@ -40,7 +41,7 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
 
 def is_library(module: str | None) -> bool:
     """Whether a module belongs to an installed package, or to Python."""
-    # One that is not loaded was made by `exec`, as in the tests of the pages.
+    # A module that is not loaded was made by `exec`, as in the tests of the pages.
     if module == "__main__" or module not in sys.modules:
         return False
     file = getattr(sys.modules[module], "__file__", None)
@@ -58,11 +59,11 @@ class _Hasher:
     def __init__(self, root: str | None):
         self.sha = hashlib.sha256()
         self.root = root
-        # Visited objects with their numbers; kept alive, so that ids are not reused.
+        # Visited objects and their numbers. They stay alive so that no id is reused.
         self.visited: dict[int, tuple[int, Any]] = {}
 
     def mark_visited(self, thing: Any) -> bool:
-        """Give it a number; true if it had none."""
+        """Give an object a number. Returns whether it is new."""
         if id(thing) in self.visited:
             return False
         self.visited[id(thing)] = len(self.visited), thing
@@ -147,7 +148,8 @@ class _Hasher:
             self.add_named(f.__globals__[name])
 
     def add_named(self, value: Any) -> None:
-        """A value that the code names: one without content counts by its type."""
+        """Add a value that the code names. A value that cannot be hashed counts by its
+        type."""
         if id(value) in self.visited:
             return
         before, count = self.sha.copy(), len(self.visited)
@@ -180,7 +182,7 @@ class _Hasher:
                 self.update(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
                 self.update("no source")
-            # Members from other modules of the user.
+            # Members can come from other modules of the user.
             for member in vars(module).values():
                 if isinstance(member, types.ModuleType):
                     self.module(member)
@@ -199,13 +201,13 @@ class _Hasher:
         try:
             parts: Any = reduce(value)
         except Exception as error:
-            raise TypeError(f"a {kind.__name__}, which {error}") from error
+            raise TypeError(f"a {kind.__name__} ({error})") from error
         self.type(kind)
         if isinstance(parts, str):
             self.update(parts)
             return
         for k, part in enumerate(parts):
-            # The fourth and fifth run over members of lists and of dictionaries.
+            # The fourth and fifth parts are iterators over members of lists and dicts.
             self.add(list(part) if k in (3, 4) and part is not None else part)
 
 
@@ -219,7 +221,7 @@ def _functions(member: Any) -> list[types.FunctionType]:
 
 
 def source_of(f: types.FunctionType) -> str:
-    """The code of a function, the same whatever its comments and its layout."""
+    """The code of a function, without its comments and layout."""
     if f.__name__ != "<lambda>":
         with contextlib.suppress(OSError, TypeError, SyntaxError):
             return _plain(inspect.getsource(f))
@@ -241,7 +243,7 @@ def _bytecode(code: types.CodeType) -> tuple:
     constants = tuple(
         _bytecode(c)
         if isinstance(c, types.CodeType)
-        # The order of a set is another one in another process.
+        # The order of a set differs between processes.
         else str(sorted(map(repr, c)))
         if isinstance(c, frozenset)
         else repr(c)
@@ -251,6 +253,6 @@ def _bytecode(code: types.CodeType) -> tuple:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """The names that the code uses, those of functions within it too."""
+    """The names that the code uses, also in the functions within it."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return {*code.co_names}.union(*map(_names, inner))

@@ -1,4 +1,4 @@
-"""Results as a page, and two of them side by side."""
+"""Pages of results, and of the differences of two results."""
 
 import itertools
 import json
@@ -14,7 +14,7 @@ from ._results import Results
 from ._statistics import Bootstrap, interquartile_mean, is_number
 
 
-# The panels of a figure, and the cases of a panel, at most.
+# The most panels of a figure, and the most cases of a panel.
 _PANELS, _CASES = 30, 60
 
 
@@ -27,9 +27,9 @@ def report(
 
     - `results`: from [`delucax.experiments.run`][].
     - `path`: the HTML file to write.
-    - `title`: its heading.
+    - `title`: the heading of the page, `"Results"` by default.
 
-    **Raises:** `OSError` if it cannot be written.
+    **Raises:** `OSError` if the file cannot be written.
 
     !!! example
 
@@ -44,7 +44,8 @@ def report(
 
 
 def page_of(results: Results, title: str) -> Page:
-    """A table of means and a figure for each experiment, what failed, and every row."""
+    """A page with a table of means and a figure for each experiment, the failures, and
+    all rows."""
     page = Page(title)
     page.paragraph(_made_with(results), "made")
     for name, part in by_experiment(results).items():
@@ -77,8 +78,9 @@ def by_experiment(results: Results) -> dict[str, Results]:
 
 
 def summary(results: Results) -> tuple[list[str], list[list]]:
-    """A row for each case: its parameters, and the interquartile mean of each result
-    over the seeds, with the quartiles where there are several."""
+    """The headings and rows of a table of cases: the parameters, and the interquartile
+    mean of each result over the seeds, with the quartiles if there are several
+    seeds."""
     cases = [[*rows.values()] for rows in _by_case(results).values()]
     firsts = [rows[0] for rows in cases]
     many = any(row["seed"] != results.rows[0]["seed"] for row in results.rows)
@@ -117,7 +119,7 @@ def _numbers(rows: list[dict[str, Any]], metric: str) -> list[float]:
 
 
 def _varies(rows: list[dict[str, Any]], metric: str) -> bool:
-    """Whether it differs between the seeds of a case."""
+    """Whether a result differs between the seeds of a case."""
     values = [row[metric] for row in rows if row.get(metric) is not None]
     return any(value != values[0] for value in values)
 
@@ -127,8 +129,9 @@ class Difference(NamedTuple):
 
     - `changed`: rows of `DIFFERENCES`.
     - `status`: rows of experiment, case, and the status in both.
-    - `same`: how many cases agree to the last bit.
-    - `only`: the experiments and cases that the first alone has, and the second.
+    - `same`: the number of cases that agree to the last bit.
+    - `only`: the cases, as (experiment, case), that only the first holds, and those
+        that only the second holds.
     """
 
     changed: list[list]
@@ -159,8 +162,11 @@ DIFFERENCES = [
 
 
 def diff(first: Results, second: Results) -> Difference:
-    """Interquartile means over the common seeds, and their difference with a paired 95%
-    interval, of each result that is not the same in both."""
+    """Compare two results.
+
+    For each value that differs, this gives the interquartile means over the common
+    seeds, and their difference with a paired 95% interval.
+    """
     a, b = _by_case(first), _by_case(second)
     changed, status, same = [], [], 0
     for key in [key for key in a if key in b]:
@@ -196,8 +202,8 @@ def _by_case(results: Results) -> dict[tuple[str, str], dict[int, dict[str, Any]
 
 
 def _add_figures(page: Page, results: Results) -> None:
-    """Each numeric result over the cases, a panel for each value of the first of
-    several parameters; nothing without Matplotlib."""
+    """Add a figure of each numeric result over the cases, unless Matplotlib is missing.
+    If there are several parameters, each value of the first one has a panel."""
     try:
         from matplotlib import rc_context
         from matplotlib.figure import Figure

@@ -1,4 +1,4 @@
-"""Results table with filtering and export."""
+"""The table of results, with filters and export."""
 
 import dataclasses
 import json
@@ -15,24 +15,28 @@ from ._cases import Case
 from ._store import CASE_COLUMNS, FAILED, RUN_COLUMNS, Store
 
 
-# Columns that differ between two runs of the same thing.
+# Columns that differ between two runs of the same case.
 TIMES = ("compile_seconds", "run_seconds", "date")
 
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """The results of experiments, a row for each case and seed.
+    """The results of experiments, with a row for each case and seed.
 
-    A row holds `experiment`, `case`, the parameters, `seed`, `status` (`"passed"`,
-    `"failed"`, `"failed as expected"`, `"passed unexpectedly"`; `"skipped"`, which is
-    not stored), what the function returned (a single number under the name `value`),
-    `error`, `traceback`, `compile_seconds` and `run_seconds` (of the case, all its
-    seeds together), and what it was made with: `date`, `commit`, `dirty`, `dtype`,
-    `device`, `versions`, `hash`.
+    A row is a dictionary with these keys:
+
+    - `experiment`, `case`, the names of the parameters, and `seed`.
+    - `status`: `"passed"`, `"failed"`, `"failed as expected"`, `"passed unexpectedly"`,
+        or `"skipped"`, which is not stored.
+    - the names of what the function returned; `value` if it returned a single number.
+    - `error` and `traceback`.
+    - `compile_seconds` and `run_seconds`: of the case, for all its seeds together.
+    - `date`, `commit`, `dirty`, `dtype`, `device`, `versions`, `hash`: how the result
+        was made.
 
     **Arguments:**
 
-    - `rows`: dictionaries.
+    - `rows`: the rows, dictionaries.
     - `metrics`: the names of what the functions returned.
     - `parameters`: the names of the parameters.
 
@@ -57,13 +61,13 @@ class Results:
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> "Results":
-        """All that is in a results file.
+        """Read all results of a file.
 
         **Arguments:**
 
         - `path`: the file.
 
-        **Raises:** `ValueError` if it is no results file, is damaged, or is of another
+        **Raises:** `ValueError` if it is not a results file, is damaged, or has another
         format; `OSError` if it cannot be read.
         """
         path = as_path(path, "path", "Results.read")
@@ -79,7 +83,7 @@ class Results:
     def _of(
         cls, store: Store, asked: Iterable[tuple[Case, tuple[int, ...]]]
     ) -> "Results":
-        """Those of the cases and seeds asked for."""
+        """The results of the given cases and seeds."""
         records = []
         for case, seeds in asked:
             stored = store.stored(case.key, case.hash)
@@ -120,7 +124,7 @@ class Results:
 
     @property
     def table(self) -> Any:
-        """The rows as a `pandas.DataFrame`, versions spread over columns."""
+        """The rows as a `pandas.DataFrame`, with a column for each version."""
         pd = extra("pandas", "tables")
         return pd.DataFrame(self.flat_rows(), columns=list(self.all_columns))
 
@@ -129,7 +133,7 @@ class Results:
 
         **Arguments:**
 
-        - `**values`: by the name of the column.
+        - `**values`: the values, by the names of the columns.
 
         **Raises:** `ValueError` if there is no such column.
         """
@@ -144,20 +148,21 @@ class Results:
         columns: Sequence[str] | None = None,
         digits: int = 4,
     ) -> str:
-        """Write the rows to a file, or show them as text.
+        """Write the rows to a file, or return them as text.
 
         **Arguments:**
 
         - `to`: a file that ends in `.csv`, `.parquet`, `.md` or `.tex`; or `"csv"`,
-            `"markdown"` or `"latex"`, for the text alone.
-        - `columns`: which; by default all in CSV and Parquet, and otherwise the
-            parameters, the seed, the status and what was returned.
-        - `digits`: significant ones of numbers in Markdown and LaTeX, 4 by default.
+            `"markdown"` or `"latex"`, to get only the text.
+        - `columns`: the names of the columns. By default all for CSV and Parquet,
+            otherwise the parameters, the seed, the status and what was returned.
+        - `digits`: the number of significant digits in Markdown and LaTeX, 4 by
+            default.
 
         **Returns:** the text; empty for Parquet.
 
-        **Raises:** `ValueError` on another ending or an unknown column; `OSError` if
-        the file cannot be written.
+        **Raises:** `ValueError` if the file has another ending or a column is unknown;
+        `OSError` if the file cannot be written.
         """
         ending = FORMS.get(Path(to).suffix)
         if ending is None and to not in ("csv", "markdown", "latex"):
@@ -197,12 +202,12 @@ class Results:
 
     @property
     def all_columns(self) -> tuple[str, ...]:
-        """The columns, and those of the versions."""
+        """The names of the columns, and then those of the versions."""
         versions = [name for row in self.rows for name in row["versions"]]
         return (*self.columns, *dict.fromkeys(versions))
 
     def flat_rows(self) -> list[dict[str, Any]]:
-        """The rows with versions spread over columns, and arrays as JSON."""
+        """The rows with a column for each version, and arrays as JSON."""
         flat = []
         for row in self.rows:
             values = {name: value for name, value in row.items() if name != "versions"}
@@ -214,7 +219,7 @@ class Results:
 
 
 def _of_one_type(column: list) -> list:
-    """A column as text, unless its values have one type, which Parquet needs."""
+    """A column whose values have one type, which Parquet needs: text if they differ."""
     types = {type(value) for value in column if value is not None}
     if len(types) < 2 or types == {int, float}:
         return column

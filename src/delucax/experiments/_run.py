@@ -1,4 +1,4 @@
-"""Run experiments: here, on all cores, or on a cluster."""
+"""Runs experiments: in this process, on all cores, or on a cluster."""
 
 import atexit
 import contextlib
@@ -57,35 +57,38 @@ def run(
 ) -> Results:
     """Run the cases of experiments that are not in the store yet.
 
-    A case that fails is recorded with its traceback, and the others run on; they also
-    run on if a case kills its worker. Each result is stored at once. What is stored is
-    not run again unless its code or parameters changed, so that the same call continues
-    a run that was killed.
+    If a case fails, its traceback is recorded and the other cases go on. They also go
+    on if a case kills its worker. Each result is stored at once. A stored case is not
+    run again unless its code or parameters changed, so the same call continues a run
+    that was killed.
 
     **Arguments:**
 
-    - `*experiments`: what to run, each an [`delucax.experiments.Experiment`][].
-    - `store`: a results file, made if it is not there; in memory alone by default.
-    - `workers`: processes; 1, this one, by default; -1 is one for each core. Each has
-        one thread of its own for its computations.
-    - `backend`: what starts them: `"loky"` (default), on this machine, or `"dask"`, on
-        the cluster of the `dask.distributed.Client` that is open. Both need the extra
-        `experiments`, the second `dask` as well.
-    - `select`: which cases, by their names, such as `"lqr and not cartpole"`; all by
+    - `*experiments`: the experiments, each an [`delucax.experiments.Experiment`][].
+    - `store`: a results file, which is created if it does not exist. By default the
+        results are only kept in memory.
+    - `workers`: the number of processes. 1 by default, which is this process; -1 is one
+        for each core. Each of several workers computes with one thread.
+    - `backend`: how workers are started: `"loky"` (default), on this machine, or
+        `"dask"`, on the cluster of the open `dask.distributed.Client`. Both need the
+        extra `experiments`, and `"dask"` also needs the extra `dask`.
+    - `select`: selects cases by words in their names, such as `"lqr and not cartpole"`;
+        all by default.
+    - `marks`: selects cases by their marks, in the same way; all by default.
+    - `slow`: whether to include cases that are marked `slow`; `False` by default.
+    - `seeds`: a number of seeds, or the seeds, in place of those of the experiments.
+    - `mesh`: a `jax.sharding.Mesh`. The seeds of each case are spread over its first
+        axis. None by default; only for one worker.
+    - `fresh`: whether to run cases that are already stored; `False` by default.
+    - `retry`: whether to run cases again that raised an error, expected or not; `False`
+        by default.
+    - `progress`: whether to show the progress of the run and of each worker; `True` by
         default.
-    - `marks`: which cases, by their marks, likewise.
-    - `slow`: also those marked `slow`; not by default.
-    - `seeds`: other seeds than the experiments' own, how many or which.
-    - `mesh`: a `jax.sharding.Mesh` over whose first axis the seeds of each case are
-        spread; none by default. With one worker only.
-    - `fresh`: run also what is in the store; not by default.
-    - `retry`: run again what raised an error, expected or not; not by default.
-    - `progress`: show progress, for the whole and for each worker; shown by default.
 
-    **Returns:** the [`delucax.experiments.Results`][] of the cases asked for.
+    **Returns:** the [`delucax.experiments.Results`][] of the selected cases.
 
-    **Raises:** `ValueError` on an argument that does not fit, before anything is run;
-    `OSError` if the store cannot be written, with what was done so far kept.
+    **Raises:** `ValueError` if an argument does not fit, before anything is run;
+    `OSError` if the store cannot be written. The results so far are kept.
 
     !!! example
 
@@ -102,7 +105,11 @@ def run(
             path = f"{folder}/results.jsonl"
             results = experiments.run(half, store=path, progress=False)
             again = experiments.run(half, store=path, progress=False)  # runs nothing
-        assert again.rows == results.rows
+        again.rows == results.rows
+        ```
+
+        ```text
+        True
         ```
     """
     where = "run"
@@ -118,7 +125,10 @@ def run(
     workers = check_count(workers, "workers", where)
     check_choice(backend, ("loky", "dask"), "backend", where)
     if mesh is not None and (workers > 1 or backend == "dask"):
-        raise ValueError(f"{where}: mesh needs workers=1, got {workers} {backend}.")
+        raise ValueError(
+            f"{where}: mesh needs workers=1 and backend='loky', got workers={workers} "
+            f"and backend={backend!r}."
+        )
     other_seeds = None if seeds is None else as_seeds(seeds, where)
     opened = Store(store, where)
     jobs, asked, changed = [], [], []
@@ -127,8 +137,8 @@ def run(
         wanted = wanted if one.is_random else wanted[:1]
         if mesh is not None and "key" not in one.arguments:
             raise ValueError(
-                f"{where}: mesh spreads what takes a key, and {one.name} has no "
-                "argument `key`."
+                f"{where}: mesh needs experiments that take a key, but {one.name} has "
+                "no argument `key`."
             )
         if mesh is not None and len(wanted) % mesh.devices.shape[0]:
             raise ValueError(
@@ -164,11 +174,11 @@ def run(
 def _write_outcomes(
     jobs: list[Job], outcomes: Outcomes, opened: Store, bars: Any
 ) -> None:
-    """Write each outcome down as it arrives."""
+    """Store each outcome as it arrives."""
     try:
         file = inspect.getfile(inspect.unwrap(jobs[0].experiment.function))
         folder = Path(file).resolve().parent
-    except (TypeError, OSError):  # not in a file
+    except (TypeError, OSError):  # the function is not in a file
         folder = Path.cwd()
     number = opened.write_run(provenance(folder))
     with bars as tick, contextlib.closing(outcomes):
@@ -182,7 +192,7 @@ def _write_outcomes(
 
 
 def _with_new_status(case: Case, stored: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Status updates of stored cases whose marks changed."""
+    """The records of stored cases whose status changed with their marks."""
     again = []
     for record in stored:
         status = _status(case, record["error"])
@@ -209,9 +219,9 @@ def _run_here(jobs: list[Job], mesh: Any) -> Outcomes:
 
 
 def _run_in_workers(jobs: list[Job], workers: int, backend: str) -> Outcomes:
-    """Run jobs by joblib. If a worker dies, the jobs that were running are repeated one
-    by one, to know which one kills it. Workers end with the run if they hold fixtures
-    that must be ended."""
+    """Run jobs with joblib. If a worker dies, the jobs that were running are repeated
+    one by one, to find out which one kills it. If workers hold fixtures with a
+    teardown, the teardown runs at the end."""
     extra("joblib", "experiments")
     if backend == "dask":
         extra("distributed", "dask")
@@ -240,7 +250,7 @@ def _run_in_workers(jobs: list[Job], workers: int, backend: str) -> Outcomes:
 
 
 def _end_fixtures(backend: str) -> None:
-    """End the fixtures of idle workers; those of loky end with the process."""
+    """Tear down the fixtures of idle workers. Those of loky end with their process."""
     if backend == "dask":
         client = extra("distributed", "dask").default_client()
         client.run(_close_runners, on_error="ignore")
@@ -265,7 +275,7 @@ def _parallel(
 
 def _alone(job: Job, packed: Packed, backend: str) -> Outcome:
     try:
-        # Two workers, for joblib runs a single one in this process.
+        # Two workers, because joblib runs a single worker in this process.
         ((_, outcome),) = _parallel([job], packed, 2, backend, None)
         return outcome
     except Exception as error:
@@ -276,28 +286,30 @@ def _alone(job: Job, packed: Packed, backend: str) -> Outcome:
         return Outcome({}, message, trace, 0.0, 0.0, None, 0)
 
 
-# By their names: the classes are in packages that need not be there.
+# By name, because the packages of these classes may not be installed.
 _DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker")
 
 
 def _packed(experiment: Experiment) -> tuple[str, bytes]:
     """The experiment as bytes that any process can read, and their hash."""
     cloudpickle = extra("cloudpickle", "experiments")
-    # Its fixtures are looked up here: in another process it has no module's globals.
+    # Look up its fixtures here: in another process the globals of its module are
+    # missing.
     experiment = dataclasses.replace(experiment, fixtures=experiment.used_fixtures())
     try:
         content = cloudpickle.dumps(experiment)
     except Exception as error:
         raise ValueError(
             f"run: {experiment.name} cannot be sent to another process: {error}. Make "
-            "what cannot be sent in the function or in a fixture."
+            "the object in the function or in a fixture."
         ) from error
-    # As bytes: Dask would keep an array on one worker, and lose it with that worker.
+    # As bytes, because Dask would keep an array on one worker, and lose it if that
+    # worker dies.
     return hashlib.sha256(content).hexdigest(), content
 
 
 _local = threading.local()
-# All that this process holds, in whatever thread.
+# The runners of this process, in all its threads.
 _held: set[Runner] = set()
 
 
@@ -310,7 +322,7 @@ def _close_runners() -> None:
 def _work(
     packed: Any, number: int, index: tuple, seeds: tuple, precise: bool, marks: Any
 ) -> tuple[int, Outcome]:
-    """Run one case in a worker, which keeps the runner for the next one."""
+    """Run one case in a worker, which keeps the runner for the next case."""
     import cloudpickle
 
     name, content = packed
@@ -331,7 +343,7 @@ def _work(
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Processes that are started meanwhile compute with one thread each."""
+    """Let processes that are started meanwhile compute with one thread each."""
     flag, flags = "--xla_cpu_multi_thread_eigen=false", os.environ.get("XLA_FLAGS", "")
     names = "XLA_FLAGS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
     before = {name: os.environ[name] for name in names if name in os.environ}
@@ -349,7 +361,7 @@ def _one_thread() -> Iterator[None]:
 def _progress(
     total: int, workers: int, shown: bool
 ) -> Iterator[Callable[[int, str, str], None]]:
-    """A bar for the whole, and one for each worker that has answered."""
+    """A progress bar for the whole run, and one for each worker that has answered."""
     from tqdm.auto import tqdm
 
     make = functools.partial(tqdm, unit="case", disable=not shown)

@@ -1,4 +1,4 @@
-"""Interquartile means, and comparisons of pairs."""
+"""Interquartile means, bootstrap intervals, and comparisons of pairs."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -13,28 +13,32 @@ from ._store import PASSED
 
 
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
-    """The mean of the middle half of some values.
+    """The mean of the middle half of the values.
 
-    It is as robust as the median and uses more of the data. Where a quarter of the
-    values is no whole number, the values at the edges count in part.
+    It ignores outliers, as the median does, but uses more of the data. If the number of
+    values is not a multiple of 4, the values at the edges count in part.
 
     Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
 
     **Arguments:**
 
-    - `values`: numbers; infinite ones may be among the outer quarters.
-    - `axis`: over which; all by default.
+    - `values`: numbers. Infinite values in the outer quarters have no effect.
+    - `axis`: the axis to average over; all axes by default.
 
     **Returns:** a number, or an array without that axis.
 
-    **Raises:** `ValueError` if there are none.
+    **Raises:** `ValueError` if there are no values.
 
     !!! example
 
         ```python
         from delucax import experiments
 
-        assert experiments.interquartile_mean([1.0, 2.0, 3.0, 1000.0]) == 2.5
+        experiments.interquartile_mean([1.0, 2.0, 3.0, 1000.0])
+        ```
+
+        ```text
+        2.5
         ```
     """
     array = np.asarray(values, np.float64)
@@ -44,12 +48,12 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
         raise ValueError("interquartile_mean: values must have at least one entry.")
     cut = count / 4
     place = np.arange(count)
-    # The k-th sorted value fills [k, k + 1] of [0, count]; what of it lies between the
-    # quartiles, count / 4 and 3 count / 4, is its weight.
+    # The k-th sorted value takes up [k, k + 1] of [0, count]. Its weight is the part of
+    # this between the quartiles, count / 4 and 3 count / 4.
     weight = np.clip(place + 1 - cut, 0, 1) * np.clip(count - cut - place, 0, 1)
     if count == 1:
         weight = np.ones(1)
-    # Not a product with zero, which would make NaN of an infinite value outside.
+    # Values of weight zero are left out, because zero times infinity is NaN.
     inside = weight > 0
     ordered = np.sort(array, axis=-1)[..., inside]
     mean = ordered @ weight[inside] / weight.sum()
@@ -57,7 +61,7 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Whether a result is a number, which statistics can be made of."""
+    """Whether a result is a number, so that it has statistics."""
     return isinstance(value, bool | int | float)
 
 
@@ -72,11 +76,11 @@ def compare(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Any:
-    """Each value of a parameter against one of them, on the same cases and seeds.
+    """Compare each value of a parameter with a baseline, on the same cases and seeds.
 
-    Two values are compared where both passed: pairs that agree in all other parameters
-    and in the seed. Intervals are those of a bootstrap that draws pairs, seeds within
-    each case (within all cases, where a case has but one seed).
+    A value and the baseline are compared in pairs of rows that passed and that agree in
+    all other parameters and in the seed. The intervals come from a bootstrap over the
+    pairs. It draws seeds within each case, or cases if each case has only one seed.
 
     Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
 
@@ -85,18 +89,24 @@ def compare(
     - `results`: from [`delucax.experiments.run`][].
     - `by`: the parameter, such as `"controller"`.
     - `baseline`: the value to compare with, as the table shows it.
-    - `metric`: what to compare, `"value"` by default.
-    - `ratio`: the quotient of the interquartile means rather than the difference.
-    - `confidence`: of the intervals, 0.95 by default.
-    - `resamples`: how many, 2000 by default.
-    - `seed`: of the resampling.
+    - `metric`: the result to compare, `"value"` by default.
+    - `ratio`: whether to give the ratio of the interquartile means in place of their
+        difference; `False` by default.
+    - `confidence`: the confidence level of the intervals, 0.95 by default.
+    - `resamples`: the number of bootstrap samples, 2000 by default.
+    - `seed`: the seed of the bootstrap, 0 by default.
 
-    **Returns:** a `pandas.DataFrame`, a row for each value: `iqm`, `low`, `high` of its
-    interquartile mean; `difference` (or `ratio`) to the baseline's over the common
-    pairs, its `difference_low`, `difference_high`; `below`, the fraction of the pairs
-    that are below the baseline; and `pairs`.
+    **Returns:** a `pandas.DataFrame` with a row for each value, and the columns
 
-    **Raises:** `ValueError` if there is no such parameter, value or metric.
+    - `iqm`, `low`, `high`: the interquartile mean and its interval.
+    - `difference`, `difference_low`, `difference_high`: the difference from the
+        baseline over the common pairs, and its interval. With `ratio` they are called
+        `ratio`, `ratio_low` and `ratio_high`.
+    - `below`: the fraction of the pairs in which the value is below the baseline.
+    - `pairs`: the number of pairs.
+
+    **Raises:** `ValueError` if there is no such parameter, value or metric, or if the
+    metric is not a number.
 
     !!! example
 
@@ -111,7 +121,11 @@ def compare(
 
         results = experiments.run(cost, progress=False)
         table = experiments.compare(results, by="method", baseline="a")
-        assert table.loc["b", "difference"] == 1.0
+        print(table.loc["b", "difference"])
+        ```
+
+        ```text
+        1.0
         ```
     """
     pd = extra("pandas", "tables")
@@ -142,8 +156,8 @@ def compare(
             f"{where}: baseline must be a value of {by!r} that passed "
             f"({', '.join(map(repr, samples))}), got {baseline!r}."
         )
-    # The same draws for all values of the parameter: what is shared by two of them does
-    # not widen the interval of their difference.
+    # The same draws for all values of the parameter, so that the variation they share
+    # does not widen the intervals of their differences.
     bootstrap = Bootstrap(confidence, resamples, seed)
     rows = {}
     for label, groups in samples.items():
@@ -167,17 +181,19 @@ def compare(
 
 @dataclasses.dataclass(frozen=True)
 class Bootstrap:
-    """Intervals by resampling: of a statistic of groups of values, and of what lies
-    between the members of pairs, for which the same draws are made.
+    """Bootstrap intervals of a statistic, and of differences or ratios of pairs.
+
+    The values come in groups, and each group is resampled separately. The two members
+    of a pair are drawn together.
 
     Source: Efron, 1979.
 
     **Arguments:**
 
-    - `confidence`: of the intervals, 0.95 by default.
-    - `resamples`: how many, 2000 by default.
-    - `seed`: of the resampling, 0 by default.
-    - `statistic`: of an array over an `axis`; by default
+    - `confidence`: the confidence level of the intervals, 0.95 by default.
+    - `resamples`: the number of bootstrap samples, 2000 by default.
+    - `seed`: the seed of the bootstrap, 0 by default.
+    - `statistic`: a function of an array and an `axis`; by default
         [`delucax.experiments.interquartile_mean`][].
 
     !!! example
@@ -188,7 +204,11 @@ class Bootstrap:
 
         costs = np.random.default_rng(0).normal(2.0, 1.0, (40, 2))
         ratio, low, high = Bootstrap(statistic=np.mean).paired([costs], ratio=True)
-        assert low < ratio < high
+        low < ratio < high
+        ```
+
+        ```text
+        True
         ```
     """
 
@@ -202,7 +222,9 @@ class Bootstrap:
 
         **Arguments:**
 
-        - `groups`: vectors of values; each is resampled by itself.
+        - `groups`: vectors of values. Each is resampled separately.
+
+        **Returns:** `(value, low, high)`.
         """
         value = self.statistic(np.concatenate(groups))
         return float(value), *self._ends(self.statistic(self._drawn(groups), axis=1))
@@ -210,19 +232,21 @@ class Bootstrap:
     def paired(
         self, groups: Sequence[np.ndarray], ratio: bool = False
     ) -> tuple[float, float, float]:
-        """The statistic of the first members of pairs less that of the second, or
-        divided by it, and its interval; NaN if there are no pairs.
+        """The statistic of the first members of pairs minus the statistic of the second
+        members, and its interval.
 
         **Arguments:**
 
-        - `groups`: arrays of shape `(count, 2)`; each is resampled by itself.
-        - `ratio`: whether to divide; false by default.
+        - `groups`: arrays of pairs, shape `(count, 2)`. Each is resampled separately.
+        - `ratio`: whether to divide in place of subtracting; `False` by default.
+
+        **Returns:** `(value, low, high)`; NaN if there are no pairs.
         """
         if not groups:
             return np.nan, np.nan, np.nan
         drawn, flat = self._drawn(groups), np.concatenate(groups)
         of = np.divide if ratio else np.subtract
-        # A baseline of zero has no ratio: infinity or NaN, as the division says.
+        # A baseline of zero makes the ratio infinite or NaN, without a warning.
         with np.errstate(divide="ignore", invalid="ignore"):
             value = of(*self.statistic(flat, axis=0))
             resampled = of(*self.statistic(drawn, axis=1).T)
@@ -230,7 +254,7 @@ class Bootstrap:
 
     def _drawn(self, groups: Sequence[np.ndarray]) -> np.ndarray:
         rng = np.random.default_rng(self.seed)
-        # A group of one would be drawn as it is, and the interval have no width.
+        # A group of one value never changes, so the interval would have no width.
         if all(len(group) == 1 for group in groups):
             groups = [np.concatenate(groups)]
         parts = [

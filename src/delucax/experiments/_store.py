@@ -1,9 +1,9 @@
-"""Results in a file, as they arrive: JSON, one line a case.
+"""Stores results in a file as they arrive: a line of JSON for each case.
 
-The first line names the format; a line `run` says what the cases after it were made
-with; a line `case` holds a case for some of its seeds. A line is written by one call,
-and one that was cut short is dropped when the file is next opened, so that a process
-may be killed at any moment. For cases that ran again the last line counts.
+The first line names the format. A line `run` says how the cases after it were made. A
+line `case` holds the results of a case for some of its seeds. A line is written by one
+call. A line that was cut short is dropped when the file is next opened, so a process
+may be killed at any moment. If a case ran again, its last line counts.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from .._check import as_path
 
 try:
     import fcntl
-except ImportError:  # Windows has no such lock, and two runs could write
+except ImportError:  # Windows has no such lock: two runs could write to one file
     fcntl = None
 
 _FORMAT = "delucax-results"
@@ -31,14 +31,14 @@ _NEEDED = {"run", "parameters", "status", "error", "device"}
 PASSED = ("passed", "passed unexpectedly")
 FAILED = ("failed", "passed unexpectedly")
 RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
-"""Names that neither a parameter nor a result can have."""
+"""The names that neither a parameter nor a result can have."""
 
 
 class Store:
-    """The lines of a results file; without a path they are kept in memory alone.
+    """The lines of a results file. Without a path they are only kept in memory.
 
-    `cases` is by experiment and case; each holds `hash`, `order` and `seeds`: what
-    counts of each seed, as a line has it but with its own values.
+    `cases` maps (experiment, case) to a dictionary with `hash`, `order` and `seeds`.
+    `seeds` maps each seed to its latest record: a line with the values of this seed.
     """
 
     def __init__(self, path: Any, where: str):
@@ -58,14 +58,14 @@ class Store:
         if path.is_dir():
             raise self._error("is a folder, not a results file.")
         if not path.is_file():  # a device may have no end
-            raise self._error("is no regular file.")
+            raise self._error("is not a regular file.")
         try:
             content = path.read_bytes()
         except OSError as error:
             where = f"{self.where}: '{path}'"
             raise type(error)(f"{where} cannot be read: {error}") from error
         lines = content.split(b"\n")
-        # A line without its end was cut short by the end of its process.
+        # The last line has no newline if its process was killed.
         self._whole = len(content) - len(lines.pop())
         if lines or not _line(_HEADER).startswith(content):
             self._check_header(lines[0] if lines else content)
@@ -142,8 +142,7 @@ class Store:
         return number
 
     def append(self, record: dict[str, Any]) -> None:
-        """Add a line."""
-        # Kept as it is read back, so that a fresh table and one from a file are equal.
+        """Add a line to the file and to `cases`."""
         if self.path is not None:
             self._write(record)
         self._add(record)
@@ -166,7 +165,7 @@ class Store:
         return type(error)(
             error.errno,
             f"{self.where}: '{self.path}' cannot be written ({error.strerror}); the "
-            f"{kept} results so far are kept, and the same call goes on from them",
+            f"{kept} results so far are kept, and the same call continues from them",
         )
 
     def close(self) -> None:

@@ -93,7 +93,7 @@ def report_diff(
 
 
 def _show(results: Results) -> None:
-    """A table of means for each experiment."""
+    """Print a table of means for each experiment."""
     for name, part in by_experiment(results).items():
         print(f"\n{name}\n\n{as_text('markdown', *summary(part))}")
 
@@ -105,8 +105,8 @@ def _write_page(path: str | None, make: Callable[[], Page]) -> None:
 
 
 def load(file: str, suites: Mapping[str, str], command: str) -> list[Experiment]:
-    """The experiments of a file, of a module by its dotted name, or of a suite: one of
-    the modules that have a shorter name. Errors name the command."""
+    """Load the experiments of a Python file, of a module by its dotted name, or of a
+    suite, which is a short name for a module. Errors name the command."""
     if file in suites:
         module = importlib.import_module(suites[file])
     elif file.endswith(".py"):
@@ -141,7 +141,7 @@ def _module_at(path: Path, command: str) -> ModuleType:
         import cloudpickle
     except ImportError:
         return module
-    # Workers do not find it by its name.
+    # Workers cannot import it by its name.
     cloudpickle.register_pickle_by_value(module)
     return module
 
