@@ -121,7 +121,7 @@ def test_quoted_numbers_and_blank_lines(lines, tmp_path):
 def test_a_column_is_there_once(lines, tmp_path):
     path = tmp_path / "twice.csv"
     path.write_text("\n".join([f"{lines[0]},R", *(f"{line},20" for line in lines[1:])]))
-    with user_error(match="must have each column once, but has R more often"):
+    with user_error(match="must have each column once, but repeats R"):
         lung.read_breaths(path)
 
 

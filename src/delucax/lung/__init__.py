@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     )
     from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
 else:
-    # Controllers, Optax and the training loop are imported as they are used.
+    # Controllers, Optax and the training loop are imported when they are first used.
     __getattr__, __dir__ = _lazily(
         __name__,
         {

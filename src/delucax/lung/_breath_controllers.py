@@ -1,4 +1,4 @@
-"""Controllers of a breath."""
+"""Controllers of the valves during a breath."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -23,25 +23,28 @@ class _Phases(NamedTuple):
 
 
 class Breathing(AbstractController):
-    r"""A controller of whole breaths, made of one of the inspiratory valve.
+    r"""A controller of whole breaths, made from a controller of the inspiratory valve.
 
-    In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), valve(y))`. In the
-    expiratory phase the inspiratory valve is closed; or, with an `expiratory_opening`
-    `u_e`, in the second half of a period it is opened to `u_e (1 - exp(-5 s))`, where
-    `s` is the time since the middle: this keeps the airway open against a leak. The
-    inspiratory controller is reset at the start of each breath, and is not called in
-    the expiratory phase.
+    In the inspiratory phase, the control of the inspiratory valve is that of
+    `inspiratory`, clipped to [0, 100]. In the expiratory phase the inspiratory valve is
+    closed. With an `expiratory_opening` $u_e$, it is opened to $u_e (1 - e^{-5 s})$ in
+    the second half of each period, where $s$ is the time since the middle of the period
+    [s]. This keeps the airway open against a leak.
+
+    The inspiratory controller is reset at the start of each breath. Its state does not
+    change in the expiratory phase.
 
     **Arguments:**
 
     - `inspiratory`: any controller of one control, such as a
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
-    - `expiratory_opening`: [%], 0 by default; that of the original is 5.
-    - `valve`: a controller of the expiratory valve; by default it is 0 in the
+    - `expiratory_opening`: $u_e$ [%], 0 by default; 5 in the original.
+    - `valve`: a controller of the expiratory valve. By default its control is 0 in the
         inspiratory phase and 1 in the expiratory phase.
 
-    **Raises:** `ValueError` if what is given is no controller, or no waveform.
+    **Raises:** `ValueError` if `inspiratory` or `valve` is not a controller, or
+    `waveform` is not a `BreathWaveform`.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).
@@ -84,7 +87,7 @@ class Breathing(AbstractController):
         begins = inhale & ~state.inhaling
         inner = _where(begins, self.inspiratory.init(key=None), state.inner)
         u_in, after = self.inspiratory(t, y, inner)
-        # Opened with a time constant of 0.2 s.
+        # The valve opens with a time constant of 0.2 s.
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
         held = self.expiratory_opening * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
@@ -103,7 +106,7 @@ class Breathing(AbstractController):
 
 
 def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
-    """Select one of two states. Random keys are those of `no`: none is used twice."""
+    """Select one of two states. Random keys come from `no`, so none is used twice."""
 
     def where(yes, no):
         if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
@@ -114,12 +117,12 @@ def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
 
 
 class BangBang(AbstractController):
-    """Fully open below the target, and closed above it.
+    """Opens the valve fully below the target pressure, and closes it above.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `high`: the control below it [%], 100 by default.
+    - `high`: the control below the target [%], 100 by default.
 
     **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
 
@@ -145,13 +148,15 @@ class BangBang(AbstractController):
 
 
 class BreathPolicy(AbstractController):
-    r"""A network of the last errors, the targets to come, and the last controls,
+    r"""A policy of the inspiratory valve: a network of errors, targets and controls.
 
-    `u = 100 sigmoid(network(e[k], ..., e[k + 1 - errors], r[k + 1], r[k + 2], r[k],
-    u[k - 1], ..., u[k - controls]) + shift)`,
+    $$u_k = 100 \, \sigma(\mathrm{network}(e_k, \dots, e_{k + 1 - n_e},
+    r_{k + 1}, r_{k + 2}, r_k, u_{k - 1}, \dots, u_{k - n_u}) + \mathrm{shift})$$
 
-    all scaled; before the breath there are zeros. The sigmoid enforces the bounds of
-    the valve without a zero gradient.
+    The inputs are the last errors $e$, the target $r$ now and at the next two steps,
+    and the last controls $u$. They are scaled to about 1, and errors and controls are
+    zero before the breath. The sigmoid $\sigma$ enforces the bounds of the valve, and
+    its gradient is never zero.
 
     The kind `"mlp"` is a fully connected network. The kind `"cnn"` first takes the
     means of the last 1, 2, ..., `errors` errors, and convolves them.
@@ -159,22 +164,21 @@ class BreathPolicy(AbstractController):
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `dt`: the control interval.
+    - `dt`: the control interval [s].
     - `kind`: `"mlp"` (default) or `"cnn"`.
-    - `width`: hidden units, or channels, 32 by default.
-    - `depth`: hidden layers of the `"mlp"`, 2 by default; may be 0. The `"cnn"` has
-        none.
-    - `errors`: how many errors it is given, 10 by default, and at least 5 of them for a
-        `"cnn"`.
-    - `controls`: how many controls it is given, 4 by default; may be 0. The published
-        networks were given no controls, and not `r[k]`, which this one always is.
+    - `width`: the number of hidden units, or of channels, 32 by default.
+    - `depth`: the number of hidden layers of the `"mlp"`, 2 by default; may be 0. The
+        `"cnn"` has none.
+    - `errors`: the number of errors $n_e$, 10 by default. A `"cnn"` needs at least 5.
+    - `controls`: the number of controls $n_u$, 4 by default; may be 0. The published
+        networks had neither the controls nor $r_k$ as inputs.
     - `key`: a random key, for the first weights.
 
-    **Attributes:** `network`, trainable; `shift`, -2, so that it begins with the valve
-    a little open.
+    **Attributes:** `network`, trainable; `shift`, -2, so that the valve is a little
+    open at first.
 
-    **Raises:** `ValueError` if a size is below its least, the kind is unknown,
-    `waveform` is not a `BreathWaveform` or there is no key.
+    **Raises:** `ValueError` if a size is too small, the kind is unknown, `waveform` is
+    not a `BreathWaveform`, or there is no key.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -240,8 +244,8 @@ class BreathPolicy(AbstractController):
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         errors, controls = state
         now = self.waveform.pressure(t)
-        # Scaled, so that what enters the network is about 1: errors by 10 cmH2O,
-        # targets by 15, controls by 50 %.
+        # Scaled so that the inputs of the network are about 1: errors by 10 cmH2O,
+        # targets by 15 cmH2O, controls by 50 %.
         error = ((now - y) / 10).astype(errors.dtype)
         errors = jnp.concatenate([error, errors[:-1]])
         ahead = [self.waveform.pressure(t + k * self.dt) for k in (1, 2)]

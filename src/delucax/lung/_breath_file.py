@@ -1,4 +1,5 @@
-"""The public data set of a ventilator, as a file of comma-separated values."""
+"""Reads and writes breaths as comma-separated values, in the format of a public data
+set of a ventilator."""
 
 import array
 import csv
@@ -30,33 +31,33 @@ def read_breaths(
     resistances: Sequence[float] = RESISTANCES,
     compliances: Sequence[float] = COMPLIANCES,
 ) -> Breaths:
-    """The inspirations of a file with the columns of the "Ventilator Pressure
-    Prediction" data set.
+    """Read the inspirations of a file like the "Ventilator Pressure Prediction" data
+    set.
 
     The columns are `id`, `breath_id`, `R` [cmH2O s/L], `C` [mL/cmH2O], `time_step` [s],
-    `u_in` (0 to 100 %), `u_out` (0 or 1) and `pressure` [cmH2O], in any order, and the
-    rows of a breath follow each other. An inspiration is what is before `u_out` is
-    first 1. As the steps of the file are not even, it is sampled anew every `dt`: the
-    pressure along a line, the controls held.
+    `u_in` (0 to 100 %), `u_out` (0 or 1) and `pressure` [cmH2O], in any order. The rows
+    of a breath follow each other. An inspiration ends when `u_out` is first 1. The
+    steps of the file are uneven, so each inspiration is sampled again every `dt`: the
+    pressure is interpolated linearly, and the controls are held.
 
-    Numbers may be quoted, blank lines are passed over, and there are no comments.
+    Numbers may be quoted and blank lines are ignored. Comments are not allowed.
 
     **Arguments:**
 
     - `path`: the file.
-    - `length`: samples per inspiration, 29 by default.
-    - `dt`: the time between samples [s]; the median of the file's by default.
+    - `length`: the number of samples per inspiration, 29 by default.
+    - `dt`: the time between samples [s]; the median of the file by default.
     - `resistances`, `compliances`: the values that `R` and `C` may have; 5, 20, 50 and
         10, 20, 50 by default.
 
-    **Returns:** a [`delucax.lung.Breaths`][], with the resistance and compliance of
-        each.
+    **Returns:** a [`delucax.lung.Breaths`][] with the resistance and compliance of each
+        breath.
 
-    **Raises:** `ValueError` that names the column and the row, which is the line of the
-        file as an editor counts it (the header is in row 1, and blank lines count),
-        where a column is missing, a value is not a finite number, `u_in` is out of its
-        bounds, `R`, `C` or `u_out` is none of the values that it may have, `R` or `C`
-        changes within a breath, time does not go on, or a breath is too short;
+    **Raises:** `ValueError` if a column is missing, a value is not a finite number,
+        `u_in` is out of its bounds, `R`, `C` or `u_out` has a value that is not
+        allowed, `R` or `C` changes within a breath, time does not increase, or a breath
+        is too short. The message names the column and the row, which is the line of the
+        file as an editor counts it: the header is row 1, and blank lines count.
         `OSError` if the file cannot be read.
 
     Source: Google Brain, 2021 (the data set); Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu,
@@ -89,7 +90,7 @@ def read_breaths(
     time = table["time_step"]
     if dt is None:
         steps = np.diff(time)
-        steps[starts[1:] - 1] = np.nan  # from one breath to the next
+        steps[starts[1:] - 1] = np.nan  # between one breath and the next
         dt = float(np.nanmedian(steps))
     samples = []
     grid = dt * np.arange(length)
@@ -120,9 +121,7 @@ def _wrong(path: Path, line: Any, column: str, words: str) -> ValueError:
 def _breaths(
     path: Path, table: dict[str, np.ndarray], allowed: dict[str, Sequence[float]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The first row of each breath and the row after its last.
-
-    Raises unless each breath is of one lung.
+    """Check the rows. Returns the first row of each breath and the row after its last.
 
     `allowed` holds the values that a column may have.
     """
@@ -134,7 +133,7 @@ def _breaths(
     again = begins & ~np.isin(np.arange(len(number)), first)
     single = begins & np.append(begins[1:], True)
     rise = {n: np.diff(table[n], prepend=0.0) for n in ("time_step", "R", "C")}
-    apart = "the rows of a breath must follow each other, but breath {now:g} was before"
+    apart = "the rows of a breath must follow each other, but breath {now:g} comes again"
     short = "a breath must have at least 2 rows, got 1 of breath {now:g}"
     later = "must increase within a breath, got {now:g} after {last:g}"
     same = "must be the same for all of breath {breath:g}, got {now:g} after {last:g}"
@@ -169,8 +168,8 @@ def _table(path: Path) -> dict[str, np.ndarray]:
         twice = [name for name in COLUMNS if header.count(name) > 1]
         if twice:
             raise ValueError(
-                f"{_WHERE}: '{path}' must have each column once, but has "
-                f"{', '.join(twice)} more often."
+                f"{_WHERE}: '{path}' must have each column once, but repeats "
+                f"{', '.join(twice)}."
             )
         if missing:
             raise ValueError(
@@ -198,7 +197,7 @@ def _numbers(
     for name, j in place.items():
         text = row[j] if j < len(row) else ""
         try:
-            # Python takes 1_000 for a number; no other reader of the file would.
+            # Python reads 1_000 as a number, but other readers of the file do not.
             number = np.nan if "_" in text else float(text)
         except ValueError:
             number = np.nan
@@ -216,7 +215,8 @@ def write_breaths(path: str | os.PathLike, breaths: Breaths) -> None:
     - `path`: the file to write.
     - `breaths`: a [`delucax.lung.Breaths`][] with resistance and compliance.
 
-    **Raises:** `ValueError` without those; `OSError` if the file cannot be written.
+    **Raises:** `ValueError` if the resistance or compliance is missing; `OSError` if
+    the file cannot be written.
 
     !!! example
 

@@ -16,22 +16,22 @@ from ._waveform import LENGTH
 
 
 class Breaths(eqx.Module):
-    """Recorded breaths, `B` of them, each of `T` samples.
+    """`B` recorded breaths with `T` samples each.
 
-    The pressure at a sample is what the sensor read before the control of that sample
-    acted.
+    The pressure of a sample is the reading of the sensor before the control of that
+    sample acted.
 
     **Arguments:**
 
-    - `u_in`: opening of the inspiratory valve [%], shape `(B, T)`.
+    - `u_in`: the opening of the inspiratory valve [%], shape `(B, T)`.
     - `u_out`: whether the expiratory valve was open, shape `(B, T)`.
-    - `pressure`: what the sensor read [cmH2O], shape `(B, T)`.
+    - `pressure`: the reading of the sensor [cmH2O], shape `(B, T)`.
     - `dt`: the time between samples [s].
-    - `resistance`: of the lung of each breath [cmH2O s/L], shape `(B,)`; not known by
-        default.
-    - `compliance`: of the lung of each breath [mL/cmH2O], shape `(B,)`; not known by
-        default.
-    - `truth`: what a sensor without noise would have read, shape `(B, T)`; not known by
+    - `resistance`: the resistance of the lung of each breath [cmH2O s/L], shape `(B,)`;
+        `None` by default.
+    - `compliance`: the compliance of the lung of each breath [mL/cmH2O], shape `(B,)`;
+        `None` by default.
+    - `truth`: the reading of a sensor without noise [cmH2O], shape `(B, T)`; `None` by
         default.
 
     **Raises:** `ValueError` if shapes do not fit each other, a value is not finite, or
@@ -83,28 +83,28 @@ class Breaths(eqx.Module):
         return self.pressure.shape[0]
 
     def __getitem__(self, index: Any) -> "Breaths":
-        """The breaths of an index, a slice or booleans."""
+        """The breaths at an index, a slice or a mask of booleans."""
         return jax.tree.map(lambda a: a[index] if a.ndim else a, self)
 
     @classmethod
     def from_recording(
         cls, u_in: Any, u_out: Any, pressure: Any, *, dt: Any, length: int = LENGTH
     ) -> "Breaths":
-        """The inspirations of a recording, cut out of it.
+        """Cut the inspirations out of a recording.
 
-        An inspiration is a longest stretch with the expiratory valve closed. Those
-        shorter than `length` are left out, and the others cut to it.
+        An inspiration lasts as long as the expiratory valve is closed. Inspirations
+        shorter than `length` are left out, and the others are cut to `length`.
 
         **Arguments:**
 
         - `u_in`, `u_out`, `pressure`: the recording, vectors of one size.
         - `dt`: the time between samples [s].
-        - `length`: samples per inspiration, 29 by default.
+        - `length`: the number of samples per inspiration, 29 by default.
 
         **Returns:** a [`delucax.lung.Breaths`][].
 
-        **Raises:** `ValueError` if sizes differ, a value is not finite, or there is no
-        inspiration as long.
+        **Raises:** `ValueError` if the sizes differ, a value is not finite, or no
+        inspiration is long enough.
 
         !!! example
 
@@ -139,16 +139,16 @@ class Breaths(eqx.Module):
         return cls(*(jnp.asarray(column[rows]) for column in columns), dt=dt)
 
     def split(self, test: float = 0.1, *, key: PRNGKey) -> tuple["Breaths", "Breaths"]:
-        """Breaths to train on and breaths to test on, drawn at random.
+        """Split the breaths at random into breaths to train on and breaths to test on.
 
         **Arguments:**
 
-        - `test`: the share to test on, between 0 and 1; 0.1 by default.
+        - `test`: the share of breaths to test on, between 0 and 1; 0.1 by default.
         - `key`: a random key.
 
         **Returns:** `(train, test)`.
 
-        **Raises:** `ValueError` if either would be empty.
+        **Raises:** `ValueError` if one of them would be empty.
         """
         check_key(key, "split")
         check_range(test, "test", "split", 0, 1)
@@ -162,10 +162,9 @@ class Breaths(eqx.Module):
         return self[order[cut:]], self[order[:cut]]
 
     def open_loop_error(self, model: Any) -> Array:
-        """The mean absolute error of a lung that is given the recorded controls alone.
+        """The mean absolute error of a lung that is given only the recorded controls.
 
-        Against the truth of the breaths where it is known, else against what the sensor
-        read.
+        The error is taken from `truth` if it is known, else from `pressure`.
 
         **Arguments:** `model`: a [`delucax.lung.LearnedLung`][] or
             [`delucax.lung.LungModel`][].

@@ -1,4 +1,4 @@
-"""Breaths made by exploring a lung."""
+"""Collects breaths by exploring a lung."""
 
 from typing import Any
 
@@ -29,22 +29,23 @@ GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
 class Explorer(AbstractController):
     r"""A PID with random gains and a random disturbance, to collect data of a lung.
 
-    Its control is `(clip(pid + bump(t), 0, 100), 0)`, and `(0, 1)` in the expiratory
-    phase. The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn
-    for each episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10}, times `scale`. A bump is
-    drawn too: a triangle of a height between -30 and 30
-    and a width between 0.1 and 0.5 s somewhere in the inspiration; with probability
-    0.15 a ramp instead, which begins at a height between 0 and 100 and is gone within
-    0.05 to 0.3 s.
+    The control is the sum of the PID and a bump, clipped to [0, 100], with the
+    expiratory valve closed. In the expiratory phase it is (0, 1).
+
+    The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn for each
+    episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10}, times `scale`. A bump is drawn too:
+    a triangle of height -30 to 30 % and width 0.1 to 0.5 s, at a random time in the
+    inspiration. With probability 0.15 it is instead a ramp, which falls from a height
+    of 0 to 100 % to zero within 0.05 to 0.3 s.
 
     **Arguments:**
 
-    - `dt`: the control interval.
+    - `dt`: the control interval [s].
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `scale`: of the gains that are drawn, 1 by default.
+    - `scale`: the scale of the random gains, 1 by default.
 
-    **Raises:** `ValueError` if a number is not one or not finite, `dt` is not positive,
-    or `waveform` is not a `BreathWaveform`.
+    **Raises:** `ValueError` if an argument is not a finite number, `dt` is not
+    positive, or `waveform` is not a `BreathWaveform`.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -89,7 +90,7 @@ class Explorer(AbstractController):
         since = waveform.share(t) * waveform.period
         inspiration = waveform.inspiration * waveform.period
         height, width, place, top, duration = (bump[i] for i in range(5))
-        # The triangle lies within the inspiration, its middle at a place from 0 to 1.
+        # The triangle lies within the inspiration. `place`, from 0 to 1, says where.
         middle = width / 2 + place * (inspiration - width)
         triangle = height * jnp.maximum(0, 1 - jnp.abs(since - middle) / (width / 2))
         ramp = top * jnp.maximum(0, 1 - since / duration)
@@ -124,26 +125,28 @@ def explore(
     resistance: Any = None,
     compliance: Any = None,
 ) -> Breaths:
-    """Breaths of an [`delucax.lung.Explorer`][], each from the start of the task.
+    """Collect breaths of a lung with an [`delucax.lung.Explorer`][].
 
-    Those in which the pressure passes the abort limit are left out, as a rig would
-    never finish them, and others are drawn in their place.
+    Each breath begins at the start of the task. Breaths whose pressure passes the abort
+    limit are left out, because a real machine would not finish them. Other breaths are
+    drawn in their place.
 
     **Arguments:**
 
     - `env`: a task of a lung, such as `delucax.make("lung/double_compartment")`.
-    - `breaths`: how many.
+    - `breaths`: the number of breaths.
     - `key`: a random key.
-    - `length`: samples per breath, 29 by default.
+    - `length`: the number of samples per breath, 29 by default.
     - `pips`: the peak pressures to draw from, 10, 15, ..., 35 cmH2O by default.
-    - `scale`: of the PID gains that are drawn, 1 by default.
+    - `scale`: the scale of the random PID gains, 1 by default.
     - `abort`: the abort limit [cmH2O], 70 by default.
-    - `resistance`, `compliance`: of the lung, to be written down; not by default.
+    - `resistance`, `compliance`: of the lung, to record with the breaths; `None` by
+        default.
 
-    **Returns:** a [`delucax.lung.Breaths`][], with `truth`.
+    **Returns:** a [`delucax.lung.Breaths`][] with `truth`.
 
-    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
-    say), or hardly a breath stays below the limit.
+    **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
+    below PEEP), or if too few breaths stay below the limit.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -170,7 +173,7 @@ def explore(
     explorer = Explorer(dt=env.dt, waveform=waveform, scale=scale)
     kept, count = [], 0
     for attempt in range(50):
-        # Four times as many as asked for, so that one batch mostly does.
+        # Draw four times as many as needed, so that one batch is mostly enough.
         draw_key, run_key = jr.split(jr.fold_in(key, attempt))
         drawn = jr.choice(draw_key, pips, (4 * breaths,))
         keys = jr.split(run_key, 4 * breaths)
@@ -182,8 +185,8 @@ def explore(
             break
     else:
         raise ValueError(
-            f"{where}: abort must be a limit that some breaths stay below, but of "
-            f"{200 * breaths} breaths only {count} stayed below {abort}: lower scale."
+            f"{where}: abort must be a limit that some breaths stay below, but only "
+            f"{count} of {200 * breaths} breaths stayed below {abort}. Lower scale."
         )
     whole = [np.concatenate(column)[:breaths] for column in zip(*kept, strict=True)]
     u_in, u_out, pressure, truth = map(jnp.asarray, whole)

@@ -19,60 +19,63 @@ from ._breaths import Breaths
 
 @eqx.filter_jit
 def _boundary(key: PRNGKey, boundary: int, size: int) -> tuple[Array, ...]:
-    """The first weights of the networks at the beginning of a breath, and two keys."""
+    """The first weights of the networks of the first steps, and two keys."""
     hidden_key, output_key, *keys = jr.split(key, 4)
     shape = boundary, 16
-    # Variances of one over the inputs keep what enters a tanh about 1.
+    # A variance of 1 over the number of inputs keeps the input of tanh about 1.
     hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
     return hidden, 0.1 * jr.normal(output_key, shape) / 16**0.5, *keys
 
 
 @eqx.filter_jit
 def _moments(breaths: Breaths) -> tuple[Array, ...]:
-    """Means and standard deviations of control and pressure, and the first pressure."""
+    """Means and standard deviations of control and pressure, and the mean pressure at
+    the first sample."""
     inhaling = breaths.u_out < 0.5
     moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
     u_mean, u_std = moments(breaths.u_in)
     p_mean, p_std = moments(breaths.pressure)
     start = jnp.mean(breaths.pressure[..., 0])
-    # It is divided by, and 0 where all are the same.
+    # The standard deviations are divisors, and are 0 if all values are the same.
     return u_mean, u_std + 1e-3, p_mean, p_std + 1e-3, start
 
 
 class LearnedLung(AbstractDynamics):
-    r"""A lung learned from breaths: a network of the last controls and pressures, and
-    networks of their own for the first steps of an inspiration.
+    r"""A lung learned from breaths: a network of the last controls and pressures, with
+    extra networks for the first steps of an inspiration.
 
-    With `u` and `p` the normalised controls and pressures, step `k` of an inspiration
-    predicts
+    At step $k$ of an inspiration, the normalised pressure is predicted as
 
-    `p[k + 1] = p[k] + line . z + network(z) + output_k . tanh(hidden_k z_all)`,
-    `z = (v(u[k]), ..., v(u[k + 1 - u_window]), p[k], ..., p[k + 1 - p_window])`,
+    $$p_{k + 1} = p_k + \ell^\top z + \mathrm{network}(z)
+    + o_k^\top \tanh(H_k z_\mathrm{all})$$
 
-    where `v`, a small network of one control, linearises the curve of the valve, and
-    `z_all` is the whole history. The last term is included for `k < boundary` only.
-    Before an inspiration the valve is closed and the pressure is the start pressure of
-    the breaths.
+    $$z = (v(u_k), \dots, v(u_{k + 1 - n_u}), p_k, \dots, p_{k + 1 - n_p})$$
 
-    With `published`, the model of the paper: `p[k + 1] = network(z)` of the raw
-    controls, for `k < boundary` the last term alone, and a history of zeros before an
-    inspiration.
+    Here $u$ are the normalised controls, $\ell$ is `line`, and $v$ is a small network
+    of one control that linearises the curve of the valve. The last term, of `output`
+    and `hidden` and the whole history $z_\mathrm{all}$, is only there for
+    $k < \mathrm{boundary}$. Before an inspiration the valve is closed and the pressure
+    is the start pressure of the breaths.
 
-    The `boundary` networks have 16 hidden units each, and are one stacked array,
-    of which a step takes its slice.
-    While `u_out` is above 1/2 the lung is as before an inspiration. The state is (the
-    controls, the pressures, both newest first, and the count of steps), and the
-    observation is the pressure [cmH2O].
+    With `published` it is the model of the paper: $p_{k + 1} = \mathrm{network}(z)$ of
+    the raw controls, only the last term for $k < \mathrm{boundary}$, and a history of
+    zeros before an inspiration.
+
+    The networks of the first steps have 16 hidden units each and are stacked in one
+    array. While `u_out` is above 1/2, the state is reset to that before an inspiration.
+    The state is (the controls, the pressures, both newest first, and the number of
+    steps). The observation is the pressure [cmH2O].
 
     **Arguments:**
 
-    - `breaths`: a [`delucax.lung.Breaths`][], from which the scales and the pressure
-        before an inspiration are taken.
-    - `width`, `depth`: of the network, 24 and 1 by default.
-    - `boundary`: how many first steps have networks of their own, 5 by default.
-    - `u_window`, `p_window`: how many controls and pressures the network is given, 8
-        and 6 by default.
-    - `published`: as published (see above); false by default.
+    - `breaths`: a [`delucax.lung.Breaths`][], which gives the scales and the pressure
+        before an inspiration.
+    - `width`, `depth`: the hidden units and hidden layers of the network, 24 and 1 by
+        default.
+    - `boundary`: the number of first steps with a network of their own, 5 by default.
+    - `u_window`, `p_window`: the numbers $n_u$ and $n_p$ of controls and pressures that
+        enter the network, 8 and 6 by default.
+    - `published`: whether to use the published model (see above); `False` by default.
     - `key`: a random key, for the first weights.
 
     **Attributes:** `line`, `valve`, `network`, `hidden` and `output`, trainable;
@@ -145,7 +148,7 @@ class LearnedLung(AbstractDynamics):
 
     @property
     def window(self) -> int:
-        """The number of controls, and of pressures, in the state."""
+        """The number of controls in the state, and of pressures."""
         return self.hidden.shape[-1] // 2
 
     @property
@@ -175,12 +178,12 @@ class LearnedLung(AbstractDynamics):
         return self.p_mean + self.p_std * x[self.window]
 
     def corrected(self, x: State, pressure: RealScalar, gain: RealScalar) -> State:
-        """The state with its newest pressure corrected by a measured one.
+        """Correct the newest pressure in the state with a measurement.
 
-        **Arguments:** `x`: the state. `pressure`: what a sensor read [cmH2O]. `gain`:
-        how much of the difference is made up for, from 0 to 1.
+        **Arguments:** `x`: the state. `pressure`: the reading of a sensor [cmH2O].
+        `gain`: the share of the difference to correct, from 0 to 1.
 
-        **Returns:** the state.
+        **Returns:** the corrected state.
         """
         innovation = (pressure - self.pressure(x)) / self.p_std
         return x.at[self.window].add((gain * innovation).astype(x.dtype))
@@ -196,18 +199,19 @@ class LearnedLung(AbstractDynamics):
         """The next pressure, after the first steps."""
         z = jnp.concatenate([linearised, pressures[: self.p_window]])
         predicted = self.network(z)
-        # The networks learn the change: for a short step it is small and near linear.
+        # The networks learn the change, which is small and almost linear.
         return predicted if self.published else pressures[0] + self.line @ z + predicted
 
     def _first_step(
         self, history: Array, late: Any, hidden: Array, output: Array
     ) -> Array:
-        """The next pressure in a first step; `late` is that of `_later_step`."""
+        """The next pressure in one of the first steps. `late` is the result of
+        `_later_step`."""
         own = output @ jnp.tanh(hidden @ history)
         return own if self.published else own + late
 
     def _bound(self, pressure: Array) -> Array:
-        # A control that makes no sense must not drive the state out of all bounds.
+        # Keep the state bounded, even if a control makes no sense.
         return 20 * jnp.tanh(pressure / 20)
 
     def advance(
@@ -218,39 +222,42 @@ class LearnedLung(AbstractDynamics):
         control = jnp.reshape((u[0] - self.u_mean) / self.u_std, (1,)).astype(x.dtype)
         controls, pressures = jnp.concatenate([control, x[: n - 1]]), x[n : 2 * n]
         step, first = x[2 * n], self.hidden.shape[0]
-        # The count of steps is a float in the state; past `boundary` a slice is still
-        # taken, and not used, because a scan has no branches of other shapes.
+        # The number of steps is a float in the state. Past `boundary` a slice is taken
+        # but not used, because both predictions are computed.
         i = jnp.clip(jnp.round(step), 0, first - 1).astype(int)
         late = self._later_step(self._linearised(controls[: self.u_window]), pressures)
         history = jnp.concatenate([controls, pressures])
         early = self._first_step(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
         after = jnp.hstack([controls, predicted, pressures[: n - 1], step + 1])
-        # Nothing is learned of expirations: an open valve resets the state.
+        # Expirations are not learned: an open valve resets the state.
         after = jnp.where(u[1] > 0.5, self.resting(), after)
         return after.astype(x.dtype), RESULTS.successful
 
     def predict(self, u_in: Array) -> Array:
-        """The pressures of an inspiration under recorded controls: open loop.
+        """Predict the pressures of an inspiration from its controls, in open loop.
 
-        **Arguments:** `u_in`: shape `(T,)` [%].
+        **Arguments:** `u_in`: the controls [%], shape `(T,)`.
 
-        **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
+        **Returns:** the pressures [cmH2O], shape `(T,)`. The first is the pressure
+        before any control acted.
         """
         return self._predicted(u_in, None)
 
     def one_step(self, u_in: Array, pressure: Array) -> Array:
-        """Each pressure predicted from the recorded ones before it.
+        """Predict each pressure from the recorded pressures before it.
 
-        **Arguments:** `u_in`, `pressure`: shape `(T,)`.
+        **Arguments:** `u_in`: the controls [%], shape `(T,)`. `pressure`: the recorded
+            pressures [cmH2O], shape `(T,)`.
 
-        **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
+        **Returns:** the pressures [cmH2O], shape `(T,)`. The first is the pressure
+        before any control acted.
         """
         return self._predicted(u_in, (pressure - self.p_mean) / self.p_std)
 
     def _predicted(self, u_in: Array, recorded: Array | None) -> Array:
-        """The same as by `advance`, but what needs no prediction is computed for all
-        steps at once: the windows of controls, and with records the whole."""
+        """Predict as `advance` does, but compute for all steps at once what needs no
+        prediction: the windows of controls, or everything if pressures are recorded."""
         n, last = self.window, u_in.shape[0] - 1
         first = min(self.hidden.shape[0], last)
         x0 = self.resting().astype(u_in.dtype)
@@ -272,7 +279,8 @@ class LearnedLung(AbstractDynamics):
 
         inputs = controls[:first], linearised[:first], *weights
         start = x0[n : 2 * n]
-        # Open loop each step needs the pressure before it; with records none does.
+        # In open loop each step needs the pressure before it. With recorded pressures
+        # all steps are independent.
         if recorded is None:
 
             def scan(step, pressures, inputs):
@@ -292,7 +300,7 @@ class LearnedLung(AbstractDynamics):
 
 
 def _windows(values: Array, size: int) -> Array:
-    """The last `size` values at each time that has as many, newest first."""
+    """The last `size` values, newest first, at each time that has enough values."""
     count = values.shape[0] - size + 1
     shifts = [values[size - 1 - i : size - 1 - i + count] for i in range(size)]
     return jnp.stack(shifts, axis=1)

@@ -1,4 +1,4 @@
-"""Physical, neural and grey-box models of a lung, to be fitted to breaths."""
+"""Physical, neural and grey-box models of a lung, which are fitted to breaths."""
 
 from typing import Any, cast, ClassVar
 
@@ -27,18 +27,18 @@ from ._ventilation import Valves
 
 
 class LungModel(eqx.Module):
-    """A lung as a differential equation and a sensor, to be fitted to breaths.
+    """A lung as a differential equation and a sensor, which can be fitted to breaths.
 
     **Arguments:**
 
     - `system`: a [`delucax.lung.AbstractLung`][].
     - `dt`: the time between samples [s], 0.03 by default.
-    - `sensor_delay`: steps until a pressure is observed, 2 by default.
-    - `peep`: the pressure at which it rests before an inspiration [cmH2O], 5 by
-        default.
+    - `sensor_delay`: the number of steps until a pressure is observed, 2 by default.
+    - `peep`: the pressure at rest before an inspiration [cmH2O], 5 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
 
-    **Raises:** `ValueError` if `system` is no lung or `dt` is not positive.
+    **Raises:** `ValueError` if `system` is not an `AbstractLung` or `dt` is not
+    positive.
 
     !!! example
 
@@ -81,14 +81,15 @@ class LungModel(eqx.Module):
         return self.dynamics.filled(self.system.resting(self.peep))
 
     def predict(self, u_in: Array) -> Array:
-        """The pressures of an inspiration under recorded controls: open loop.
+        """Predict the pressures of an inspiration from its controls, in open loop.
 
-        **Arguments:** `u_in`: shape `(T,)` [%].
+        **Arguments:** `u_in`: the controls [%], shape `(T,)`.
 
-        **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
+        **Returns:** the pressures [cmH2O], shape `(T,)`. The first is the pressure
+        before any control acted.
         """
 
-        # Recomputed for the gradient, of which only the states are kept.
+        # The gradient keeps only the states and computes the steps again.
         @jax.checkpoint
         def body(x, u):
             both = jnp.stack([u, jnp.zeros_like(u)])
@@ -100,21 +101,25 @@ class LungModel(eqx.Module):
 
 
 class NeuralLung(AbstractLung):
-    r"""A neural ODE: a pressure and some hidden states,
+    r"""A lung as a neural ODE, whose state is a pressure and some hidden states.
 
-    `dz/dt = rate network(z, flow(u_in) / max_flow, u_out)`, `p = p_mean + p_std z[0]`.
+    $$\dot z = \mathrm{rate} \cdot
+    \mathrm{network}(z, q(u_\mathrm{in}) / q_\mathrm{max}, u_\mathrm{out}), \qquad
+    p = p_\mathrm{mean} + p_\mathrm{std} z_0$$
 
-    While `u_out` is 0 nothing but the flow of the valve enters. Smooth everywhere.
+    Here $q$ is the flow of the inspiratory valve, which is known and not learned. The
+    vector field is smooth.
 
     **Arguments:**
 
-    - `hidden`: hidden states, 2 by default.
-    - `width`, `depth`: of the network, 24 and 1 by default.
-    - `valves`: whose curve of the flow is used; the default ones by default.
+    - `hidden`: the number of hidden states, 2 by default.
+    - `width`, `depth`: the hidden units and hidden layers of the network, 24 and 1 by
+        default.
+    - `valves`: a [`delucax.lung.Valves`][], which gives $q$; `Valves()` by default.
     - `key`: a random key, for the first weights.
 
     **Attributes:** `network`, trainable; `p_mean` and `p_std`, the scale of the
-        pressures, 20 and 10 cmH2O; `rate`, that of the time derivatives, 10 / s.
+        pressures, 20 and 10 cmH2O; `rate`, the scale of the time derivatives, 10 / s.
 
     **Raises:** `ValueError` if a size is below 1, or there is no key.
 
@@ -170,30 +175,32 @@ class NeuralLung(AbstractLung):
         return jnp.hstack([first, jnp.zeros(self.hidden)])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        # Scaled to be about 1; the valve itself is known and not learned.
+        # Scaled to be about 1.
         flow = self.valves.flow(u[0]) / self.valves.max_flow
         z = jnp.concatenate([x, jnp.stack([flow, u[1]]).astype(x.dtype)])
         return (self.rate * self.network(z)).astype(x.dtype)
 
 
 class GreyBoxLung(AbstractLung):
-    r"""A single compartment, and networks for what it leaves out,
+    r"""A single compartment, with networks for what it leaves out.
 
-    `p = p_single(x) + p_std network(inflow, V / C, h)`,
-    `dh/dt = rate memory(inflow, V / C, h)`,
+    $$p = p_\mathrm{single}(x) + p_\mathrm{std} \, \mathrm{network}(q,
+    V / (C p_\mathrm{std}), h), \qquad
+    \dot h = \mathrm{rate} \cdot \mathrm{memory}(q, V / (C p_\mathrm{std}), h)$$
 
-    with the state (inflow [L/s], opening, volume [L], memory h). The first network
-    starts with a small output, so that the model starts near the physical one. Not
-    smooth at an opening of 0.
+    The state is (inflow $q$ [L/s], opening, volume $V$ [L], memory $h$). The first
+    network starts with a small output, so that the model starts near the physical one.
+    The vector field is not smooth at an opening of 0.
 
     **Arguments:**
 
-    - `single`: a [`delucax.lung.SingleCompartment`][]; the default one by default.
-    - `width`: hidden units of both networks, 16 by default.
+    - `single`: a [`delucax.lung.SingleCompartment`][]; `SingleCompartment()` by
+        default.
+    - `width`: the number of hidden units of both networks, 16 by default.
     - `key`: a random key, for the first weights.
 
     **Attributes:** `network` and `memory`, trainable; `p_std`, the scale of the
-        pressures, 10 cmH2O; `rate`, that of the time derivative of h, 5 / s.
+        pressures, 10 cmH2O; `rate`, the scale of $\dot h$, 5 / s.
 
     **Raises:** `ValueError` if a size is below 1, or there is no key.
 

@@ -44,11 +44,10 @@ def _task(
     substeps: int = 1,
     **options: Any,
 ) -> Environment:
-    """A lung, `system` or one of `kind`, that rests at the PEEP of its valves and is to
-    breathe.
+    """The task to ventilate a lung, which starts at rest at the PEEP of its valves.
 
-    `task` is the function that a user called, which errors name, and `delay` the steps
-    until a control acts.
+    The lung is `system`, or one of `kind`. Errors name `task`, the function that the
+    user called. `delay` is the number of steps until a control acts.
     """
     where = task.__name__
     check_keywords(options, where, task, kind, _task, ventilation, Environment)
@@ -69,12 +68,12 @@ def _task(
     options.setdefault("resting_state", rest)
     env = ventilation(dynamics, waveform, **options)
     asked, least = waveform.peep, valves.peep
-    # Checked where both are known. Numbers of another precision may differ by rounding.
+    # The tolerance allows for rounding, if the two numbers differ in precision.
     if is_concrete(asked) and is_concrete(least):
         if np.any(np.asarray(asked) < np.asarray(least) - 1e-3):
             raise ValueError(
                 f"{where}: the peep of waveform must be at least that of valves, "
-                f"{least}, below which no lung empties, got {asked}. Give both."
+                f"{least}, below which no lung empties, got {asked}. Change both."
             )
     return env
 
@@ -85,21 +84,22 @@ def balloon_lung(
     """Ventilate a balloon, so that the pressure tracks a waveform.
 
     The controls, the observation, the state and the cost are those of
-    [`delucax.lung.ventilation`][]. Starts at rest at PEEP. Never terminates.
+    [`delucax.lung.ventilation`][]. The lung starts at rest at PEEP. The task never
+    terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.BalloonLung`][]; made of `options` by default.
-    - `horizon`: steps per episode, 100 by default.
-    - `**options`: arguments of the lung; the control interval `dt` (0.03 by default),
+    - `system`: a [`delucax.lung.BalloonLung`][]; made from `options` by default.
+    - `horizon`: the number of steps per episode, 100 by default.
+    - `**options`: arguments of the lung; the control interval `dt` (0.03 s by default),
         `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
-        `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; those of
-        [`delucax.Environment`][].
+        `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; and those
+        of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
-    that of its valves.
+    **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
+    below the PEEP of the valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), retuned.
@@ -124,21 +124,21 @@ def delay_lung(
 ) -> Environment:
     """Ventilate a balloon through a long pipe, with a transport delay.
 
-    As `lung/balloon_lung`, but that the controls act some steps late, and that the pipe
-    is elastic.
+    This is the task `lung/balloon_lung` with controls that act some steps late, and
+    with an elastic pipe.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.DelayLung`][]; made of `options` by default.
-    - `delay`: steps until a control acts, 5 by default.
-    - `horizon`: steps per episode, 100 by default.
-    - `**options`: as of `lung/balloon_lung`; `substeps` is 4 by default, because air
-        rushes out of the pipe in some 25 ms.
+    - `system`: a [`delucax.lung.DelayLung`][]; made from `options` by default.
+    - `delay`: the number of steps until a control acts, 5 by default.
+    - `horizon`: the number of steps per episode, 100 by default.
+    - `**options`: those of `lung/balloon_lung`. `substeps` is 4 by default, because the
+        pipe empties in about 25 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
-    that of its valves.
+    **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
+    below the PEEP of the valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), as a differential equation and retuned.
@@ -161,18 +161,18 @@ def single_compartment(
 ) -> Environment:
     """Ventilate a lung of one compartment, so that the pressure tracks a waveform.
 
-    As `lung/balloon_lung`, with another lung.
+    This is the task `lung/balloon_lung` with another lung.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.SingleCompartment`][]; made of `options` by default.
-    - `horizon`: steps per episode, 100 by default.
-    - `**options`: as of `lung/balloon_lung`.
+    - `system`: a [`delucax.lung.SingleCompartment`][]; made from `options` by default.
+    - `horizon`: the number of steps per episode, 100 by default.
+    - `**options`: those of `lung/balloon_lung`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
-    that of its valves.
+    **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
+    below the PEEP of the valves.
 
     !!! example
 
@@ -191,21 +191,21 @@ def double_compartment(
 ) -> Environment:
     """Ventilate a lung of a fast and a slow compartment, with a late, noisy sensor.
 
-    The plant of the ventilator study: as `lung/single_compartment`, with another lung
-    and a real sensor.
+    This is the plant of the ventilator study: the task `lung/single_compartment` with
+    another lung and a realistic sensor.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.DoubleCompartment`][]; made of `options` by default.
-    - `horizon`: steps per episode, 100 by default.
-    - `**options`: as of `lung/balloon_lung`; `sensor_delay` is 2 steps and `noise`
-        0.2 cmH2O by default, and `substeps` is 2, because with the expiratory valve
-        open the fast compartment of a narrow lung is empty within some 10 ms.
+    - `system`: a [`delucax.lung.DoubleCompartment`][]; made from `options` by default.
+    - `horizon`: the number of steps per episode, 100 by default.
+    - `**options`: those of `lung/balloon_lung`. By default `sensor_delay` is 2 steps
+        and `noise` is 0.2 cmH2O. `substeps` is 2, because the fast compartment of a
+        narrow lung empties in about 10 ms when the expiratory valve is open.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
-    that of its valves.
+    **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
+    below the PEEP of the valves.
 
     !!! example
 
@@ -226,26 +226,26 @@ def learned_lung(
     horizon: int = 100,
     **options: Any,
 ) -> Environment:
-    """Ventilate a lung that was learned from breaths: controllers are trained in it.
+    """Ventilate a lung that was learned from breaths, to train controllers in it.
 
-    As `lung/balloon_lung`; its time step is that of the breaths, and it exhales to
-    their start pressure regardless of the PEEP of `waveform`. The sensor of a
-    [`delucax.lung.LungModel`][] has the delay of the model.
+    The task is like `lung/balloon_lung`, but its time step is the time between samples
+    of the breaths. It exhales to their start pressure, whatever the PEEP of `waveform`.
+    The sensor of a [`delucax.lung.LungModel`][] has the delay of the model.
 
     **Arguments:**
 
     - `model`: a [`delucax.lung.LearnedLung`][], a [`delucax.lung.LungModel`][] or a
-        [`delucax.lung.PublishedLung`][]. By default the learned lung that comes with
-        the library, from breaths of the task `lung/double_compartment`; its sensor is
-        two samples late, and so is its pressure. In the repository,
-        `python -m benchmarks.learned_lung` makes it.
-    - `horizon`: steps per episode, 100 by default.
+        [`delucax.lung.PublishedLung`][]. The default is the learned lung that comes
+        with the library. It was fitted to breaths of the task
+        `lung/double_compartment`, whose sensor is two samples late, so its pressure is
+        late too. In the repository, `python -m benchmarks.learned_lung` makes it.
+    - `horizon`: the number of steps per episode, 100 by default.
     - `**options`: `waveform`, `noise`, `limit` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if `model` is another one, or on invalid numbers.
+    **Raises:** `ValueError` if `model` has another type, or if a number is invalid.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -266,7 +266,7 @@ def learned_lung(
     if model is None:
         model = load(Path(__file__).with_name("learned_lung.dlx"))
     if isinstance(model, LungModel):
-        # The task senses before it delays; so it takes what the model delays.
+        # The task adds the sensor, and then the delay: take the dynamics without it.
         options |= dict(sensor_delay=model.dynamics.sensor)
         dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
     elif isinstance(model, LearnedLung | PublishedLung):

@@ -1,4 +1,4 @@
-"""Lungs fitted to breaths, and controllers to lungs."""
+"""Fits lungs to breaths, and trains controllers in lungs."""
 
 import functools
 from typing import Any, Literal
@@ -34,7 +34,7 @@ from ._waveform import as_pips, BreathWaveform, LENGTH, PIPS
 
 
 class _Simulation(eqx.Module):
-    """The error of a batch of lungs over breaths, relative to the scale of each."""
+    """The mean error of several lungs over breaths, each relative to its scale."""
 
     scale: Array
     teacher: bool = eqx.field(static=True)
@@ -47,7 +47,7 @@ class _Simulation(eqx.Module):
             predict = model.one_step if self.teacher else model.predict
             return jnp.mean(jnp.abs(jax.vmap(predict)(*inputs) - pressure))
 
-        # Relative to each scale: lungs of large pressures do not outweigh the others.
+        # Relative to the scales, so that lungs of large pressures do not dominate.
         errors = eqx.filter_vmap(one)(models, u_in, pressure)
         return jnp.mean(errors / self.scale)
 
@@ -66,36 +66,39 @@ def fit_lungs(
     progress: bool = False,
     checkpoint: Any = None,
 ) -> Fitted:
-    """Fit lungs to breaths, each to its own, all at once.
+    """Fit several lungs at once, each to its own breaths.
 
-    First, where the model can (a [`delucax.lung.LearnedLung`][]), each pressure is
-    predicted from the recorded ones before it, as published; then the whole breath from
-    its controls alone, which the noise of the sensor does not bias. The loss is the
-    mean absolute error, relative to the standard deviation of the pressures; Adam with
-    a learning rate that falls to 0 along a cosine.
+    The first part, only for a [`delucax.lung.LearnedLung`][], predicts each pressure
+    from the recorded pressures before it, as published. The second part predicts the
+    whole breath from its controls only, so that the noise of the sensor does not bias
+    the model. The loss is the mean absolute error, relative to the standard deviation
+    of the pressures. The optimiser is Adam with a learning rate that falls to 0 along a
+    cosine.
 
     **Arguments:**
 
     - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
-        several in one module, each array with a leading axis over them, as
-        `equinox.filter_vmap` makes of them.
-    - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`; of `(models, B, T)` for
-        several.
+        several stacked in one module, as `equinox.filter_vmap` returns them: each array
+        has a leading axis over the models.
+    - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`, or of shape
+        `(models, B, T)` for several models.
     - `key`: a random key, for the batches.
-    - `teacher_steps`: of the first part, 1000 by default.
-    - `steps`: of the second part, 800 by default.
-    - `learning_rate`: 5e-3 by default, and twice that in the first part.
-    - `optimiser`: an Optax optimiser of both parts instead of Adam, with a learning
-        rate of its own; none by default.
-    - `batch_size`: breaths of each lung in a step, 64 by default; `None` for all.
-    - `trainable`: what moves, as in [`delucax.training.fit`][]; the weights by default.
-    - `progress`: whether to show a bar, false by default.
-    - `checkpoint`: the path of a file from which a run that was cut off goes on
-        (beside it, with `.first` added, that of the first part); none by default.
+    - `teacher_steps`: the number of steps of the first part, 1000 by default.
+    - `steps`: the number of steps of the second part, 800 by default.
+    - `learning_rate`: 5e-3 by default. The first part uses twice this rate.
+    - `optimiser`: an Optax optimiser for both parts in place of Adam, with its own
+        learning rate; none by default.
+    - `batch_size`: the number of breaths of each lung in a step, 64 by default; `None`
+        for all.
+    - `trainable`: what to train, as in [`delucax.training.fit`][]; the weights by
+        default.
+    - `progress`: whether to show a progress bar, `False` by default.
+    - `checkpoint`: the path of a file from which an interrupted run continues. The
+        first part uses the same path with `.first` added. None by default.
 
-    **Returns:** a [`delucax.training.Fitted`][], that of the last part.
+    **Returns:** a [`delucax.training.Fitted`][] of the last part.
 
-    **Raises:** `ValueError` if the arguments are invalid, `RuntimeError` if it
+    **Raises:** `ValueError` if the arguments are invalid, `RuntimeError` if the loss
     diverges.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
@@ -121,7 +124,7 @@ def fit_lungs(
     single = breaths.pressure.ndim == 2
     if single:
         models, breaths = stack([models]), stack([breaths])
-    # Batches are drawn along the first axis: the same rows of all lungs.
+    # Batches are drawn along the first axis, the same rows for all lungs.
     data = jnp.swapaxes(breaths.u_in, 0, 1), jnp.swapaxes(breaths.pressure, 0, 1)
     if batch_size is not None and batch_size >= len(data[0]):
         batch_size = None
@@ -134,7 +137,7 @@ def fit_lungs(
     for teacher, count, name, times in parts:
         if check_count(count, name, where, least=0) == 0:
             continue
-        # Open loop, errors and their gradients can grow along a breath: clipped.
+        # In open loop the gradients can grow along a breath: clip them.
         schedule = optax.cosine_decay_schedule(times * learning_rate, count)
         adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         if checkpoint is not None:
@@ -173,18 +176,19 @@ def breath_error(
     **Arguments:**
 
     - `env`: a task of a lung.
-    - `controller`: of both valves ([`delucax.lung.Breathing`][]), or of the inspiratory
-        one alone.
+    - `controller`: a controller of both valves ([`delucax.lung.Breathing`][]), or of
+        the inspiratory valve only.
     - `key`: a random key, for the noise of the sensor.
-    - `pips`: the peak pressures to follow, each in an episode of its own;
-        10, 15, ..., 35 cmH2O by default.
-    - `horizon`: steps per episode, 29 by default: 0.87 s of an inspiration.
+    - `pips`: the peak pressures to follow, each in its own episode; 10, 15, ..., 35
+        cmH2O by default.
+    - `horizon`: the number of steps per episode, 29 by default: 0.87 s of an
+        inspiration.
 
-    **Returns:** the mean of `|p - r|` over the steps of each episode, shape `(pips,)`
-        [cmH2O]. NaN where a run failed.
+    **Returns:** the mean of `|p - r|` over the steps of each episode [cmH2O], shape
+        `(pips,)`. It is NaN if a run failed.
 
-    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
-    say).
+    **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
+    below PEEP).
 
     !!! example
 
@@ -218,7 +222,7 @@ def breath_error(
 
 
 class _TrackingError(eqx.Module):
-    """The mean error of a batch of controllers, each in its own lungs."""
+    """The mean error of several controllers, each in its own lungs."""
 
     envs: Environment
     pips: Array
@@ -227,7 +231,7 @@ class _TrackingError(eqx.Module):
     throw: bool = eqx.field(static=True)
 
     def _counted(self, errors: Array) -> Array:
-        """Errors; unless `throw`, 0 for those that are not finite."""
+        """The errors, with 0 for those that are not finite unless `throw`."""
         return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
 
     def __call__(self, controllers: Any, key: PRNGKey) -> Array:
@@ -236,7 +240,7 @@ class _TrackingError(eqx.Module):
         def in_lung(env, controller, key):
             return jnp.mean(breath_error(env, controller, key=key, **given))
 
-        # One controller for all lungs is not mapped over them.
+        # A shared controller is not mapped over the lungs.
         own = None if self.shared else eqx.if_array(0)
         in_lungs = eqx.filter_vmap(in_lung, in_axes=(eqx.if_array(0), own, 0))
 
@@ -252,7 +256,7 @@ class _TrackingError(eqx.Module):
 
 
 class _FiniteGradients(eqx.Module):
-    """The analytic gradient, 0 for a controller for which it is not finite.
+    """The analytic gradient, with 0 for each controller whose gradient is not finite.
 
     Controllers are stacked along the first `axes` axes of each leaf.
     """
@@ -263,7 +267,7 @@ class _FiniteGradients(eqx.Module):
         cost, slope = analytic(loss, values, key)
         own = lambda leaf: tuple(range(self.axes, leaf.ndim))
         is_finite = lambda leaf: jnp.all(jnp.isfinite(leaf), axis=own(leaf))
-        # All of the gradient of a controller is replaced, for a part has no meaning.
+        # Replace the whole gradient of a controller, because a part has no meaning.
         finite = jnp.all(jnp.stack([*map(is_finite, jax.tree.leaves(slope))]), axis=0)
         kept = lambda leaf: jnp.where(jnp.expand_dims(finite, own(leaf)), leaf, 0)
         diverged = jnp.sum(~finite).astype(cost.dtype)
@@ -272,7 +276,8 @@ class _FiniteGradients(eqx.Module):
 
 @functools.lru_cache
 def _falling_adam(learning_rate: float, steps: int) -> optax.GradientTransformation:
-    """The same object each time, so that a training like the last compiles nothing."""
+    """Adam with a falling learning rate. Cached, so that the same training does not
+    compile again."""
     return optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
 
 
@@ -294,34 +299,35 @@ def train_controllers(
     """Train controllers in lungs, by the gradient of their error.
 
     The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
-    noise in each step; Adam with a learning rate that falls to 0 along a cosine.
-    Because Adam scales each weight by itself, the gradients of one controller do not
-    affect the others.
+    noise in each step. The optimiser is Adam with a learning rate that falls to 0 along
+    a cosine. Adam scales each weight separately, so the gradients of one controller do
+    not affect the others.
 
     **Arguments:**
 
-    - `envs`: tasks of lungs in one module, each array with a leading axis over them.
-        Of fitted lungs that are stacked so, `equinox.filter_vmap(learned_lung)(models)`
-        makes them, and of resistances a function that makes a task of one.
-    - `controllers`: of the inspiratory valve, stacked over seeds, and within a seed
-        over the lungs: leaves of shape `(seeds, lungs, ...)`. With `shared`, of shape
-        `(seeds, ...)`.
+    - `envs`: tasks of lungs, stacked in one module: each array has a leading axis over
+        the tasks. `equinox.filter_vmap(learned_lung)(models)` makes them from stacked
+        models. See the example for tasks with several resistances.
+    - `controllers`: controllers of the inspiratory valve, stacked over seeds and then
+        over lungs: leaves have the shape `(seeds, lungs, ...)`. With `shared` they have
+        the shape `(seeds, ...)`.
     - `key`: a random key, for the noise.
-    - `shared`: whether one controller is for all lungs; false by default.
-    - `steps`: 400 by default.
+    - `shared`: whether all lungs share one controller; `False` by default.
+    - `steps`: the number of steps, 400 by default.
     - `learning_rate`: 1e-2 by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `horizon`: steps per episode, 29 by default.
-    - `trainable`, `progress`, `checkpoint`: of [`delucax.training.fit`][]; the weights,
-        no bar and no file by default.
-    - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
-        a gradient that is not finite is replaced by 0, the other controllers are
-        unaffected, and `history["diverged"]` counts such controllers at each step.
+    - `horizon`: the number of steps per episode, 29 by default.
+    - `trainable`, `progress`, `checkpoint`: as in [`delucax.training.fit`][]; the
+        weights, no bar and no file by default.
+    - `throw`: whether to raise an error if a loss or its gradient is not finite; `True`
+        by default. If `False`, the gradient of such a controller is replaced by 0, the
+        others are unaffected, and `history["diverged"]` counts such controllers at each
+        step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 
-    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
-    say), `RuntimeError` as `throw` says.
+    **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
+    below PEEP), `RuntimeError` if `throw` and a loss or its gradient is not finite.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -349,7 +355,7 @@ def train_controllers(
         raise ValueError(
             f"{where}: envs must be tasks of lungs that are stacked, got one "
             f"{type(envs).__name__}; equinox.filter_vmap(delucax.lung.learned_lung) "
-            "makes them of stacked models."
+            "makes them from stacked models."
         )
     waveform = waveform_of(envs, where, stacked=True)
     steps = check_count(steps, "steps", where)
@@ -371,7 +377,7 @@ def train_controllers(
 
 @eqx.filter_jit
 def _searched(envs, lists, pips, key, kind):
-    """All combinations of the lists of gains, and the error of each in each lung."""
+    """All combinations of gains, and the error of each combination in each lung."""
     lists = [jnp.ravel(values).astype(float) for values in lists]
     gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
 
@@ -395,25 +401,25 @@ def pid_grid(
     kd: Any = (0.0,),
     pips: Any = PIPS,
 ) -> tuple[Float[Array, "grid 3"], Float[Array, "lungs grid"]]:
-    """The error of every PID of a grid in every lung, all at once.
+    """The error of every PID of a grid in every lung, computed at once.
 
     **Arguments:**
 
-    - `envs`: tasks of lungs in one module, each array with a leading axis over them, or
-        a single task.
-    - `key`: a random key, for the noise of the sensor, which is the same for all.
-    - `kind`: `"leaky"` for [`delucax.controllers.LeakyPID`][], which is that of the
-        original (default); `"true"` for [`delucax.controllers.PID`][].
-    - `kp`, `ki`, `kd`: the gains, of which all combinations are tried; 0, 0.1, ...,
-        0.9, 1, 2, ..., 10 for the first two and 0 for the last by default.
+    - `envs`: a task of a lung, or several stacked in one module: each array has a
+        leading axis over the tasks.
+    - `key`: a random key, for the noise of the sensor, which is the same for all PIDs.
+    - `kind`: `"leaky"` (default) for [`delucax.controllers.LeakyPID`][], as in the
+        original; `"true"` for [`delucax.controllers.PID`][].
+    - `kp`, `ki`, `kd`: the gains. All combinations are tried. By default 0, 0.1, ...,
+        0.9, 1, 2, ..., 10 for `kp` and `ki`, and 0 for `kd`.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
 
-    **Returns:** the gains (kp, ki, kd) of each, shape `(grid, 3)`, and the mean error
-        of each in each lung, shape `(lungs, grid)` [cmH2O]; that of one lung for a
-        single task.
+    **Returns:** the gains (kp, ki, kd) of each PID, shape `(grid, 3)`, and the mean
+        error of each PID in each lung [cmH2O], shape `(lungs, grid)`. A single task
+        counts as one lung.
 
-    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
-    say).
+    **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
+    below PEEP).
 
     !!! example
 
