@@ -360,8 +360,8 @@ def test_bad_paths_are_refused_before_anything_is_drawn(
     for path, match in (
         (tmp_path / "run.avi", r"path must end in .gif, .html, .mp4, got .*run.avi"),
         (tmp_path / "run", "path must end in"),
-        (tmp_path / "missing" / "run.gif", "path must be a file in a folder"),
-        (tmp_path / "folder.gif", "path must be a file in a folder"),
+        (tmp_path / "missing" / "run.gif", "path must be a file in an existing"),
+        (tmp_path / "folder.gif", "path must be a file in an existing"),
         (tmp_path / "run.mp4", "path ends in .mp4, which needs the program ffmpeg"),
         (3, "path must be the path of a file, got 3"),
     ):

@@ -133,7 +133,7 @@ def _breaths(
     again = begins & ~np.isin(np.arange(len(number)), first)
     single = begins & np.append(begins[1:], True)
     rise = {n: np.diff(table[n], prepend=0.0) for n in ("time_step", "R", "C")}
-    apart = "the rows of a breath must follow each other, but breath {now:g} comes again"
+    apart = "the rows of a breath must follow each other, but breath {now:g} repeats"
     short = "a breath must have at least 2 rows, got 1 of breath {now:g}"
     later = "must increase within a breath, got {now:g} after {last:g}"
     same = "must be the same for all of breath {breath:g}, got {now:g} after {last:g}"

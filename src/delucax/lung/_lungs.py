@@ -29,11 +29,11 @@ PER_ML = 1e-3
 
 
 class AbstractLung(AbstractSystem):
-    """A lung behind [`delucax.lung.Valves`][]; what its sensor reads is the pressure
-    of the airway.
+    """The base class of lungs behind [`delucax.lung.Valves`][].
 
-    The control is `(u_in, u_out)`: how far the inspiratory valve is to open, from 0 to
-    100 %, and whether the expiratory valve is to (0 or 1, and all between).
+    The sensor reads the pressure of the airway [cmH2O]. The control is `(u_in, u_out)`:
+    the opening of the inspiratory valve, from 0 to 100 %, and the opening of the
+    expiratory valve, from 0 to 1.
 
     !!! example
 
@@ -64,18 +64,18 @@ class AbstractLung(AbstractSystem):
     def pressure(self, x: State) -> Scalar:
         """The pressure of the airway.
 
-        **Arguments:** `x`: state.
+        **Arguments:** `x`: state, shape `(n,)`.
 
         **Returns:** a scalar [cmH2O].
         """
 
     @abc.abstractmethod
     def resting(self, pressure: RealScalar) -> State:
-        """The state of a lung that rests at a pressure, both valves closed.
+        """The state of a lung at rest at a pressure, with both valves closed.
 
-        **Arguments:** `pressure`: everywhere [cmH2O].
+        **Arguments:** `pressure`: the pressure everywhere [cmH2O].
 
-        **Returns:** the state.
+        **Returns:** the state, shape `(n,)`.
         """
 
     def observe(self, t: Time, x: State) -> Observation:
@@ -83,10 +83,10 @@ class AbstractLung(AbstractSystem):
 
 
 class _AbstractRigidPipe(AbstractLung):
-    """A lung behind a rigid airway, whose pressure balances the flows of the valves and
-    of the lung. The state begins with the inflow and the opening."""
+    """A lung behind a rigid airway. The pressure of the airway balances the flows of
+    the valves and of the lung. The state begins with the inflow and the opening."""
 
-    if TYPE_CHECKING:  # pyright takes an AbstractVar for the first argument
+    if TYPE_CHECKING:  # pyright mistakes an AbstractVar for the first argument
         resistance: ClassVar[Any]
         valves: ClassVar[Any]
     else:
@@ -103,18 +103,18 @@ class _AbstractRigidPipe(AbstractLung):
 
 
 class _AbstractCompartment(_AbstractRigidPipe):
-    """One elastic volume at the end of one resistance, `dV/dt = (p - P(V)) / R`."""
+    r"""One elastic volume behind one resistance, $\dot V = (p - P(V)) / R$."""
 
     state_names: ClassVar = ("inflow", "opening", "volume")
     state_units: ClassVar = ("L/s", "", "L")
 
     @abc.abstractmethod
     def elastic_pressure(self, volume: Array) -> Array:
-        """The pressure `P(V)` in the lung.
+        """The pressure $P(V)$ in the lung.
 
-        **Arguments:** `volume`: [L].
+        **Arguments:** `volume`: $V$ [L].
 
-        **Returns:** [cmH2O].
+        **Returns:** the pressure [cmH2O].
         """
 
     @abc.abstractmethod
@@ -136,23 +136,24 @@ class _AbstractCompartment(_AbstractRigidPipe):
 
 
 class SingleCompartment(_AbstractCompartment):
-    r"""One elastic compartment at the end of one resistance,
+    r"""A lung of one elastic compartment behind one resistance.
 
-    `dV/dt = (p - V / C) / R`,
+    $$\dot V = \frac{p - V / C}{R}$$
 
-    where the pressure `p` of the airway balances the flows of the valves,
+    The pressure $p$ of the airway balances the flows of the valves; see
     [`delucax.lung.Valves.airway_pressure`][]. The state is (inflow [L/s], opening,
-    volume [L]). Not smooth at an opening of 0.
+    volume $V$ [L]). The vector field is not smooth at an opening of 0.
 
-    With the inspiratory valve held and no way out but a leak `G`, the pressure settles
-    at `flow(u_in) / G`; with the expiratory valve open and no leak, at
-    `peep + flow(u_in) expiratory_resistance`.
+    If the opening of the inspiratory valve is held, the pressure settles. With the
+    expiratory valve closed and a leak $G$, it settles at $q(u_\mathrm{in}) / G$, where
+    $q$ is the flow of the valve. With the expiratory valve open and no leak, it settles
+    at `peep + flow(u_in) * expiratory_resistance`.
 
     **Arguments:**
 
-    - `resistance`: R [cmH2O s/L], 20 by default.
-    - `compliance`: C [mL/cmH2O], 20 by default.
-    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+    - `resistance`: $R$ [cmH2O s/L], 20 by default.
+    - `compliance`: $C$ [mL/cmH2O], 20 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -183,26 +184,28 @@ class SingleCompartment(_AbstractCompartment):
 
 
 class DoubleCompartment(_AbstractRigidPipe):
-    r"""Two elastic compartments side by side, a fast and a slow one,
+    r"""A lung of two elastic compartments side by side, a fast and a slow one.
 
-    `dV_i/dt = (p_c - V_i / C_i) / R_i`, `p_c = p - R_0 (dV_1/dt + dV_2/dt)`.
+    $$\dot V_i = \frac{p_c - V_i / C_i}{R_i}, \qquad
+    p_c = p - R_0 (\dot V_1 + \dot V_2)$$
 
-    A share of the resistance is central, `R_0 = central R`; the rest is that of both
-    ways in parallel, `1 / (1 / R_1 + 1 / R_2) = (1 - central) R`, with
-    `R_2 = imbalance R_1`. The compliance is divided as `C_1 = share C` and
-    `C_2 = (1 - share) C`. So `R` is the resistance at high frequencies, and `C` the
-    static compliance. The state is (inflow [L/s], opening, fast [L], slow [L]), the
-    latter two volumes. Not smooth at an opening of 0.
+    The resistance $R$ has a central part $R_0 = c R$, with $c$ = `central`. The rest is
+    the two branches in parallel, $1 / (1 / R_1 + 1 / R_2) = (1 - c) R$, with
+    $R_2 / R_1$ = `imbalance`. The compliance is divided into $C_1 = s C$ and
+    $C_2 = (1 - s) C$, with $s$ = `share`. So $R$ is the resistance at high frequencies,
+    and $C$ is the static compliance. The state is (inflow [L/s], opening, fast volume
+    $V_1$ [L], slow volume $V_2$ [L]). The vector field is not smooth at an opening of
+    0.
 
     **Arguments:**
 
-    - `resistance`: R of the whole lung to a flow that begins [cmH2O s/L], 20 by
-        default.
-    - `compliance`: C of the whole lung [mL/cmH2O], 20 by default.
-    - `central`: the share of R that both have in common, 0.3 by default.
-    - `share`: of the fast compartment in C, 0.1 by default.
-    - `imbalance`: R_2 over R_1, 10 by default.
-    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+    - `resistance`: $R$, the resistance of the whole lung at high frequencies
+        [cmH2O s/L], 20 by default.
+    - `compliance`: $C$, the compliance of the whole lung [mL/cmH2O], 20 by default.
+    - `central`: the share of $R$ that is common to both compartments, 0.3 by default.
+    - `share`: the share of $C$ in the fast compartment, 0.1 by default.
+    - `imbalance`: $R_2 / R_1$, 10 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
     **Raises:** `ValueError` if a number is not positive, or a share is not between 0
     and 1.
@@ -233,9 +236,9 @@ class DoubleCompartment(_AbstractRigidPipe):
     state_units: ClassVar = ("L/s", "", "L", "L")
 
     def _parts(self, x: State) -> tuple[Array, Array, Array, Array, Array]:
-        """The conductances of both ways, the pressures in both compartments, and the
-        pressure in the equivalent single compartment."""
-        # R_1 and R_2 of `1 / (1 / R_1 + 1 / R_2) = parallel` and `R_2 = imbalance R_1`.
+        """The conductances of both branches, the pressures in both compartments, and
+        the pressure in the equivalent single compartment."""
+        # From 1 / (1 / R_1 + 1 / R_2) = parallel and R_2 = imbalance R_1.
         parallel = (1 - self.central) * self.resistance
         fast = self.imbalance / ((1 + self.imbalance) * parallel)
         slow = 1 / ((1 + self.imbalance) * parallel)
@@ -256,15 +259,15 @@ class DoubleCompartment(_AbstractRigidPipe):
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         fast, slow, p1, p2, inside = self._parts(x)
         total = (self.pressure(x) - inside) / self.resistance
-        # p_c, where the central resistance ends and both ways begin.
+        # p_c, where the central resistance ends and the branches begin.
         centre = inside + (1 - self.central) * self.resistance * total
         return jnp.stack([inflow, opening, fast * (centre - p1), slow * (centre - p2)])
 
 
 def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
-    """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, with the
-    radius of a sphere of its volume; constant below a tenth of the volume at rest."""
-    # Towards an empty balloon the pressure and its slope go to minus infinity.
+    """The pressure in a balloon; see `BalloonLung`. It is constant below a tenth of the
+    volume at rest."""
+    # In an empty balloon the pressure and its slope would be minus infinity.
     volume = xp.maximum(volume, 0.1 * rest)
     radius = (3 * volume / (4 * np.pi)) ** (1 / 3)
     unstretched = (3 * rest / (4 * np.pi)) ** (1 / 3)
@@ -272,21 +275,23 @@ def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
 
 
 class BalloonLung(_AbstractCompartment):
-    r"""A balloon at the end of a resistance,
+    r"""A lung like a balloon behind a resistance.
 
-    `dV/dt = (p - P(V)) / R`, `P(V) = stiffness (1 - (r0 / r)^6) / (r0^2 r)`,
+    $$\dot V = \frac{p - P(V)}{R}, \qquad
+    P(V) = \frac{k}{r_0^2 r} \left(1 - \left(\frac{r_0}{r}\right)^6\right)$$
 
-    with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. The pressure
-    rises, is greatest at `V = 2.65 rest`, and then falls. The state is (inflow [L/s],
-    opening, volume [L]). Not smooth at an opening of 0 and at a tenth of `rest`, below
-    which the pressure is constant.
+    Here $r$ and $r_0$ are the radii of spheres of the volumes $V$ and $V_0$. As the
+    balloon fills, the pressure rises, is greatest at $V = 2.65 \, V_0$, and then falls.
+    Below $V_0 / 10$ it is constant. The state is (inflow [L/s], opening, volume $V$
+    [L]). The vector field is not smooth at an opening of 0 and at $V = V_0 / 10$.
 
     **Arguments:**
 
-    - `resistance`: R [cmH2O s/L], 20 by default.
-    - `stiffness`: 40 by default, which with `rest` makes up to 69 cmH2O.
-    - `rest`: the volume without pressure [L], 1.5 by default.
-    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+    - `resistance`: $R$ [cmH2O s/L], 20 by default.
+    - `stiffness`: $k$ [cmH2O L], 40 by default. With the default `rest`, the pressure
+        is at most 69 cmH2O.
+    - `rest`: $V_0$, the volume without pressure [L], 1.5 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -319,22 +324,24 @@ class BalloonLung(_AbstractCompartment):
 
 
 class DelayLung(AbstractLung):
-    r"""A balloon at the end of an elastic pipe,
+    r"""A lung like a balloon at the end of an elastic pipe.
 
-    `pipe dp/dt = inflow - (p - P(V)) / R - outflow`, `dV/dt = (p - P(V)) / R`,
+    $$C_p \dot p = q_\mathrm{in} - \frac{p - P(V)}{R} - q_\mathrm{out}, \qquad
+    \dot V = \frac{p - P(V)}{R}$$
 
-    with `P(V)` of [`delucax.lung.BalloonLung`][]. The pipe holds air, so that the
-    pressure in it, which the sensor reads, is a state. The state is (inflow [L/s],
-    opening, pipe [cmH2O], volume [L]). The transport delay is that of
-    [`delucax.dynamics.Delayed`][], which the task `lung/delay_lung` puts around it.
+    The elastic pressure $P(V)$ is that of [`delucax.lung.BalloonLung`][]. The pipe
+    stores air, so the pressure $p$ in the pipe, which the sensor reads, is a state. The
+    state is (inflow $q_\mathrm{in}$ [L/s], opening, pipe pressure $p$ [cmH2O], volume
+    $V$ [L]). The task `lung/delay_lung` adds the transport delay, with
+    [`delucax.dynamics.Delayed`][].
 
     **Arguments:**
 
-    - `resistance`: R [cmH2O s/L], 20 by default.
-    - `stiffness`: 40 by default.
+    - `resistance`: $R$ [cmH2O s/L], 20 by default.
+    - `stiffness`: the stiffness of the balloon [cmH2O L], 40 by default.
     - `rest`: the volume without pressure [L], 1.5 by default.
-    - `pipe`: the compliance of the pipe [mL/cmH2O], 5 by default.
-    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+    - `pipe`: $C_p$, the compliance of the pipe [mL/cmH2O], 5 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -367,28 +374,27 @@ class DelayLung(AbstractLung):
     @host_unless_traced
     def resting(self, pressure: RealScalar) -> State:
         volume = _stretched(self.rest, self.stiffness, pressure)
-        # `0 * volume` is a zero of its dtype and shape, whatever `pressure` is.
+        # `0 * volume` is a zero with the dtype and shape of `volume`.
         return xp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         inside = balloon_pressure(x[3], self.rest, self.stiffness)
         filling = (x[2] - inside) / self.resistance
-        # The pipe stores air, so its pressure is a state, and no balance is solved.
+        # The pressure of the pipe is a state, so no balance of flows is solved.
         outflow = self.valves.outflow(x[1], x[2])
         rise = (x[0] - filling - outflow) / (PER_ML * self.pipe)
         return jnp.stack([inflow, opening, rise, filling])
 
 
-# Where the pressure of a balloon is greatest: (v / v0)^2 = 7, its radius being the
-# cube root of its volume.
+# The stretch V / V_0 at which the pressure of a balloon is greatest.
 _FULLEST = 7**0.5
 
 
 def _stretched(rest: Array, stiffness: Array, pressure: Any) -> Array:
-    """The volume at which a balloon has a pressure, on its way up.
+    """The volume at which a balloon has a pressure, where the pressure still rises.
 
-    **Raises:** `ValueError` if the pressure is above what it can hold.
+    **Raises:** `ValueError` if the pressure is more than the balloon can hold.
     """
     pressure = xp.asarray(pressure)
     most = balloon_pressure(_FULLEST * rest, rest, stiffness)
@@ -398,9 +404,9 @@ def _stretched(rest: Array, stiffness: Array, pressure: Any) -> Array:
             f"balloon can hold, got {pressure}."
         )
     unit = stiffness * (4 * np.pi / 3) / rest
-    # p / unit = (1 - s^-2) s^(-1/3) of the stretch s = v / v0 has no closed form.
-    # Newton's method from below converges as the left side is concave; in double
-    # precision six steps do for half of the greatest pressure.
+    # p / unit = (1 - s^-2) s^(-1/3) has no closed form for the stretch s = V / V_0.
+    # Newton's method from below converges, because the right side is concave. In double
+    # precision, six steps are enough up to half of the greatest pressure.
     ratio = pressure / unit
     s = 1 + ratio / 2
     for _ in range(12):

@@ -23,50 +23,53 @@ from ._waveform import BreathWaveform, check_waveform
 
 
 STEPS = 5
-"""First steps of an inspiration, and controls and pressures that are remembered."""
+"""The number of first steps of an inspiration, and of controls and of pressures in the
+state."""
 WIDTH = 100
 ERRORS = 10
 DT = 0.03
 START = -1.51449
-"""The scaled pressure before an inspiration. The file does not have it. With this one
-number the three errors that the authors' notebook prints come out to six digits."""
+"""The scaled pressure before an inspiration, which the file does not hold. With this
+number, the three errors in the authors' notebook are reproduced to six digits."""
 _WHERE = "read_published"
 
 
 class PublishedLung(AbstractDynamics):
     r"""The learned lung that was published with Deluca.
 
-    With `u` and `p` the scaled controls and pressures, step `k` of an inspiration
-    predicts
+    At step $k$ of an inspiration, the scaled pressure is predicted as
 
-    `p[k + 1] = output_k . tanh(hidden_k z_all) + bias_k` for `k < 5`,
-    `p[k + 1] = network(z)` later,
-    `z_all = (u[k], ..., u[k - 4], p[k], ..., p[k - 4])`,
-    `z = (u[k], ..., u[k - 4], p[k], p[k - 1], p[k - 2])`,
+    $$p_{k + 1} = \begin{cases}
+    o_k^\top \tanh(H_k z_\mathrm{all}) + b_k & k < 5 \\
+    \mathrm{network}(z) & k \ge 5
+    \end{cases}$$
 
-    where the network has three layers of SELUs without biases. Before an inspiration
-    there are zeros, and the start pressure. While `u_out` is above 1/2 the lung is as
-    before an inspiration. Controls are not clipped here, but by the task.
+    with $z_\mathrm{all} = (u_k, \dots, u_{k - 4}, p_k, \dots, p_{k - 4})$ and
+    $z = (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})$, where $u$ are the scaled
+    controls. The published network has three layers of SELUs without biases. Before an
+    inspiration the history is zero, except for the start pressure. While `u_out` is
+    above 1/2, the state is reset to that before an inspiration. The task clips the
+    controls; the model does not.
 
-    Rebuilt from the published weights; the authors' program was not run. Under the
-    conditions of their notebook it has the errors that are printed there, see
+    The model is rebuilt from the published weights, without the program of the authors.
+    Under the conditions of their notebook it has the errors that are printed there; see
     [the comparison](../../ventilator.md#the-published-simulator).
 
     The state is (the controls, the pressures, both scaled and newest first, and the
-    count of steps), and the observation is the pressure [cmH2O].
+    number of steps). The observation is the pressure [cmH2O].
 
     **Arguments:**
 
-    - `hidden`, `output`, `bias`: the networks of the first steps, of shapes
+    - `hidden`, `output`, `bias`: $H$, $o$ and $b$ of the first steps, of shapes
         `(5, width, 10)`, `(5, width)` and `(5,)`.
-    - `network`: a module that maps `z`, 8 numbers, to a number.
+    - `network`: a module that maps the 8 numbers of $z$ to a number.
     - `u_mean`, `u_std`, `p_mean`, `p_std`: the scales of the controls [%] and of the
         pressures [cmH2O].
     - `start`: the pressure before an inspiration [cmH2O].
-    - `dt`: the control interval, 0.03 s by default.
+    - `dt`: the control interval [s], 0.03 by default.
 
     **Raises:** `ValueError` if a scale or `dt` is not positive, a number is not finite,
-    or a shape is another one.
+    or a shape is wrong.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021 (deluca-lung).
@@ -136,7 +139,7 @@ class PublishedLung(AbstractDynamics):
         control = jnp.reshape((u[0] - self.u_mean) / self.u_std, (1,)).astype(x.dtype)
         controls = jnp.concatenate([control, x[: STEPS - 1]])
         pressures, step = x[STEPS : 2 * STEPS], x[2 * STEPS]
-        # Both are computed: a scan has no branches that cost less under vmap.
+        # Both predictions are computed, because a branch costs no less under vmap.
         i = jnp.clip(jnp.round(step), 0, STEPS - 1).astype(int)
         hidden = jnp.tanh(self.hidden[i] @ jnp.concatenate([controls, pressures]))
         early = self.output[i] @ hidden + self.bias[i]
@@ -148,28 +151,29 @@ class PublishedLung(AbstractDynamics):
 
 
 class PublishedController(AbstractController):
-    r"""The deep controller that was published with Deluca, of the inspiratory valve,
+    r"""The deep controller of the inspiratory valve that was published with Deluca.
 
-    `u = clip(output . relu(convolution (featurizer e) + biases) + bias, 0, high)`,
+    $$u = \mathrm{clip}(o^\top \mathrm{relu}(W F e + c) + b, 0, \mathrm{high})$$
 
-    where `e` are the last ten errors [cmH2O], newest first, and zero before the breath.
-    The featurizer takes the means of the last 10, 9, ..., 1 of them. Of the published
-    convolution, of width 5 over a single position, the middle row alone has an effect.
+    Here $e$ are the last ten errors [cmH2O], newest first, which are zero before the
+    breath. The published featurizer $F$ takes the means of the last 10, 9, ..., 1
+    errors. The published convolution has width 5 over a single position, so only its
+    middle row has an effect.
 
-    Rebuilt from the published weights, as [`delucax.lung.PublishedLung`][] is. In
-    contrast to the original, [`delucax.lung.Breathing`][] resets it before each breath.
-    Has no gradient where it is clipped.
+    The controller is rebuilt from the published weights, like
+    [`delucax.lung.PublishedLung`][]. Unlike the original, it is reset before each
+    breath by [`delucax.lung.Breathing`][]. Its gradient is zero where it is clipped.
 
     **Arguments:**
 
-    - `featurizer`: shape `(10, 10)`.
-    - `convolution`, `biases`: shapes `(width, 10)` and `(width,)`.
-    - `output`, `bias`: shape `(width,)`, and a number.
+    - `featurizer`: $F$, shape `(10, 10)`.
+    - `convolution`, `biases`: $W$ and $c$, shapes `(width, 10)` and `(width,)`.
+    - `output`, `bias`: $o$, shape `(width,)`, and $b$, a number.
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `high`: the largest control [%], 40 by default, as published.
 
-    **Raises:** `ValueError` if a number is not finite, a shape is another one or
-    `waveform` is not a `BreathWaveform`.
+    **Raises:** `ValueError` if a number is not finite, a shape is wrong, or `waveform`
+    is not a `BreathWaveform`.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021 (deluca-lung).
@@ -214,7 +218,7 @@ class PublishedController(AbstractController):
 
 
 class Published(NamedTuple):
-    """What [`delucax.lung.read_published`][] returns.
+    """The result of [`delucax.lung.read_published`][].
 
     **Attributes:** `lung`, a [`delucax.lung.PublishedLung`][]; `controller`, a
     [`delucax.lung.PublishedController`][].
@@ -224,7 +228,11 @@ class Published(NamedTuple):
         ```python
         from delucax import lung
 
-        lung.Published._fields  # ("lung", "controller")
+        lung.Published._fields
+        ```
+
+        ```text
+        ('lung', 'controller')
         ```
     """
 
@@ -235,36 +243,36 @@ class Published(NamedTuple):
 def read_published(
     path: str | os.PathLike, waveform: BreathWaveform | None = None
 ) -> Published:
-    """The learned lung and the deep controller of a file with the published weights.
+    """Read the learned lung and the deep controller from a file of published weights.
 
-    The file is an `.npz` of NumPy with the arrays of the two pickles of deluca-lung.
-    The names and shapes of all of them:
+    The file is a NumPy `.npz` with the arrays of the two pickles of deluca-lung. Their
+    names and shapes are
 
-    - `sim/params/0/shallow_fc1_model1/kernel` (10, 100), and of `shallow_fc2_model1`
-        the `kernel` (100, 1) and the `bias` (1,); so for each of the first five steps,
-        up to `sim/params/4/shallow_fc1_model5/kernel`.
+    - `sim/params/0/shallow_fc1_model1/kernel` (10, 100), and `kernel` (100, 1) and
+        `bias` (1,) of `shallow_fc2_model1`. Each of the first five steps has these, up
+        to `sim/params/4/shallow_fc1_model5/kernel`.
     - `sim/params/5/SNN_fc0/kernel` (10, 100), `SNN_fc1` and `SNN_fc2` (100, 100), and
-        of `SNN_fc3` the `kernel` (100, 1) and the `bias` (1,). The first two inputs of
-        the first are always zero.
+        `kernel` (100, 1) and `bias` (1,) of `SNN_fc3`. The first two inputs of
+        `SNN_fc0` are always zero.
     - `sim/u_scaler/mean` and `std`, `sim/p_scaler/mean` and `std`: numbers.
-    - `deep_controller/featurizer` (10, 10); of `deep_controller/params/deep_conv` the
-        `kernel` (5, 10, 100) and the `bias` (100,), and of `deep_fc` (100, 1) and (1,).
+    - `deep_controller/featurizer` (10, 10); `kernel` (5, 10, 100) and `bias` (100,) of
+        `deep_controller/params/deep_conv`, and (100, 1) and (1,) of `deep_fc`.
 
-    In these arrays the newest control, pressure and error are last. The pressure before
-    an inspiration is not in the file: it is 6.094 cmH2O in the scales of the authors,
-    or 1.51449 standard deviations below the mean.
+    In these arrays the newest control, pressure and error come last. The pressure
+    before an inspiration is not in the file. It is 1.51449 standard deviations below
+    the mean, which is 6.094 cmH2O with the scales of the authors.
 
     **Arguments:**
 
     - `path`: the file.
-    - `waveform`: what the controller follows, a [`delucax.lung.BreathWaveform`][] with
-        its defaults by default.
+    - `waveform`: the target of the controller, a [`delucax.lung.BreathWaveform`][];
+        `BreathWaveform()` by default.
 
     **Returns:** a [`delucax.lung.Published`][]: `(lung, controller)`.
 
-    **Raises:** `ValueError` that names the file, and the array and its shape, where the
-    file is no `.npz`, an array is missing or has another shape, or a number is not
-    finite; `OSError` if the file cannot be read.
+    **Raises:** `ValueError` if the file is not an `.npz`, an array is missing or has
+    another shape, or a number is not finite. The message names the file and the array.
+    `OSError` if the file cannot be read.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021 (deluca-lung).
@@ -307,7 +315,7 @@ def read_published(
     )
     part = "deep_controller/params/"
     controller = PublishedController(
-        # Its rows are the errors, the newest last, and its columns the features.
+        # In the file, its rows are the errors, newest last, and its columns features.
         jnp.asarray(arrays["deep_controller/featurizer"][::-1].T),
         jnp.asarray(arrays[f"{part}deep_conv/kernel"][2].T),
         jnp.asarray(arrays[f"{part}deep_conv/bias"]),
@@ -319,12 +327,12 @@ def read_published(
 
 
 def _first(k: int, layer: int = 1, name: str = "kernel") -> str:
-    """The name of an array of the network of first step `k`."""
+    """The name of an array of the network of the first step `k`."""
     return f"sim/params/{k}/shallow_fc{layer}_model{k + 1}/{name}"
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:
-    """What a file must hold."""
+    """The names and shapes of the arrays that a file must hold."""
     shapes: dict[str, tuple[int, ...]] = {
         f"sim/{letter}_scaler/{name}": () for letter in "up" for name in ("mean", "std")
     }
@@ -342,7 +350,7 @@ def _shapes() -> dict[str, tuple[int, ...]]:
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    """The arrays of a file by name, checked and in the precision of JAX."""
+    """Check the arrays of a file. Returns them by name, in the precision of JAX."""
     if not path.is_file():
         raise FileNotFoundError(f"{_WHERE}: path must be a file, got '{path}'.")
     if not zipfile.is_zipfile(path):
@@ -356,7 +364,7 @@ def _arrays(path: Path) -> dict[str, Any]:
             array = held[name]
             if array.shape != shape or array.dtype.kind != "f":
                 raise ValueError(
-                    f"{_WHERE}: '{path}' must hold {expected} and of floats, got shape "
+                    f"{_WHERE}: '{path}' must hold {expected}, of floats, got shape "
                     f"{array.shape} and {array.dtype}."
                 )
             check_finite(array, f"'{name}' of '{path}'", _WHERE)
@@ -365,8 +373,8 @@ def _arrays(path: Path) -> dict[str, Any]:
 
 
 def _newest_first(kernel: np.ndarray) -> np.ndarray:
-    """Weights of shape `(width, inputs)`, of the controls and then of the pressures,
-    of which the file has the newest last."""
+    """Weights of shape `(width, inputs)` for the controls and then the pressures,
+    newest first. In the file the newest come last."""
     controls, pressures = kernel[:STEPS], kernel[STEPS:]
     return np.concatenate([controls[::-1], pressures[::-1]]).T
 
@@ -386,7 +394,7 @@ def _network(arrays: dict[str, Any]) -> eqx.nn.MLP:
 
 
 def _check_shapes(module: Any, **shapes: tuple[int | None, ...]) -> None:
-    """Raise unless its arrays have these shapes, in which `None` is any size."""
+    """Raise an error unless the arrays have these shapes, where `None` is any size."""
     for name, shape in shapes.items():
         got = jnp.shape(getattr(module, name))
         fits = len(got) == len(shape) and all(

@@ -1,4 +1,4 @@
-"""The real-time loop of a controller and a ventilator, simulated or physical."""
+"""The real-time loop of a controller and a ventilator, simulated or real."""
 
 import abc
 import time
@@ -17,7 +17,7 @@ from ..environments import Environment
 
 
 ABORT = 60.0
-"""The pressure at which a run is aborted [cmH2O]."""
+"""The pressure above which a run is aborted [cmH2O]."""
 
 
 _step = eqx.filter_jit(Environment.step)
@@ -31,9 +31,10 @@ _applied = eqx.filter_jit(
 class Runner(Protocol):
     """The interface of a ventilator for [`delucax.lung.run_breaths`][].
 
-    Write one for a machine: none of it needs JAX, and any of it may block or raise.
+    Write a class with these methods for your machine. They need no JAX, and may block
+    or raise an error.
 
-    **Attributes:** `dt`, the time of a step.
+    **Attributes:** `dt`, the time of a step [s].
 
     !!! example
 
@@ -69,25 +70,27 @@ class Runner(Protocol):
     def should_abort(self, pressure: float) -> bool:
         """Whether to abort the run.
 
-        **Arguments:** `pressure`: what was read last [cmH2O].
+        **Arguments:** `pressure`: the last reading [cmH2O].
         """
 
     @abc.abstractmethod
     def cleanup(self) -> None:
-        """Leave the machine safe; called once at the end, whatever happened."""
+        """Leave the machine safe. It is called once at the end, even after an error."""
 
 
 class SimulatedRunner:
-    """A [`delucax.lung.Runner`][] whose ventilator is a task.
+    """A [`delucax.lung.Runner`][] that simulates a task in place of a ventilator.
 
     **Arguments:**
 
     - `environment`: a task of a lung.
     - `key`: a random key, for the noise of the sensor.
-    - `abort`: the pressure at which the run is aborted [cmH2O], 60 by default.
-    - `real_time`: whether `wait` waits, as at a machine; false by default.
+    - `abort`: the pressure above which the run is aborted [cmH2O], 60 by default.
+    - `real_time`: whether `wait` waits for the time of a step, as a machine does;
+        `False` by default.
 
-    **Raises:** `ValueError` if it is no task of a lung, or `abort` is not positive.
+    **Raises:** `ValueError` if `environment` is not a task of a lung, or `abort` is not
+    positive.
 
     !!! example
 
@@ -128,7 +131,7 @@ class SimulatedRunner:
         self.state = environment.reset(start)
         self.steps, self.controls, self.is_clean = 0, (0.0, 0.0), False
         if self.real_time:
-            # Compiled now, and not within the first interval.
+            # Compile now, not within the first interval.
             self._advanced()
         self._due = time.perf_counter()
 
@@ -150,30 +153,31 @@ class SimulatedRunner:
         self.controls = (float(u_in), float(u_out))
 
     def wait(self) -> None:
-        """Let one step go by."""
+        """Advance the simulation by one step."""
         if self.real_time:
-            # A missed deadline is not made up for: no step is shorter than `dt`.
+            # No step is shorter than `dt`, even after a missed deadline.
             self._due = max(self._due + self.dt, time.perf_counter())
             time.sleep(max(0.0, self._due - time.perf_counter()))
         self.state = self._advanced()
         self.steps += 1
 
     def _advanced(self) -> Array:
-        """The state one step on."""
+        """The state after one step."""
         u = jnp.asarray(self.controls, self.state.dtype)
-        # As an array: a number would be part of the program, which compiled each step.
+        # An array, because each new Python number would compile the program again.
         t = jnp.asarray(self.steps * self.dt)
         return _step(self.environment, t, self.state, u).state
 
     def should_abort(self, pressure: float) -> bool:
         """Whether the pressure is above the limit, or is not a number.
 
-        **Arguments:** `pressure`: what was read last [cmH2O].
+        **Arguments:** `pressure`: the last reading [cmH2O].
         """
         return not pressure <= self.abort
 
     def cleanup(self) -> None:
-        """Close the inspiratory valve, let the air out for 3 s, and close the other."""
+        """Close the inspiratory valve, let the air out for 3 s, and close the
+        expiratory valve."""
         self.actuate(0.0, 1.0)
         for _ in range(round(3.0 / self.dt)):
             self.wait()
@@ -186,9 +190,9 @@ class Recording(NamedTuple):
 
     **Attributes:**
 
-    - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry per step.
-    - `aborted`: whether the run was aborted; the last entry is then the reading that
-        was too high, and the controls of the clean-up.
+    - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry for each step.
+    - `aborted`: whether the run was aborted. The last entry is then the reading that
+        was too high, with the controls of the clean-up.
     """
 
     times: np.ndarray
@@ -207,24 +211,24 @@ def run_breaths(
 ) -> Recording:
     """Run a controller at a ventilator.
 
-    Each step: read the pressure; stop if `runner.should_abort` is true; ask the
-    controller; set the valves; wait. At the end, and also after an error in any of it
-    or an interruption, `runner.cleanup()` is called, and the error is raised again.
+    Each step reads the pressure, stops if `runner.should_abort` is true, calls the
+    controller, sets the valves, and waits. At the end `runner.cleanup()` is called. It
+    is also called after an error or an interruption, which is then raised again.
 
     **Arguments:**
 
     - `runner`: a [`delucax.lung.Runner`][].
-    - `controller`: of both valves, such as a [`delucax.lung.Breathing`][].
-    - `steps`: 100 by default.
+    - `controller`: a controller of both valves, such as a [`delucax.lung.Breathing`][].
+    - `steps`: the number of steps, 100 by default.
     - `key`: a random key for the controller; none by default.
 
-    **Returns:** a named tuple of NumPy arrays with an entry per step, `times` [s],
-        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`: whether the run
-        was aborted. The last entry is then the reading that was too high, and the
-        controls of the clean-up.
+    **Returns:** a named tuple of NumPy arrays with an entry for each step, `times` [s],
+        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`, whether the run was
+        aborted. The last entry is then the reading that was too high, with the controls
+        of the clean-up.
 
-    **Raises:** `ValueError` if what is given is no runner or no controller, or a
-        control is not finite.
+    **Raises:** `ValueError` if `runner` is not a runner, `controller` is not a
+        controller, or a control is not finite.
 
     !!! example
 
@@ -251,7 +255,7 @@ def run_breaths(
     rows, aborted = [], False
     try:
         state = controller.init(key=key)
-        # Compiled now, and not while a valve stands open.
+        # Compile now, not while a valve stands open.
         u, _ = _act(controller, jnp.asarray(0.0), jnp.array([0.0]), state)
         _applied(controller, jnp.array([0.0, 0.0]), state)
         for k in range(steps):

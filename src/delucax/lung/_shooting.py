@@ -1,4 +1,4 @@
-"""Controls of a breath by gradient descent through a lung."""
+"""Finds the controls of a breath by gradient descent through a lung."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,25 +20,26 @@ from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 
 
 class ShootingMPC(AbstractController):
-    r"""Plans the next controls in a learned lung, at every step anew.
+    r"""Model predictive control with a learned lung, by gradient descent.
 
-    The learned lung runs beside the true one under the same controls, and its pressure
-    is corrected towards the measured one by a fixed gain. The plan is improved by some
-    steps of Adam on the error to the target, and its first control is applied. With
-    `u = 100 sigmoid(z)` it keeps the bounds of the valve.
+    The learned lung runs beside the true lung under the same controls. A fixed gain
+    corrects its pressure towards the measured one. At each step, some iterations of
+    Adam improve the plan, which minimises the error to the target, and the first
+    control of the plan is applied. The controls are $u = 100 \, \sigma(z)$ of free
+    variables $z$, so they keep the bounds of the valve.
 
     **Arguments:**
 
     - `model`: a [`delucax.lung.LearnedLung`][].
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `horizon`: steps of a plan, 10 by default.
-    - `iterations`: of Adam, 30 by default.
-    - `learning_rate`: of Adam, 0.1 by default.
-    - `memory`: how much of its own prediction the learned lung keeps when a pressure is
-        read, 0.7 by default.
+    - `horizon`: the number of steps of a plan, 10 by default.
+    - `iterations`: the iterations of Adam per step, 30 by default.
+    - `learning_rate`: the learning rate of Adam, 0.1 by default.
+    - `memory`: the weight of the predicted pressure when a measured pressure corrects
+        it, from 0 to 1; 0.7 by default.
 
-    **Raises:** `ValueError` if `model` is no learned lung, `waveform` none, or a count
-    is below 1.
+    **Raises:** `ValueError` if `model` is not a `LearnedLung`, `waveform` is not a
+    `BreathWaveform`, or a count is below 1.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021 (shooting).
@@ -89,7 +90,7 @@ class ShootingMPC(AbstractController):
 
             return jnp.mean(jnp.abs(jax.lax.scan(body, lung, plan)[1] - target))
 
-        # Begins at the plan of the step before, whose first control has been used.
+        # Start from the last plan, whose first control has been used.
         start = jnp.append(plan[1:], plan[-1])
         optimiser = optax.adam(self.learning_rate)
         plan, _ = _descended(error, start, optimiser, self.iterations)
@@ -106,21 +107,20 @@ def least_error(
 ) -> Array:
     """Estimate the least error that any control of the inspiratory valve can reach.
 
-    The controls of each breath are found by gradient descent with full knowledge of the
-    true lung and without noise: a bound on all controllers, to the accuracy of the
-    descent.
+    The controls of each breath are found by gradient descent through the true lung,
+    without noise. No controller can do better, up to the accuracy of the descent.
 
     **Arguments:**
 
     - `env`: a task of a lung.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `steps`: of the descent, 600 by default.
-    - `horizon`: steps per episode, 29 by default.
+    - `steps`: the number of steps of the descent, 600 by default.
+    - `horizon`: the number of steps per episode, 29 by default.
 
-    **Returns:** the mean error at each of the pressures, shape `(pips,)` [cmH2O].
+    **Returns:** the mean error at each peak pressure [cmH2O], shape `(pips,)`.
 
-    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
-    say).
+    **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
+    below PEEP).
 
     !!! example
 
@@ -143,7 +143,7 @@ def least_error(
         x0: Any = world.initial_state
 
         def error(z):
-            # Kept for the gradient are the states alone, not what a step computes.
+            # The gradient keeps only the states and computes the steps again.
             @jax.checkpoint
             def body(x, inputs):
                 k, z = inputs
@@ -154,14 +154,15 @@ def least_error(
             return jnp.mean(costs)
 
         _, errors = _descended(error, jnp.full(horizon, -1.0), optimiser, steps)
-        # The best visited, because Adam does not descend at every step.
+        # The least error of all steps, because Adam does not descend at every step.
         return jnp.min(errors, initial=jnp.inf)
 
     return eqx.filter_jit(jax.vmap(of))(pips)
 
 
 def _controls(z: Array) -> Array:
-    """Both valves in an inspiration, within their bounds for any number `z`."""
+    """The controls of both valves in an inspiration, within their bounds for any
+    `z`."""
     return jnp.stack([100 * jax.nn.sigmoid(z), jnp.zeros_like(z)])
 
 
@@ -171,7 +172,8 @@ def _descended(
     optimiser: optax.GradientTransformation,
     steps: int,
 ) -> tuple[Array, Array]:
-    """The end of a gradient descent, and the error before each of its steps."""
+    """Descend along the gradient. Returns the last `z`, and the error before each
+    step."""
 
     def descend(carry, _):
         z, memory = carry

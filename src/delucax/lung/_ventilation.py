@@ -1,4 +1,4 @@
-"""A ventilator: its valves and sensor, the cost of a breath, and the task."""
+"""The valves and the sensor of a ventilator, the cost of a breath, and the task."""
 
 from typing import Any
 
@@ -19,37 +19,38 @@ from ._waveform import BreathWaveform, check_waveform
 
 
 class Valves(eqx.Module):
-    r"""A proportional valve that lets air in, and one that lets it out to PEEP.
+    r"""A proportional valve that lets air in, and a valve that lets it out to PEEP.
 
-    The flow that the first settles at is a smooth S-curve of its opening `u_in` [%],
-    with `z(u) = sigmoid(steepness (u - midpoint))`:
+    The steady flow of the inspiratory valve is a smooth S-curve of its opening
+    $u_\mathrm{in}$ [%]:
 
-    `flow(u_in) = max_flow (z(u_in) - z(0)) / (z(100) - z(0))`,
+    $$q(u) = q_\mathrm{max} \frac{z(u) - z(0)}{z(100) - z(0)}, \qquad
+    z(u) = \sigma(a (u - m))$$
 
-    which is 0 when closed and `max_flow` when fully open, whatever the pressure behind
-    it (the supply is far above that of the airway). Both valves follow what they are
-    asked for through a first-order lag:
+    It does not depend on the pressure of the airway, because the pressure of the supply
+    is much higher. Both valves follow their controls through a first-order lag:
 
-    `lag d(inflow)/dt = flow(u_in) - inflow`,
-    `expiratory_lag d(opening)/dt = u_out - opening`.
+    $$T_\mathrm{in} \dot q_\mathrm{in} = q(u_\mathrm{in}) - q_\mathrm{in}, \qquad
+    T_\mathrm{out} \dot o = u_\mathrm{out} - o$$
 
-    Out goes `max(opening, 0) (p - peep) / expiratory_resistance`, and through a leak
-    `leak p`. Not smooth at an opening of 0, which the lag approaches and does not
-    cross.
+    The flow out is $\max(o, 0) (p - \mathrm{peep}) / R_\mathrm{out}$ through the
+    expiratory valve, and $G p$ through a leak. It is not smooth at an opening $o$ of 0,
+    which the lag approaches but does not cross.
 
     **Arguments:**
 
-    - `max_flow`: [L/s], 3 by default.
-    - `steepness`: of the curve [1/%], 0.06 by default.
-    - `midpoint`: of the curve [%], 45 by default.
-    - `lag`: of the inspiratory valve [s], 0.05 by default.
-    - `expiratory_lag`: of the expiratory valve [s], 0.02 by default.
-    - `expiratory_resistance`: of the valve when fully open [cmH2O s/L], 5 by default.
+    - `max_flow`: $q_\mathrm{max}$ [L/s], 3 by default.
+    - `steepness`: $a$ [1/%], 0.06 by default.
+    - `midpoint`: $m$ [%], 45 by default.
+    - `lag`: $T_\mathrm{in}$ [s], 0.05 by default.
+    - `expiratory_lag`: $T_\mathrm{out}$ [s], 0.02 by default.
+    - `expiratory_resistance`: $R_\mathrm{out}$, the resistance of the expiratory valve
+        when fully open [cmH2O s/L], 5 by default.
     - `peep`: the pressure behind the expiratory valve [cmH2O], 5 by default.
-    - `leak`: conductance to the room [L/s/cmH2O], 0 by default.
+    - `leak`: $G$, the conductance to the room [L/s/cmH2O], 0 by default.
 
-    **Raises:** `ValueError` if a number is not positive, or `peep` or `leak` is
-    negative.
+    **Raises:** `ValueError` if `peep` or `leak` is negative, or if a number other than
+    these and `midpoint` is not positive.
 
     !!! example
 
@@ -79,12 +80,12 @@ class Valves(eqx.Module):
     def flow(self, u_in: Any) -> Array:
         """The steady flow of the inspiratory valve.
 
-        **Arguments:** `u_in`: its opening [%].
+        **Arguments:** `u_in`: the opening [%].
 
         **Returns:** the flow [L/s], of the shape of `u_in`.
         """
         curve = lambda u: jax.nn.sigmoid(self.steepness * (u - self.midpoint))
-        # A sigmoid is neither 0 when closed nor 1 when open: shifted and scaled.
+        # Shift and scale the sigmoid to be 0 when closed and 1 when open.
         closed = curve(0.0)
         return self.max_flow * (curve(u_in) - closed) / (curve(100.0) - closed)
 
@@ -95,8 +96,8 @@ class Valves(eqx.Module):
 
         **Arguments:**
 
-        - `inflow`: what flows in now [L/s].
-        - `opening`: of the expiratory valve now, from 0 to 1.
+        - `inflow`: the flow in [L/s].
+        - `opening`: the opening of the expiratory valve, from 0 to 1.
         - `u`: the control `(u_in, u_out)`.
 
         **Returns:** the time derivatives of `inflow` and `opening`.
@@ -107,21 +108,21 @@ class Valves(eqx.Module):
     def airway_pressure(
         self, inflow: Array, opening: Array, resistance: Array, pressure: Array
     ) -> Array:
-        """The pressure between the valves and a lung, by the balance of the flows,
+        r"""The pressure $p$ between the valves and a lung, from the balance of flows.
 
-        `inflow = (p - pressure) / resistance + opening (p - peep) /
-        expiratory_resistance + leak p`.
+        $$q_\mathrm{in} = \frac{p - p_\mathrm{lung}}{R}
+        + \frac{o \, (p - \mathrm{peep})}{R_\mathrm{out}} + G p$$
 
         **Arguments:**
 
-        - `inflow`: [L/s].
-        - `opening`: of the expiratory valve, from 0 to 1.
-        - `resistance`: of the way into the lung [cmH2O s/L].
-        - `pressure`: inside the lung [cmH2O].
+        - `inflow`: $q_\mathrm{in}$ [L/s].
+        - `opening`: $o$, the opening of the expiratory valve, from 0 to 1.
+        - `resistance`: $R$, the resistance of the lung [cmH2O s/L].
+        - `pressure`: $p_\mathrm{lung}$, the pressure inside the lung [cmH2O].
 
-        **Returns:** `p` [cmH2O].
+        **Returns:** $p$ [cmH2O].
         """
-        # Linear in p, so that no iteration is needed within a step of the solver.
+        # Linear in p, so no iteration is needed.
         out = self._conductance(opening)
         flows = inflow + pressure / resistance + out * self.peep
         return flows / (1 / resistance + out + self.leak)
@@ -131,8 +132,8 @@ class Valves(eqx.Module):
 
         **Arguments:**
 
-        - `opening`: of the expiratory valve, from 0 to 1.
-        - `pressure`: of the airway [cmH2O].
+        - `opening`: the opening of the expiratory valve, from 0 to 1.
+        - `pressure`: the pressure of the airway [cmH2O].
 
         **Returns:** the flow [L/s].
         """
@@ -141,22 +142,22 @@ class Valves(eqx.Module):
 
     def _conductance(self, opening: Array) -> Array:
         """The conductance of the expiratory valve."""
-        # A stage of a solver may evaluate an opening below 0, where the balance of the
-        # flows would be singular. `where`, unlike `maximum`, has the right-hand
-        # derivative at 0 itself.
+        # A stage of a solver may evaluate an opening below 0, which could make the
+        # balance of flows singular. At 0, `where` has the right-hand derivative, and
+        # `maximum` does not.
         return jnp.where(opening < 0, 0, opening) / self.expiratory_resistance
 
 
 class PressureSensor(AbstractWrapper):
-    """Dynamics whose observation, a pressure, is kept at the end of the state.
+    """Adds the observation of the dynamics, a pressure, to the end of the state.
 
-    A cost reads it there, and need not know the lung. For a sensor delay wrap it in
-    [`delucax.dynamics.Delayed`][].
+    A cost can then read the pressure without knowing the lung. For a sensor delay, wrap
+    it in [`delucax.dynamics.Delayed`][].
 
-    **Arguments:** `dynamics`: of a lung; it observes one number.
+    **Arguments:** `dynamics`: the dynamics of a lung, which observe one number.
 
-    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or observes
-    more than one number.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or does not
+    observe exactly one number.
 
     !!! example
 
@@ -188,13 +189,13 @@ class PressureSensor(AbstractWrapper):
         return (*self.dynamics.state_names, "sensed pressure")
 
     def filled(self, x: ArrayLike) -> State:
-        """The state of a lung that has rested.
+        """Add the observation to a state of the dynamics.
 
-        **Arguments:** `x`: the state of the dynamics.
+        **Arguments:** `x`: the state of the dynamics, shape `(n,)`.
 
-        **Returns:** the state, with what is observed of `x`.
+        **Returns:** `x` with its observation at the end, shape `(n + 1,)`.
 
-        **Raises:** `ValueError` on a wrong shape.
+        **Raises:** `ValueError` if `x` has a wrong shape.
         """
         x = as_vector(x, self.dynamics.state_size, "x", "PressureSensor.filled")
         return _with_reading(self.dynamics, x)
@@ -224,18 +225,19 @@ def _with_reading(dynamics: AbstractDynamics, x: Array) -> Array:
 
 
 class BreathCost(AbstractCost):
-    r"""The weighted absolute error of the pressure, `weight |p - r(t)|`.
+    r"""The weighted absolute error of the pressure, $w \, |p - r(t)|$.
 
-    The weight is 1 in the inspiratory phase and `expiration_weight` in the other. With
-    a limit each cmH2O above it costs ten more, as an alarm is worse than an error. Not
-    smooth on the target, and at the limit.
+    The weight $w$ is 1 in the inspiratory phase and `expiration_weight` in the
+    expiratory phase. With a `limit`, each cmH2O above it costs 10 more, because a
+    pressure that is too high is worse than an error. The cost is not smooth at the
+    target and at the limit.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `index`: the place of the pressure in the state.
-    - `expiration_weight`: 0 by default.
-    - `limit`: a pressure [cmH2O]; none by default.
+    - `index`: the index of the pressure in the state.
+    - `expiration_weight`: the weight in the expiratory phase, 0 by default.
+    - `limit`: the limit of the pressure [cmH2O]; none by default.
 
     **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is
     not positive.
@@ -284,30 +286,30 @@ def ventilation(
     horizon: int = 100,
     **options: Any,
 ) -> Environment:
-    """A task in which a lung is ventilated.
+    """The task to ventilate a lung, so that the pressure tracks a waveform.
 
-    The controls are (u_in [%], u_out), the observation is the pressure of the airway
-    [cmH2O], and the state holds it too, see [`delucax.lung.PressureSensor`][]. Cost
-    `|p - r(t)|` a step of the inspiratory phase, [`delucax.lung.BreathCost`][]. Never
-    terminates.
+    The controls are (u_in [%], u_out). The observation is the pressure of the airway
+    [cmH2O]. The state holds this pressure too; see [`delucax.lung.PressureSensor`][].
+    The cost of a step is the absolute error of the pressure in the inspiratory phase;
+    see [`delucax.lung.BreathCost`][]. The task never terminates.
 
     **Arguments:**
 
-    - `dynamics`: of the lung; it observes the pressure of the airway and takes the
-        controls (u_in, u_out).
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20
-        times a minute, by default.
+    - `dynamics`: the dynamics of the lung, which observe the pressure of the airway and
+        take the controls (u_in, u_out).
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]. The default rises to
+        35 cmH2O, 20 times a minute.
     - `resting_state`: the first state of the dynamics; zero by default.
-    - `sensor_delay`: steps until a pressure is observed, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `expiration_weight`, `limit`: of the cost; 0 and none by default.
-    - `horizon`: steps per episode, 100 by default.
-    - `**options`: other arguments of [`delucax.Environment`][], which hold instead of
-        those of the task.
+    - `sensor_delay`: the number of steps until a pressure is observed, 0 by default.
+    - `noise`: the standard deviation of the noise of the sensor [cmH2O], 0 by default.
+    - `expiration_weight`, `limit`: arguments of the cost; 0 and none by default.
+    - `horizon`: the number of steps per episode, 100 by default.
+    - `**options`: other arguments of [`delucax.Environment`][], which replace those of
+        the task.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on invalid numbers, or if `waveform` is not a
+    **Raises:** `ValueError` if a number is invalid, or if `waveform` is not a
     `BreathWaveform`.
 
     !!! example
@@ -335,7 +337,7 @@ def ventilation(
     if delay:
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)
-    # The value of a traced or batched noise cannot be inspected: it is kept.
+    # A traced or batched noise cannot be compared with 0, so it is kept.
     silent = isinstance(noise, int | float) and noise == 0
     fields: dict[str, Any] = dict(
         dynamics=sensed,
@@ -349,7 +351,7 @@ def ventilation(
 
 
 def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:
-    """The waveform of a task of a lung, or of several that are stacked."""
+    """The waveform of a task of a lung, or of several stacked tasks."""
     if not isinstance(env, Environment) or not isinstance(env.cost, BreathCost):
         raise ValueError(
             f"{where}: env must be a task with a breath waveform, such as "

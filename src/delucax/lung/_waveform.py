@@ -29,34 +29,37 @@ from .._module import (
 _T = TypeVar("_T")
 
 LENGTH = 29
-"""Samples of an inspiration that are learned from: 0.87 s."""
+"""The number of samples of an inspiration to learn from: 0.87 s."""
 PIPS = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
-"""The peak pressures that are learned from [cmH2O]."""
+"""The peak pressures to learn from [cmH2O]."""
 
 
 class BreathWaveform(eqx.Module):
     r"""The target pressure of pressure-controlled ventilation, a function of time.
 
-    With the share `s = (t mod period) / period` of a breath of `period = 60 / rate`
-    seconds: `r(t) = peep + (pip - peep) interp(s, keypoints, levels)`. A breath is in
-    its inspiratory phase while `s <= inspiration`. As the keypoints are shares of the
-    period, they scale with the rate.
+    $$r(t) = \mathrm{peep} + (\mathrm{pip} - \mathrm{peep}) \,
+    \mathrm{interp}(s, \mathrm{keypoints}, \mathrm{levels}), \qquad
+    s = \frac{t \bmod T}{T}, \quad T = \frac{60}{\mathrm{rate}}$$
 
-    It is a reference like any other, and its numbers are leaves.
+    Here $T$ is the period of a breath [s] and $s$ the elapsed share of the breath. The
+    inspiratory phase lasts while $s \le \mathrm{inspiration}$. The keypoints are shares
+    of the period, so they scale with the rate.
+
+    The waveform can be used like any other reference. Its numbers are leaves.
 
     **Arguments:**
 
     - `pip`: the peak inspiratory pressure [cmH2O], 35 by default.
-    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. This is the
-        target; the pressure that a lung exhales to is the `peep` of its
-        [`delucax.lung.Valves`][]. Change both together.
-    - `rate`: breaths a minute, 20 by default.
-    - `keypoints`: shares of a period, increasing, from 0 to 1; `(0, 1/3, 1/2, 1)` by
-        default. The pressure may jump from the end of a breath to the next one.
-    - `levels`: how far from PEEP (0) to PIP (1) the target is at each; `(1, 1, 0, 0)`
-        by default: PIP is asked for at once and held for 1 s, then falls to PEEP in
-        0.5 s.
-    - `inspiration`: the share of a period that is inspiratory, 1/3 by default.
+    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. This is only
+        the target. The lung exhales to the `peep` of its [`delucax.lung.Valves`][], so
+        change both together.
+    - `rate`: breaths per minute, 20 by default.
+    - `keypoints`: increasing shares of a period, from 0 to 1; `(0, 1/3, 1/2, 1)` by
+        default. The pressure may jump from the end of a breath to the next breath.
+    - `levels`: the level of the target at each keypoint, from PEEP (0) to PIP (1);
+        `(1, 1, 0, 0)` by default. The target is then at PIP for 1 s, and falls to PEEP
+        in 0.5 s.
+    - `inspiration`: the share of the inspiratory phase in a period, 1/3 by default.
 
     **Raises:** `ValueError` if a number is not finite, PIP is below PEEP, the rate is
     not positive, keypoints do not increase from 0 to 1 or are not as many as the
@@ -113,7 +116,7 @@ class BreathWaveform(eqx.Module):
 
     @property
     def period(self) -> Array:
-        """The time of a breath [s]."""
+        """The period of a breath [s]."""
         return 60 / self.rate
 
     def share(self, t: Any) -> Array:
@@ -121,11 +124,11 @@ class BreathWaveform(eqx.Module):
 
         **Arguments:** `t`: time [s].
 
-        **Returns:** of the shape of `t`. A time that rounding put just before a breath
-        counts as its beginning.
+        **Returns:** the share, of the shape of `t`. It is 0 if rounding puts `t` just
+        before the beginning of a breath.
         """
         breaths = as_float_array(t) / self.period
-        # `mod` would give almost 1 where rounding puts `k dt` just before a breath.
+        # `mod` would give almost 1 if rounding puts `k dt` just before a breath.
         return jnp.maximum(breaths - jnp.floor(breaths + _slack(breaths)), 0)
 
     def is_inspiration(self, t: Any) -> Array:
@@ -143,7 +146,7 @@ class BreathWaveform(eqx.Module):
 
         **Arguments:** `t`: time [s].
 
-        **Returns:** [cmH2O], of the shape of `t`.
+        **Returns:** the pressure [cmH2O], of the shape of `t`.
         """
         level = jnp.interp(self.share(t), self.keypoints, self.levels)
         return self.peep + (self.pip - self.peep) * level
@@ -154,9 +157,9 @@ class BreathWaveform(eqx.Module):
 
     @staticmethod
     def at_pip(tree: _T, pip: Any) -> _T:
-        """A copy of a pytree in which every breath waveform has that peak pressure.
+        """Copy a pytree, and set the peak pressure of every breath waveform in it.
 
-        An environment and its controller each hold the waveform; under `jax.vmap` this
+        An environment and its controller both hold the waveform. Under `jax.vmap` this
         makes a batch of both over several pressures, which compiles once.
 
         **Arguments:**
@@ -166,7 +169,7 @@ class BreathWaveform(eqx.Module):
 
         **Returns:** the copy.
 
-        **Raises:** `ValueError` if there is no waveform in it, or `pip` is below PEEP.
+        **Raises:** `ValueError` if `tree` holds no waveform, or `pip` is below PEEP.
 
         !!! example
 
@@ -192,21 +195,22 @@ class BreathWaveform(eqx.Module):
 
 
 def _slack(breaths: Array) -> Array:
-    """A bound on the rounding error of `k dt` after so many breaths, in periods."""
+    """A bound on the rounding error of `k dt` after a number of breaths, in periods."""
     eps = jnp.finfo(breaths.dtype).eps
     return jnp.clip(2 * eps * jnp.abs(breaths), 1e-6, 1e-3)
 
 
 def check_waveform(waveform: Any, where: str) -> None:
-    """Raise unless it is a breath waveform."""
+    """Raise an error unless `waveform` is a breath waveform."""
     check_instance(waveform, BreathWaveform, "waveform", where)
 
 
 def as_pips(pips: Any, tree: Any, where: str) -> Array:
-    """`pips` as a vector of peak pressures, none of them below the PEEP of a waveform
-    in a pytree.
+    """Convert `pips` to a vector of peak pressures. Raises an error if one is below the
+    PEEP of a waveform in `tree`.
 
-    They are mapped over with `jax.vmap`, inside which their values cannot be checked.
+    This is done before `jax.vmap` maps over them, because values cannot be checked
+    inside it.
     """
     array = as_float_array(pips)
     if not eqx.is_inexact_array(array) or array.ndim != 1 or not array.size:
@@ -220,7 +224,7 @@ def as_pips(pips: Any, tree: Any, where: str) -> Array:
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
-    """Raise unless a peak pressure is at least PEEP, if both are known."""
+    """Raise an error if a peak pressure is below PEEP and both are known."""
     check_finite(pip, name, where)
     if is_concrete(pip) and is_concrete(peep):
         if not np.all(np.asarray(pip) >= np.asarray(peep)):
