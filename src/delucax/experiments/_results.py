@@ -53,6 +53,15 @@ class Results:
         results = run(noisy, progress=False)
         print(results.export("markdown"))
         ```
+
+        ```text
+        | x | seed | status | value |
+        | ---: | ---: | --- | ---: |
+        | 1 | 0 | passed | 1 |
+        | 1 | 1 | passed | 1.1 |
+        | 2 | 0 | passed | 2 |
+        | 2 | 1 | passed | 2.1 |
+        ```
     """
 
     rows: list[dict[str, Any]]

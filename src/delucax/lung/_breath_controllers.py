@@ -135,6 +135,10 @@ class BangBang(AbstractController):
         bang = BangBang(BreathWaveform())
         bang(0.1, jnp.array([20.0]), bang.init())
         ```
+
+        ```text
+        (Array([100.], dtype=float32), None)
+        ```
     """
 
     waveform: BreathWaveform

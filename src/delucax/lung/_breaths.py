@@ -115,6 +115,10 @@ class Breaths(eqx.Module):
             u_out = jnp.tile(jnp.repeat(jnp.array([0.0, 1.0]), 30), 3)
             Breaths.from_recording(0 * u_out, u_out, 0 * u_out, dt=0.03)
             ```
+
+            ```text
+            Breaths(u_in=f32[3,29], u_out=f32[3,29], pressure=f32[3,29], dt=0.03)
+            ```
         """
         where = "from_recording"
         length = check_count(length, "length", where)

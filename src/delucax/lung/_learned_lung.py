@@ -98,6 +98,10 @@ class LearnedLung(AbstractDynamics):
         lung = LearnedLung(breaths, key=jax.random.key(0))
         lung.pressure(lung.resting())
         ```
+
+        ```text
+        Array(16.289, dtype=float32)
+        ```
     """
 
     line: Float[Array, " inputs"] = weight()

@@ -47,7 +47,11 @@ class LungModel(eqx.Module):
         from delucax.lung import LungModel, SingleCompartment
 
         model = LungModel(SingleCompartment(resistance=5.0))
-        model.predict(jnp.linspace(50.0, 0.0, 10))
+        model.predict(jnp.linspace(50.0, 0.0, 5)).round(1)
+        ```
+
+        ```text
+        Array([ 5. ,  5. ,  5. ,  9.5, 10.9], dtype=float32)
         ```
     """
 

@@ -202,6 +202,10 @@ def breath_error(
         pid = dlx.controllers.LeakyPID(dt=env.dt, reference=waveform)
         lung.breath_error(env, pid, key=jax.random.key(0), pips=[20.0, 30.0])
         ```
+
+        ```text
+        Array([2.592, 3.808], dtype=float32)
+        ```
     """
     where = "breath_error"
     waveform = waveform_of(env, where)

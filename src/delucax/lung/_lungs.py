@@ -55,6 +55,10 @@ class AbstractLung(AbstractSystem):
 
         lung.LungModel(Rigid()).resting()
         ```
+
+        ```text
+        Array([5., 5., 5.], dtype=float32)
+        ```
     """
 
     control_names: ClassVar = ("u_in", "u_out")
@@ -168,7 +172,11 @@ class SingleCompartment(_AbstractCompartment):
 
         lung = SingleCompartment(resistance=50.0, compliance=10.0)
         dynamics = dlx.Discretized(lung, dt=0.03)
-        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))
+        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))[-1]
+        ```
+
+        ```text
+        Array([0.715, 0.   , 0.127], dtype=float32)
         ```
     """
 
@@ -221,7 +229,11 @@ class DoubleCompartment(_AbstractRigidPipe):
 
         lung = DoubleCompartment(resistance=50.0, compliance=10.0)
         dynamics = dlx.Discretized(lung, dt=0.03)
-        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))
+        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))[-1]
+        ```
+
+        ```text
+        Array([0.715, 0.   , 0.066, 0.061], dtype=float32)
         ```
     """
 
@@ -307,7 +319,11 @@ class BalloonLung(_AbstractCompartment):
 
         lung = BalloonLung(resistance=10.0)
         dynamics = dlx.Discretized(lung, dt=0.03)
-        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))
+        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))[-1]
+        ```
+
+        ```text
+        Array([0.715, 0.   , 1.612], dtype=float32)
         ```
     """
 
@@ -355,7 +371,12 @@ class DelayLung(AbstractLung):
         lung = DelayLung()
         late = dlx.dynamics.Delayed(dlx.Discretized(lung, dt=0.03), controls=5)
         x0 = late.filled(lung.resting(5.0))
-        dlx.open_loop(late, x0, jnp.array([[30.0, 0.0]] * 8))
+        states = dlx.open_loop(late, x0, jnp.array([[30.0, 0.0]] * 8))
+        states[:, 2].round(1)  # the pressure, which rises after 5 steps
+        ```
+
+        ```text
+        Array([ 5. ,  5. ,  5. ,  5. ,  5. ,  5. ,  6. ,  8.1, 10.6], dtype=float32)
         ```
     """
 

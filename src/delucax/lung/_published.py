@@ -188,7 +188,11 @@ class PublishedController(AbstractController):
         weights = jnp.ones((4, 10)), jnp.zeros(4), jnp.ones(4), 0.0
         waveform = lung.BreathWaveform()
         controller = lung.PublishedController(means, *weights, waveform)
-        controller(0.0, jnp.array([34.0]), controller.init())
+        controller(0.0, jnp.array([34.0]), controller.init())[0]
+        ```
+
+        ```text
+        Array([11.716], dtype=float32)
         ```
     """
 

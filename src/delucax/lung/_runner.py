@@ -47,6 +47,10 @@ class Runner(Protocol):
         runner = lung.SimulatedRunner(env, key=jax.random.key(0))
         isinstance(runner, lung.Runner)
         ```
+
+        ```text
+        True
+        ```
     """
 
     dt: float
@@ -103,7 +107,11 @@ class SimulatedRunner:
         runner = lung.SimulatedRunner(env, key=jax.random.key(0))
         runner.actuate(50.0, 0.0)
         runner.wait()
-        runner.observe()
+        round(runner.observe(), 1)
+        ```
+
+        ```text
+        21.0
         ```
     """
 
@@ -241,7 +249,11 @@ def run_breaths(
         waveform = env.cost.waveform
         pid = dlx.controllers.LeakyPID(1.0, 1.0, dt=env.dt, reference=waveform)
         runner = lung.SimulatedRunner(env, key=jax.random.key(0))
-        lung.run_breaths(runner, lung.Breathing(pid, waveform), 5).pressure
+        lung.run_breaths(runner, lung.Breathing(pid, waveform), 5).pressure.round(2)
+        ```
+
+        ```text
+        array([ 5.  , 12.73, 15.11, 16.34, 17.24])
         ```
     """
     where = "run_breaths"

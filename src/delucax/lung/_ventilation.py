@@ -59,6 +59,10 @@ class Valves(eqx.Module):
 
         Valves(max_flow=2.0).flow(50.0)
         ```
+
+        ```text
+        Array(1.135, dtype=float32, weak_type=True)
+        ```
     """
 
     max_flow: Array = parameter(3.0, constraint=positive)
@@ -172,6 +176,10 @@ class PressureSensor(AbstractWrapper):
         states = dlx.open_loop(dynamics, x0, jnp.array([[30.0, 0.0]] * 5))
         dynamics.observe(0.0, states[-1])
         ```
+
+        ```text
+        Array([23.15], dtype=float32)
+        ```
     """
 
     dynamics: AbstractDynamics
@@ -250,6 +258,10 @@ class BreathCost(AbstractCost):
 
         cost = BreathCost(BreathWaveform(), index=2)
         cost(0.5, jnp.array([0.0, 0.0, 34.0]), jnp.zeros(2))
+        ```
+
+        ```text
+        Array(1., dtype=float32)
         ```
     """
 

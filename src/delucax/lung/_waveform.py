@@ -77,6 +77,10 @@ class BreathWaveform(eqx.Module):
         waveform = BreathWaveform(pip=25.0, rate=15.0)
         waveform(0.5), waveform.is_inspiration(0.5)
         ```
+
+        ```text
+        (Array([25.], dtype=float32), Array(True, dtype=bool))
+        ```
     """
 
     pip: Array = parameter(35.0)
