@@ -113,8 +113,8 @@ def as_entries(
 
 
 def _fits(size: int | None) -> Callable[[Shape], bool]:
-    """A test of whether a shape is that of a number or of a vector. If `size` is given,
-    the vector must have this size."""
+    """A function that tests whether a shape is that of a number or of a vector, which
+    must have the size `size` if that is given."""
     return lambda shape: len(shape) <= 1 and (size is None or shape in ((), (size,)))
 
 
@@ -304,7 +304,7 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
 def check_at_most(
     value: int, most: int, name: str, where: str, of: str | None = None
 ) -> None:
-    """Raise if a count exceeds `most`, the number of the things that `of` names."""
+    """Raise if a count exceeds `most`. `of` says what `most` counts."""
     if value > most:
         limit = most if of is None else f"the {most} {of}"
         raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")

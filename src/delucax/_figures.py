@@ -12,9 +12,9 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from PIL import Image
 
 
-# The palette of Okabe and Ito (2008), which colour-blind readers can distinguish.
-# Without its yellow, which vanishes on white paper, and its black, which vanishes on a
-# dark page.
+# The palette of Okabe and Ito (2008), which colour-blind readers can distinguish. Its
+# yellow is left out because it vanishes on white paper, and its black because it
+# vanishes on a dark page.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINE_STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
 NEUTRAL = "0.5"

@@ -11,7 +11,7 @@ from ._message import shortened
 
 
 def as_path(value: Any, name: str, where: str) -> Path:
-    """`value` as a path, or an error if it is none."""
+    """`value` as a path, or an error if it is not a path."""
     if not isinstance(value, str | os.PathLike):
         raise ValueError(
             f"{where}: {name} must be the path of a file, got {shortened(value)}."

@@ -1,9 +1,9 @@
 """One code for two array libraries: NumPy if nothing is traced, JAX otherwise.
 
-A design, such as a Riccati equation, is solved once. To compile it would take a
-thousand times as long as to solve it. Code that is written with `xp`, `lax` and the
-loops below runs on NumPy if all its arguments are concrete arrays, and with JAX under
-`jax.jit`, `jax.vmap` and `jax.grad`.
+A design, such as a Riccati equation, is solved once. Compiling it would take a thousand
+times as long as solving it. Code that is written with `xp`, `lax` and the loops below
+runs on NumPy if all its arguments are concrete arrays, and with JAX under `jax.jit`,
+`jax.vmap` and `jax.grad`.
 
 Such code must avoid two differences. NumPy changes an array in place where JAX makes a
 new one, so write `a = a + b`, not `a += b`. And NumPy's `where` of two Python numbers
@@ -116,7 +116,7 @@ class _Operations:
 
     @staticmethod
     def custom_linear_solve(matvec: Any, b: Any, solve: Any, **_: Any) -> Any:
-        """The solution."""
+        """The solution of `matvec(x) = b`, found by `solve`."""
         return solve(matvec, b)
 
 

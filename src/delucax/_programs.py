@@ -33,9 +33,9 @@ def keep_programs(
     - `folder`: the folder; that in `JAX_COMPILATION_CACHE_DIR` by default.
     - `otherwise`: the folder if neither is given; one in the user's caches by default.
 
-    **Returns:** the folder; or `None` if nothing is kept, which is so with
-    `JAX_ENABLE_COMPILATION_CACHE=false`, or after a warning if the folder cannot be
-    written to.
+    **Returns:** the folder, or `None` if nothing is kept: with
+    `JAX_ENABLE_COMPILATION_CACHE=false`, or if the folder cannot be written to, which
+    gives a warning.
     """
     if not jax.config.jax_enable_compilation_cache:
         return None
@@ -45,7 +45,7 @@ def keep_programs(
         kept = Path(kept or user_folder()).absolute()
         kept.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=kept).close()
-    except (OSError, RuntimeError) as error:  # the latter if there is no home
+    except (OSError, RuntimeError) as error:  # a RuntimeError if there is no home
         forget_programs()
         warnings.warn(f"compiled programs are not kept on disk: {error}", stacklevel=2)
         return None

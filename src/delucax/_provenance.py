@@ -39,9 +39,9 @@ def device() -> str:
 
 
 def _git(folder: Path) -> tuple[str | None, bool | None]:
-    """The commit, and whether the files differ from it; `None` twice outside of a
+    """The commit, and whether the files differ from it; `(None, None)` outside of a
     repository. New files count only if they are Python files or notebooks, because a
-    run may write others."""
+    run may write other files."""
 
     def ask(*words: str) -> str:
         how: Any = dict(cwd=folder, timeout=20, check=True)

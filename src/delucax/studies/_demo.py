@@ -1,4 +1,4 @@
-"""The demo: from the pendulum's ODE to a controller, then the paper in small."""
+"""The demo: from the ODE of a pendulum to a controller, then the paper in short."""
 
 import tempfile
 import time
@@ -50,9 +50,9 @@ def demo(
     **Arguments:**
 
     - `out`: the folder to write to, `"demo"` by default.
-    - `seeds`: how many MLPs to train, 2 by default; the first one is compared.
-    - `steps`: optimiser steps for each, 800 by default.
-    - `say`: what to do with a line of text; `print` by default.
+    - `seeds`: the number of MLPs to train, 2 by default. The first one is compared.
+    - `steps`: the number of optimiser steps for each MLP, 800 by default.
+    - `say`: a function that gets each line of text; `print` by default.
 
     **Returns:** the table of the pendulum, a `pandas.DataFrame`.
 
@@ -163,7 +163,7 @@ def demo(
 
 
 def _writable(out: Path) -> Path:
-    """The folder, made and tried before any work is done."""
+    """Make the folder, and try to write to it before any work is done."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
@@ -174,7 +174,7 @@ def _writable(out: Path) -> Path:
 
 
 def _draw(runs: dict[str, Trajectory]) -> Any:
-    """The runs by controller, with the shock in grey and ticks at each half turn."""
+    """Draw the run of each controller, the shock in grey, and ticks at half turns."""
     figure: Any = plotting.plot(runs)
     for axes in figure.axes:
         axes.axvspan(10.0, 10.5, color="0.5", alpha=0.25, lw=0)
@@ -191,7 +191,7 @@ def _draw(runs: dict[str, Trajectory]) -> Any:
 def _evaluate(
     env: Environment, controller: Any, starts: np.ndarray, w: np.ndarray
 ) -> tuple[Trajectory, np.ndarray]:
-    """The runs from all starts, in NumPy, and which of them hold the upright."""
+    """The runs from all starts, in NumPy, and whether each of them holds upright."""
     return jax.device_get(_compiled_runs(env, controller, starts, w))
 
 
@@ -204,7 +204,7 @@ def _compiled_runs(env, controller, starts, w):
 
 
 def _beside_gymnasium(steps_per_second: float) -> str:
-    """Gymnasium's own speed, measured here and now if it is installed."""
+    """A sentence about the speed of Gymnasium, which is measured if it is installed."""
     count = 20_000
     try:
         seconds = take_turns([gymnasium_run(count)], 1)
@@ -219,13 +219,14 @@ def _beside_gymnasium(steps_per_second: float) -> str:
 
 
 def _derivative() -> str:
-    """The cost's derivative with respect to the length, beside a central difference."""
+    """A sentence about the derivative of the cost by the length, and a central
+    difference."""
     with jax.enable_x64(True):
         env = pendulum(solver=diffrax.Tsit5(), dt=0.02)
         policy, key = Linear(jnp.array([[20.0, 5.0]])), jax.random.key(0)
         options: Any = dict(x0=jnp.array([0.1, 0.0]), horizon=250, throw=False)
 
-        # One program has both.
+        # One program for the cost and its derivative.
         @jax.jit
         @jax.value_and_grad
         def both(length):

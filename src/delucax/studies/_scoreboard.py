@@ -1,7 +1,7 @@
-"""Every task crossed with the controllers that suit it, one recipe for each.
+"""The scoreboard: every task with every controller that suits it.
 
-`python -m delucax run scoreboard` runs it; `python -m benchmarks.scoreboard` makes the
-committed results and their page.
+Each controller has one recipe for all tasks. `python -m delucax run scoreboard` runs
+it. `python -m benchmarks.scoreboard` makes the committed results and their page.
 """
 
 import functools
@@ -28,16 +28,16 @@ from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
 
 
-# Of every training: steps of the optimiser on the gradient, episodes a step, and the
-# most steps of an episode. PPO and SHAC are given as many steps of the environment.
+# For every training: the optimiser steps on the gradient, the episodes in a step, and
+# the most steps of an episode. PPO and SHAC get as many steps of the environment.
 TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
-# Trained controllers of each kind.
+# The number of trained controllers of each kind.
 TRAINING_SEEDS = 3
 
 
 class EnergyPumping(AbstractController):
-    """Full force in the direction of motion, which pumps energy into a swing: the best
-    first guess that is known for the mountain cars."""
+    """Full force in the direction of motion, which pumps energy into a swing. It is the
+    best known first guess for the mountain cars."""
 
     push: Array
 
@@ -51,7 +51,7 @@ class Unsuitable(Exception):
 
 @functools.cache
 def task_of(name: str) -> Environment:
-    """The task, with what it needs drawn from a fixed key."""
+    """The task of a name. Its random parts are drawn from a fixed key."""
     options: dict[str, Any] = {}
     if name == "neural":
         options = dict(width=8, key=jax.random.key(0))
@@ -63,7 +63,7 @@ def task_of(name: str) -> Environment:
 
 
 def is_disturbed(name: str) -> bool:
-    """Whether the task draws disturbances, which a plan knows and no controller."""
+    """Whether the task draws disturbances, which only a plan knows in advance."""
     return not isinstance(task_of(name).disturbance, Undisturbed)
 
 
@@ -86,7 +86,7 @@ def _regulator(
 
 
 def _following(name: str, env: Environment) -> Any:
-    """A PID on the waveform that a ventilator is to follow."""
+    """A PID that follows the waveform of a ventilator."""
     if not isinstance(env.cost, BreathCost):
         raise Unsuitable("the cost follows no waveform")
     waveform = env.cost.waveform
@@ -107,7 +107,7 @@ def _receding(
     real_time: bool = False,
     **options: Any,
 ) -> Any:
-    """MPC, with the cost to go of the LQR where there is one."""
+    """MPC, with the cost-to-go of the LQR if the LQR suits the task."""
     bounds = env.control_bounds
     if kind in (MPPI, CEM) and bounds is not None:
         low, high = (np.asarray(bound, float) for bound in bounds)
@@ -119,12 +119,12 @@ def _receding(
 
 
 def _seeds() -> Any:
-    """Of the controllers that are trained as a batch, every array with it in front."""
+    """A key for each of the controllers that are trained as a batch."""
     return jax.random.split(jax.random.key(1), TRAINING_SEEDS)
 
 
 def _by_gradient(env: Environment, network: Callable[..., Any], **options: Any) -> Any:
-    """Networks, by gradient descent through the rollout."""
+    """Networks that are trained by gradient descent through the rollout."""
     keys, horizon = _seeds(), min(env.horizon, LONGEST)
     loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
     models = eqx.filter_vmap(lambda key: network(env, key=key, **options))(keys)
@@ -140,7 +140,7 @@ def _gru(env: Environment, key: Any) -> Any:
 
 
 def _by_actor_critic(env: Environment, method: type[PPO] | type[SHAC]) -> Any:
-    """The MLPs by reinforcement learning."""
+    """MLPs that are trained by reinforcement learning."""
     head, keys = "gaussian" if method is PPO else "deterministic", _seeds()
     shape: dict[str, Any] = dict(width=32, depth=1, head=head)
     models = eqx.filter_vmap(lambda key: actor_critic(env, **shape, key=key))(keys)
@@ -153,7 +153,7 @@ def _by_actor_critic(env: Environment, method: type[PPO] | type[SHAC]) -> Any:
 
 
 def _fitted(loss: Any, models: Any, steps: int, keys: Any) -> Any:
-    """The models, trained by Adam, all in one program."""
+    """Train the models with Adam, all in one program."""
     adam = optax.adam(optax.cosine_decay_schedule(0.01, steps))
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
     options: Any = dict(key=keys, progress=False, throw=False)
@@ -196,7 +196,7 @@ FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
         "PPO": lambda name, env: _by_actor_critic(env, PPO),
     },
 }
-"""The methods by family: each makes a controller for the task of a name."""
+"""The methods by family. Each method makes a controller for the task of a name."""
 
 
 TRAINED = tuple(FAMILIES["Training"])
@@ -204,7 +204,8 @@ TRAINED = tuple(FAMILIES["Training"])
 
 @functools.cache
 def agent_of(name: str, method: str) -> Any:
-    """The controller, designed at the operating point; or a batch of those trained.
+    """The controller of a method, designed at the operating point of the task, or the
+    batch of trained controllers.
 
     **Raises:** `Unsuitable` if the task lacks what the method needs.
     """
@@ -216,20 +217,21 @@ def agent_of(name: str, method: str) -> Any:
 
 
 METHODS = (*(name for family in FAMILIES.values() for name in family), "plan")
-# Seeds that are run, and timed, in one batch.
+# The number of seeds that are run and timed in one batch.
 BATCH = 8
-# Seconds that are timed, at least.
+# The least time to measure [s].
 TIMED = 0.3
 
 
-# What the plan begins at, beside no control.
+# The methods whose controls start the plan, beside zero control.
 GUIDES = ("MLP", "GRU", "MPC")
 PUMPED = ("mountain_car", "mountain_car_discrete")
 
 
 def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
-    """The best controls of iLQR for a known start and known disturbances, from zero
-    control and from each of the guides; or those of a guide, if they cost less."""
+    """The best controls of iLQR for a known start and known disturbances. It starts
+    from zero control and from each guide. If the controls of a guide cost less, they
+    are taken."""
     best, least = None, np.inf
     for agent in (Zero(env.control_size), *guides):
         run: Any = rollout(env, agent, key=key, throw=False)
@@ -247,7 +249,7 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
 
 
 def _members(agent: Any, method: str) -> list[Any]:
-    """The controllers of a batch, one for each training; or the one that there is."""
+    """The controllers of a batch, one for each training, or the single controller."""
     if method not in TRAINED:
         return [agent]
     of = lambda k: jax.tree.map(lambda a: a[k] if eqx.is_array(a) else a, agent)
@@ -255,7 +257,8 @@ def _members(agent: Any, method: str) -> list[Any]:
 
 
 def _suited(task: str, method: str) -> Any:
-    """The controller, the first of a training, or none if it does not suit."""
+    """The controller of a method (the first if several are trained), or `None` if it
+    does not suit the task."""
     try:
         return _members(agent_of(task, method), method)[0]
     except Unsuitable:
@@ -273,20 +276,20 @@ def _costs(env: Environment, agent: Any, keys: Any) -> Any:
 
 
 def _keys(block: int) -> Any:
-    """Those of the episodes of a block of seeds."""
+    """The keys of the episodes of a block of seeds."""
     seeds = range(block * BATCH, (block + 1) * BATCH)
     return jax.vmap(jax.random.key)(jnp.array(seeds))
 
 
 def costs_of(task: str, agent: AbstractController) -> list[float]:
-    """The costs of a controller of yours, from the starts of the scoreboard."""
+    """The costs of your own controller, from the starts of the scoreboard."""
     return np.asarray(_costs(task_of(task), agent, _keys(0))).tolist()
 
 
 @functools.cache
 def _batch(task: str, method: str, block: int) -> tuple[Any, float | None]:
-    """The costs of a block of seeds, for each training a row, and microseconds per
-    step of one of them."""
+    """The costs of a block of seeds, with a row for each training, and the microseconds
+    per step of the first controller."""
     env, keys = task_of(task), _keys(block)
     if method == "plan":
         guides = [agent for name in GUIDES if (agent := _suited(task, name))]
@@ -309,8 +312,8 @@ def _batch(task: str, method: str, block: int) -> tuple[Any, float | None]:
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:
-    """The cost of an episode, the middle one of several trainings, these costs, and
-    microseconds per step."""
+    """The cost of an episode (the median over several trainings), the cost of each
+    training, and the microseconds per step."""
     try:
         batch, speed = _batch(task, method, seed // BATCH)
     except Unsuitable as error:

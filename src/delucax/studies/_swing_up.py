@@ -1,4 +1,4 @@
-"""The recipe that swings Gym's pendulum up by differentiating the rollout."""
+"""The recipe to swing up Gym's pendulum by differentiating the rollout."""
 
 import functools
 
@@ -29,21 +29,21 @@ def train_swing_up(
     steps: int = STEPS,
     progress: bool = True,
 ) -> Fitted:
-    """Train an MLP that swings the pendulum up and holds it, through the ODE.
+    """Train an MLP that swings up a pendulum and holds it, through the ODE.
 
-    The gradient of a long swing explodes through the unstable upright, and plain
-    descent then falls into spinning; so the gradient is damped by 0.92 each step back
-    in time. One network of width 32, 128 fresh starts a step, horizon 100, Adam with
-    cosine decay from 0.01.
+    The gradient of a long swing explodes at the unstable upright, and plain gradient
+    descent then ends in spinning. The gradient is therefore damped by 0.92 per step
+    back in time. The network has one hidden layer of width 32. Each step of Adam, with
+    cosine decay from 0.01, uses 128 new starts and a horizon of 100 steps.
 
     **Arguments:**
 
     - `environment`: a pendulum; [`delucax.environments.pendulum`][] by default.
     - `key`: a random key, for the first weights and the starts.
-    - `steps`: optimiser steps, 800 by default.
-    - `progress`: show a progress bar.
+    - `steps`: the number of optimiser steps, 800 by default.
+    - `progress`: whether to show a progress bar, `True` by default.
 
-    **Returns:** what [`delucax.training.fit`][] returns; its `model` is the controller.
+    **Returns:** a [`delucax.training.Fitted`][]; its `model` is the controller.
 
     !!! example
 
@@ -63,8 +63,8 @@ def train_swing_up(
 
 
 def spread_starts(environment: Environment) -> Environment:
-    """The pendulum with starts over all angles and speeds, so that no part of the swing
-    is new."""
+    """The pendulum with starts at all angles and speeds, so that training sees every
+    part of the swing."""
     corner = jnp.asarray(np.array([np.pi, 8.0]))
     starts = {"initial_state.low": -corner, "initial_state.high": corner}
     return replace(environment, starts)
@@ -72,21 +72,23 @@ def spread_starts(environment: Environment) -> Environment:
 
 @functools.lru_cache
 def _optimiser(steps: int) -> optax.GradientTransformation:
-    """Adam with cosine decay; cached, because `fit` compiles anew for a new one."""
+    """Adam with cosine decay. Cached, because `fit` compiles again for a new one."""
     return optax.adam(optax.cosine_decay_schedule(0.01, steps))
 
 
 def holds_upright(
     trajectory: Trajectory, *, seconds: float = 5.0, tolerance: float = 0.2
 ) -> Bool[Array, "..."]:
-    """Whether the pendulum stayed upright to the end: `|angle| < tolerance` over the
-    last `seconds`.
+    r"""Whether the pendulum stayed upright to the end.
+
+    This means that $|\theta| < \mathrm{tolerance}$ over the last `seconds`, where
+    $\theta$ is the angle from upright.
 
     **Arguments:**
 
-    - `trajectory`: of a pendulum, or a batch of them.
-    - `seconds`: 5 by default.
-    - `tolerance`: in radians, 0.2 by default.
+    - `trajectory`: a trajectory of a pendulum, or a batch of them.
+    - `seconds`: the time to look at [s], 5 by default.
+    - `tolerance`: the largest angle [rad], 0.2 by default.
 
     **Returns:** a boolean for each trajectory.
 

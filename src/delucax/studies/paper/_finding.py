@@ -17,7 +17,7 @@ class Claim:
 
     - `statement`: the claim, with its limit.
     - `measured`: the number, with its unit.
-    - `holds`: whether it came out.
+    - `holds`: whether the claim holds.
     """
 
     statement: str
@@ -27,9 +27,12 @@ class Claim:
 
 @dataclass(frozen=True)
 class Finding:
-    """The claims of one study, its tables (by title, rows as dictionaries) and its
-    figures (by file name, those of Matplotlib or paths of images); `notes` say what was
-    done and what is not as the paper has it."""
+    """The claims of one study, its tables and its figures.
+
+    - `tables`: by title, the rows as dictionaries.
+    - `figures`: by file name, Matplotlib figures or paths of images.
+    - `notes`: what was done, and what differs from the paper.
+    """
 
     title: str
     claims: list[Claim]
@@ -39,7 +42,7 @@ class Finding:
 
 
 def mean_and_half_width(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """The mean, and half of its 95% interval."""
+    """The mean, and half the width of its 95% interval."""
     half = 1.96 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     return float(values.mean()), float(half)
 
@@ -53,15 +56,15 @@ def paired_ratio(
 
 
 def side_by_side(function: Callable[..., Any], arguments: Iterable[Any]) -> list[Any]:
-    """The results for each argument, from threads: nearly all of the time of a study is
-    compilation, and a program compiles on one core."""
+    """The results for each argument, from two threads. Nearly all of the time of a
+    study is compilation, and a program compiles on one core."""
     with ThreadPoolExecutor(max_workers=2) as pool:
         return list(pool.map(function, arguments))
 
 
 def draw_panels(count: int, size: tuple[float, float], **options: Any) -> Any:
-    """The axes of a figure with panels beside each other, which have faint grids; with
-    the options of Matplotlib's `subplots`."""
+    """The axes of a figure with panels side by side, with faint grids. `options` go to
+    Matplotlib's `subplots`."""
     from matplotlib.figure import Figure
 
     from ..._figures import PALETTE

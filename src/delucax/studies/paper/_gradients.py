@@ -1,5 +1,5 @@
-"""Gradients of a policy: descent through the rollout beside evolution strategies (the
-first figure, right), and the variance of the estimators (Section 2)."""
+"""Policy gradients: descent through the rollout against evolution strategies (the first
+figure, right), and the variance of gradient estimators (Section 2)."""
 
 import functools
 import itertools
@@ -27,16 +27,16 @@ from ._finding import Claim, draw_panels, Finding, side_by_side
 EPISODE, RATE, GOAL = 50, 0.01, 2.0
 TWICE = 2 * RATE
 BUDGET, HORIZON = 128, 20
-"""Rollouts in one estimate, and steps in a rollout."""
+"""The number of rollouts in one estimate, and of steps in a rollout."""
 ON_WEIGHTS, ON_CONTROLS = 0.01, 0.1
-"""Standard deviations of the noise."""
+"""The standard deviations of the noise on the weights and on the controls."""
 LONGER = (10, 25, 50, 100, 200, 400)
 DRAWN = 8
-"""Rollouts in one estimate where the start is drawn."""
+"""The number of rollouts in one estimate with random starts."""
 
 
 def policy_gradient(small: bool = False) -> Finding:
-    """A linear policy of the pendulum, hanging at first, with torque up to 10."""
+    """Train a linear policy of a pendulum that hangs at first, with torque up to 10."""
     steps, seeds = (400, 3) if small else (1500, 5)
     scales, pairs = ((0.1,), (1, 16)) if small else ((0.05, 0.1, 0.3), (1, 4, 16, 64))
 
@@ -54,7 +54,7 @@ def policy_gradient(small: bool = False) -> Finding:
     fewest = []
     for (scale, count), runs in curves.items():
         when = [_first(run) for run in runs]
-        # The loss itself, which is one more rollout a step, is not charged.
+        # The loss takes one more rollout per step, which is not counted.
         cost = [2 * count * w for w in when if w is not None]
         fewest += cost
         name = f"evolution strategies, sigma {scale}, {count} pairs"
@@ -99,7 +99,8 @@ def policy_gradient(small: bool = False) -> Finding:
 
 @functools.cache
 def _mean_cost() -> Callable[..., Any]:
-    """The mean cost per step from hanging; cached, as a new function would compile."""
+    """The mean cost per step from hanging. Cached, because a new function would compile
+    again."""
     env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
     total = training.expected_cost(env, batch=1, horizon=EPISODE)
     return lambda controller, key: total(controller, key) / EPISODE
@@ -107,15 +108,15 @@ def _mean_cost() -> Callable[..., Any]:
 
 @functools.cache
 def _descent(rate: float) -> optax.GradientTransformation:
-    """Gradient descent; cached, because `fit` compiles anew for a new one."""
+    """Gradient descent. Cached, because `fit` compiles again for a new one."""
     return optax.sgd(rate)
 
 
 def train_linear(
     steps: int, seed: Any = 0, rate: float = RATE, **options: Any
 ) -> training.Fitted:
-    """Descend with a linear policy from zero, or with several for an array of seeds;
-    with the options of `fit`."""
+    """Train a linear policy from zero by gradient descent, or several policies for an
+    array of seeds. `options` go to `fit`."""
     start, key_of = Linear(jnp.zeros((1, 2))), jr.key
     if np.ndim(seed):
         start = jax.tree.map(lambda K: jnp.stack([K] * len(seed)), start)
@@ -141,7 +142,7 @@ def _first(losses: np.ndarray) -> int | None:
 
 
 def estimator_variance(small: bool = False) -> Finding:
-    """Networks of growing width, of one pendulum's control."""
+    """Compare gradient estimators for networks of growing width."""
     widths = (4, 64) if small else (4, 8, 16, 32, 64, 128, 256)
     draws = 64 if small else 256
     env = pendulum(initial_state=np.array([1.0, 0.0]), horizon=HORIZON)
@@ -235,7 +236,8 @@ def estimator_variance(small: bool = False) -> Finding:
 
 
 class _After(eqx.Module):
-    """The end of an episode at a time, which is data: all horizons share a program."""
+    """Ends an episode at a time. The time is an array, so all horizons share a
+    program."""
 
     end: Array
 
@@ -245,7 +247,8 @@ class _After(eqx.Module):
 
 
 def _over_horizons(horizons: Sequence[int], draws: int) -> list[dict[str, Any]]:
-    """Variances over each horizon, the start drawn, and how large the gradient is."""
+    """The variances for each horizon, with random starts, and the norm of the
+    gradient."""
     env = spread_starts(pendulum(terminated=_After(jnp.zeros(()))))
     policy = mlp_policy(env, width=32, depth=1, key=jr.key(0))
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
@@ -255,8 +258,8 @@ def _over_horizons(horizons: Sequence[int], draws: int) -> list[dict[str, Any]]:
         until = replace(env, {"terminated.end": (horizon - 0.5) * env.dt})
         one = training.expected_cost(until, batch=1, horizon=max(horizons))
         score = training.scored_cost(until, horizon=max(horizons))
-        # Of single rollouts, so that norms are those of one, and the variance an
-        # eighth.
+        # The analytic gradients are of single rollouts, for their norms. Their variance
+        # is divided by the number of rollouts in an estimate.
         both = [(training.analytic, one, policy), (drawn, score, noisy)]
         each, guesses = _estimates(both, draws)
         norms = np.linalg.norm(each, axis=1)
@@ -271,8 +274,8 @@ def _over_horizons(horizons: Sequence[int], draws: int) -> list[dict[str, Any]]:
 def _estimates(
     given: list[tuple[Any, Any, Any]], draws: int
 ) -> list[Float[np.ndarray, "draws weights"]]:
-    """Estimates of the gradient by the policy's own weights, a row each, by each
-    estimator of a loss of a model."""
+    """Estimates of the gradient by the weights of the policy, one in each row, for each
+    given (estimator, loss, model)."""
     return side_by_side(lambda one: np.asarray(_compiled_estimates(one, draws)), given)
 
 

@@ -1,5 +1,5 @@
-"""Online control beside regulators and plans: the linear-quadratic figure, under three
-kinds of perturbation, and the pendulum figure, without noise and in a shock."""
+"""Online control against regulators and plans: the linear-quadratic figure with three
+kinds of perturbation, and the pendulum figure without noise and with a shock."""
 
 from collections.abc import Callable
 from typing import Any
@@ -33,7 +33,7 @@ DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20
 
 
 def pendulum_shock(small: bool = False) -> Finding:
-    """Regulate the inverted pendulum from off upright."""
+    """Regulate an inverted pendulum that starts off upright."""
     seeds, steps = (4, 300) if small else (20, STEPS)
     dynamics = Discretized(Pendulum(), dt=DT, solver=diffrax.Euler())
     cost = Quadratic(np.eye(2), np.eye(1))
@@ -56,7 +56,7 @@ def pendulum_shock(small: bool = False) -> Finding:
     learner = controllers.gpc(dynamics, cost, base=lqr)
     horizon = learner.loop.horizon
     around = lambda x: controllers.gpc(dynamics, cost, base=x, horizon=horizon)
-    # What LQR would cost from there on stands for all that lies beyond the horizon.
+    # The cost-to-go of LQR stands for the cost beyond the horizon.
     ahead = Quadratic(np.eye(2), np.eye(1), final=lqr.P)
     mpc = controllers.MPC(dynamics, ahead, AHEAD, bounds=(-BOUND, BOUND))
     contenders: dict[str, Any] = {
@@ -118,7 +118,7 @@ def pendulum_shock(small: bool = False) -> Finding:
     times = DT * np.arange(steps)
     for ax, world in zip(axes, worlds, strict=True):
         names = [name for name in contenders if name != "zero"]
-        # Several lie on top of each other: the thinner ones are drawn last.
+        # Several lines coincide, so the thinner ones are drawn last.
         for name, width in zip(names, range(len(names), 0, -1), strict=True):
             mean_cost = costs_of[name, world].mean(axis=0)
             ax.semilogy(times, mean_cost, lw=width, label=name)
@@ -149,9 +149,10 @@ def _costs(
     starts: Float[Array, "seeds states"],
     plans: Any,
 ) -> dict[tuple[str, str], Float[np.ndarray, "seeds steps"]]:
-    """The cost of each step, by controller and world: all meet the same disturbances.
+    """The cost of each step, by controller and world. All controllers meet the same
+    disturbances.
 
-    A contender makes a controller of the plan of a seed.
+    A contender makes a controller from the plan of a seed.
     """
     options: Any = dict(key=jr.key(0), keep=("costs",), throw=False)
 
@@ -187,10 +188,10 @@ def _at_most(
 
 
 def lq_perturbations(small: bool = False) -> Finding:
-    """Zero control diverges on this plant: LQR is the row to beat."""
+    """Regulate a double integrator, on which zero control diverges."""
     from matplotlib.ticker import LogLocator
 
-    # Over fewer steps the time that GPC takes to learn would count for more.
+    # With fewer steps, the time that GPC takes to learn would count for more.
     seeds, steps = 5 if small else 20, 1000
     A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
     dynamics, cost = LinearDynamics(A, B), Quadratic(np.eye(2), np.eye(1))

@@ -1,4 +1,4 @@
-"""The first figure, left: the calls of the dynamics that iLQR makes."""
+"""How often iLQR calls the dynamics (the first figure, left)."""
 
 from typing import Any
 
@@ -129,7 +129,7 @@ def _step(given, z, n, samples):
 @_step.def_jvp
 def _(primals, tangents):
     given, z, n, samples = primals
-    # The draw is new at each point, and the same for each direction there.
+    # The perturbations are new at each point, and the same for each direction there.
     fold = lambda key, bits: (jr.fold_in(key, bits), None)
     bits = jax.lax.bitcast_convert_type(z.astype(jnp.float32), jnp.uint32)
     key, _ = jax.lax.scan(fold, jr.key(0), bits)

@@ -1,4 +1,4 @@
-"""The paper from one command."""
+"""Reproduces the paper with one command."""
 
 import html
 import time
@@ -25,7 +25,7 @@ STUDIES: dict[str, Callable[..., Finding]] = {
         *(ventilator, pendulum_shock, lq_perturbations),
     )
 }
-"""In the order of the paper."""
+"""The studies, in the order of the paper."""
 
 
 def reproduce(
@@ -35,23 +35,26 @@ def reproduce(
     small: bool = False,
     say: Callable[[str], Any] = print,
 ) -> list[dict[str, Any]]:
-    """Regenerate figures and tables of the Deluca paper, each claim with its number.
+    """Regenerate the figures and tables of the Deluca paper, and check its claims.
 
-    A claim holds or it does not: the report says which, with what was measured. A study
-    that raises an error is a claim that does not hold, and the others run on.
+    The report says whether each claim holds, with the measured number. If a study
+    raises an error, it counts as a claim that does not hold, and the other studies go
+    on.
 
     **Arguments:**
 
     - `names`: `"all"` (default) or some of `oracle-complexity`, `policy-gradient`,
         `estimator-variance`, `wall-clock`, `ventilator`, `pendulum-shock` and
         `lq-perturbations`.
-    - `out`: the folder to write to, `"paper"` by default: `report.html`, `claims.csv`,
-        the figures, and in `lung` or `lung-small` what
-        [`delucax.studies.lung_study`][] writes, which goes on there if it was cut off.
-    - `small`: fewer seeds and steps; false by default.
-    - `say`: what to do with a line of text; `print` by default.
+    - `out`: the folder to write to, `"paper"` by default. It gets `report.html`,
+        `claims.csv` and the figures. The folder `lung` (or `lung-small`) in it gets the
+        files of [`delucax.studies.lung_study`][], which continues there if it was
+        interrupted.
+    - `small`: whether to use fewer seeds and steps; `False` by default.
+    - `say`: a function that gets each line of text; `print` by default.
 
-    **Returns:** a row for each claim: `study`, `claim`, `measured`, `holds`.
+    **Returns:** a dictionary for each claim, with the keys `study`, `claim`, `measured`
+    and `holds`.
 
     **Raises:** `ValueError` if a name is not one of these; `OSError` if the folder
     cannot be written; `ImportError` without pandas or Matplotlib.
@@ -91,7 +94,7 @@ def reproduce(
         images = []
         for title, figure in finding.figures.items():
             if not isinstance(figure, Path):
-                # Drawn once, for the page too: figures take as long as some studies.
+                # Draw it only once, because this takes as long as some studies.
                 figure.savefig(out / f"{title}.png", dpi=150)
                 figure = out / f"{title}.png"
             images.append(figure)
@@ -113,7 +116,8 @@ def _held(rows: list[dict[str, Any]]) -> str:
 
 
 def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Finding:
-    """The finding of a study; if it raises, a claim that does not hold."""
+    """The finding of a study. If the study raises an error, it is a claim that does not
+    hold."""
     options = {}
     if name == "ventilator":
         options = {"out": out / ("lung-small" if small else "lung"), "say": say}

@@ -11,7 +11,7 @@ from ._finding import Claim, Finding
 
 
 def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
-    """The results of `python -m delucax lung`, from the folder that it writes to."""
+    """Run the ventilator study in the folder `out`, and check its claims."""
     lung_study(out, small=small, say=lambda line: say(f"  {line}"))
     summary = json.loads((out / "summary.json").read_text())
     simulators = summary["simulators"]

@@ -19,7 +19,7 @@ LANES = 1024
 
 
 def wall_clock(small: bool = False) -> Finding:
-    """Ten million steps in one call; Gymnasium beside it, if it is installed."""
+    """Time ten million steps in one call, and steps of Gymnasium beside it."""
     steps, runs = (10**6, 5) if small else (10**7, 10)
     python_steps = 10**4 if small else 10**5
     chain_start_up, chain = _compiled(steps, None)
@@ -39,8 +39,8 @@ def wall_clock(small: bool = False) -> Finding:
             ("Gymnasium", None, theirs),
         )
     ]
-    # The paper's limit is 1000. A small run may share its machine, which takes a chain
-    # down to some 500 times, and has a limit that tells compiled from not.
+    # The paper's limit is 1000. On a shared machine a chain may be only 500 times as
+    # fast, so a small run has a lower limit, which still shows that it is compiled.
     cases = [
         ("in one chain", float(np.median(theirs / ours)), 100 if small else 1000),
         (f"{LANES} at a time", float(np.median(theirs / each)), 1000),
@@ -64,7 +64,7 @@ def wall_clock(small: bool = False) -> Finding:
 
 
 def _compiled(steps: int, lanes: int | None) -> tuple[float, Callable[[], Any]]:
-    """Seconds to compile, and a run."""
+    """The time to compile [s], and a function that runs the program."""
     env, key = pendulum(), jax.random.key(0)
     options: Any = dict(key=key, horizon=steps, keep=(), throw=False)
     final = lambda x0: rollout(env, Zero(1), x0=x0, **options).final_state
@@ -77,7 +77,7 @@ def _compiled(steps: int, lanes: int | None) -> tuple[float, Callable[[], Any]]:
 
 
 def gymnasium_run(steps: int) -> Callable[[], Any]:
-    """A run of Gymnasium's own pendulum.
+    """A function that runs Gymnasium's own pendulum.
 
     **Raises:** `ImportError` if it is not installed.
     """
@@ -93,8 +93,8 @@ def gymnasium_run(steps: int) -> Callable[[], Any]:
 
 
 def take_turns(runs: list[Callable[[], Any]], rounds: int) -> np.ndarray:
-    """Seconds by round and run. A load on the machine that comes or goes meets all of
-    them, so that the ratios within a round barely change."""
+    """The time of each run in each round [s]. The runs take turns, so that a changing
+    load on the machine affects all of them, and hardly the ratios within a round."""
     for run in runs:
         run()
     taken = np.empty((rounds, len(runs)))

@@ -1,3 +1,3 @@
-"""Controllers of a ventilator, trained in learned lungs and tried on others."""
+"""The ventilator study: controllers that are trained in learned lungs."""
 
 from ._study import lung_study as lung_study

@@ -30,17 +30,19 @@ TRUE_PID = dict(
     ki=(0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0),
     kd=(0.0, 0.01, 0.03),
 )
-"""The gains of the true PIDs that are tried."""
+"""The gains of true PIDs to try."""
 _TUNED_KINDS = {"PID": PID, "leaky PID": LeakyPID}
 _TUNED_FURTHER = 4
 """The number of PIDs drawn at random that are trained further."""
 _TRAINING_LIMIT = ABORT - 15
-"""The alarm of the network for all lungs: well below the limit, as no lung is known."""
+"""The limit of the pressure in the training of the network for all lungs [cmH2O]. It is
+well below the abort limit, because the network does not know which lung it ventilates.
+"""
 
 
 class Summed(AbstractController):
-    """The sum of two controllers, such as a PID and a network trained on top of it,
-    `u = first(y) + second(y) - offset`."""
+    """The sum of two controllers, such as a PID and a network trained on top of it. The
+    `offset` is subtracted."""
 
     first: AbstractController
     second: AbstractController
@@ -61,7 +63,8 @@ class Summed(AbstractController):
 
 
 class FeedForward(AbstractController):
-    """A control that goes with the target, `u = gain (r(t) - peep) + offset`."""
+    r"""A feed-forward of the target, $u = \mathrm{gain} \, (r(t) - \mathrm{peep}) +
+    \mathrm{offset}$."""
 
     waveform: lung.BreathWaveform
     gain: Array = weight(1.0)
@@ -73,11 +76,11 @@ class FeedForward(AbstractController):
 
 
 class Contender(NamedTuple):
-    """A row of the report, before it was run.
+    """A row of the report, before it is run.
 
-    - `label`, `seed`: what it is called.
-    - `controllers`: of the inspiratory valve, stacked over the lungs; if it is
-        `shared`, one for all of them.
+    - `label`, `seed`: its name in the report.
+    - `controllers`: controllers of the inspiratory valve, stacked over the lungs, or a
+        single controller if it is `shared` by all lungs.
     """
 
     label: str
@@ -87,7 +90,7 @@ class Contender(NamedTuple):
 
 
 class Trainer(NamedTuple):
-    """Trains controllers through simulators of the lungs, stacked."""
+    """Trains controllers in simulators of the lungs, which are stacked."""
 
     simulators: Any
     waveform: lung.BreathWaveform
@@ -103,11 +106,11 @@ class Trainer(NamedTuple):
     def __call__(
         self, start: Any, steps: int, fold: int, *, limit: Any = None, **options: Any
     ) -> Any:
-        """The trained controllers: see [`delucax.lung.train_controllers`][]."""
+        """Train controllers; see [`delucax.lung.train_controllers`][]."""
         options |= dict(steps=steps, key=jr.fold_in(self.key, fold))
         given: Any = dict(waveform=self.waveform, noise=NOISE, limit=limit)
         task = lambda model: lung.learned_lung(model, **given)
-        # Compiled, as the trainings are: then the first states round as they do there.
+        # Compiled like the trainings, so that the first states are rounded as there.
         envs = eqx.filter_jit(eqx.filter_vmap(task))(self.simulators)
         return lung.train_controllers(envs, start, **options).model
 
@@ -116,7 +119,7 @@ class Trainer(NamedTuple):
         return kind(*gains, dt=self.simulators.dt[0], reference=self.waveform)
 
     def policies(self, shape: tuple[int, ...], fold: int, **options: Any) -> Any:
-        """Networks before they are trained, stacked to `shape`."""
+        """Untrained networks, stacked to `shape`."""
         given = self.waveform, self.simulators.dt[0]
         make = lambda key: lung.BreathPolicy(*given, key=key, **options)
         for _ in shape:
@@ -126,13 +129,13 @@ class Trainer(NamedTuple):
     def networks(
         self, shape: tuple[int, ...], fold: int, steps: int, **sizes: Any
     ) -> Callable[..., Any]:
-        """A function that trains networks of some sizes, stacked to `shape`."""
+        """A function that trains networks of these sizes, stacked to `shape`."""
         start = lambda: self.policies(shape, fold, **sizes)
         return lambda **options: self(start(), steps, fold + 1, **options)
 
 
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
-    """The best PID of each kind, for each lung and for all."""
+    """The best PID of each kind, for each lung and for all lungs."""
     best: dict[str, Any] = {}
     key, true = jr.fold_in(trainer.key, 6), dict[str, Any](TRUE_PID, kind="true")
     for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
@@ -146,7 +149,7 @@ def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | P
 def trained_pids(
     trainer: Trainer, pids: dict[str, Any], *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
-    """The PIDs trained further by the gradient, alone and with a feed-forward."""
+    """The PIDs after more training by the gradient, alone and with a feed-forward."""
     forward = FeedForward(trainer.waveform, jnp.asarray(0.3))
     forwards = stack([forward] * trainer.count)
     starts = {f"trained {name}": pid for name, pid in pids.items()}
@@ -165,14 +168,15 @@ def trained_pids(
 def _drawn(
     kind: type[LeakyPID | PID], count: int, dt: Array, waveform: Any, key: PRNGKey
 ) -> Summed:
-    """PIDs with a feed-forward, gains at random over orders of magnitude."""
+    """PIDs with a feed-forward, whose gains are random over orders of magnitude."""
 
     def between(key, low, high):
         return jnp.exp(jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high)))
 
     def one(key):
         keys = jr.split(key, 7)
-        # Half of them without a derivative, a feed-forward gain or an offset.
+        # The derivative, the feed-forward gain and the offset are each 0 in half of
+        # the PIDs.
         some = jr.bernoulli(keys[0], 0.5, (3,))
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
@@ -188,8 +192,8 @@ def _drawn(
 def _errors(
     envs: Environment, controllers: Any, key: PRNGKey, own: bool
 ) -> Float[Array, "lungs controllers"]:
-    """The error of each in each lung, shape `(lungs, controllers)`; of controllers of
-    shape `(controllers,)`, or `(controllers, lungs)` if each lung has its own."""
+    """The error of each controller in each lung. Controllers are stacked to the shape
+    `(controllers,)`, or `(controllers, lungs)` if each lung has its `own`."""
     options: Any = dict(key=key, pips=jnp.asarray(TRAIN_PIPS))
     of = lambda env, one: jnp.mean(lung.breath_error(env, one, **options))
     across = eqx.filter_vmap(of, in_axes=(None, eqx.if_array(0)))
@@ -199,8 +203,8 @@ def _errors(
 
 
 def best_candidates(candidates: Any, errors: Any, shared: bool) -> Any:
-    """The candidate with the least error in each lung, or on average over all; errors
-    have the shape `(lungs, candidates)`."""
+    """The candidate with the least error in each lung, or, if it is `shared`, on
+    average over all lungs. Errors have the shape `(lungs, candidates)`."""
     if shared:
         return taken(candidates, jnp.argmin(jnp.mean(errors, axis=0)))
     return taken(candidates, (jnp.argmin(errors, axis=1), jnp.arange(errors.shape[0])))
@@ -209,8 +213,9 @@ def best_candidates(candidates: Any, errors: Any, shared: bool) -> Any:
 def tuned_pids(
     envs: Environment, trainer: Trainer, *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
-    """The best of many at random and of the best few of them trained on, in each lung
-    and for all: by their errors in the lungs themselves, which no network is given."""
+    """The best PIDs for each lung and for all lungs. Many are drawn at random, and the
+    best few are trained further. They are judged in the lungs themselves, to which the
+    networks have no access."""
     best: dict[str, Any] = {}
     dt, size = envs.dt[0], trainer.size
     options: Any = dict(steps=size.pid_steps, progress=progress)
@@ -248,7 +253,7 @@ def divergence_note(diverged: Any, errors: Any) -> str:
 
 
 def pid_contenders(pids: dict[str, Any]) -> list[Contender]:
-    """PIDs by name, those that end with "for all" alike in each lung."""
+    """The rows of PIDs by name. A PID whose name ends with "for all" is shared."""
     return [Contender(n, 0, pid, n.endswith("for all")) for n, pid in pids.items()]
 
 
@@ -257,8 +262,8 @@ def online_learners(
 ) -> Any:
     """GPC around the best leaky PID of each lung, stacked over the lungs.
 
-    Its model is linear: the least-squares fit of the next pressure to the last ones and
-    the last controls in the breaths. A Kalman filter gives it the state.
+    Its model is a linear least-squares fit of the next pressure to the last pressures
+    and controls in the breaths. A Kalman filter estimates the state.
     """
     newton = online_newton()
 
@@ -266,7 +271,7 @@ def online_learners(
         dt: Any = breaths.dt
         measured = zip(breaths.pressure, breaths.u_in, strict=True)
         records = [Record(pressure, u_in, dt=dt) for pressure, u_in in measured]
-        # A model to predict with: each of its numbers need not be known.
+        # The model only predicts, so not all of its numbers must be identifiable.
         lags: Any = dict(outputs_back=2, controls_back=4, delay=delay + 1)
         identified = arx(records, throw=False, **lags).model
         model = LinearDynamics(identified.A, identified.B, dt=dt)
@@ -275,7 +280,8 @@ def online_learners(
         error = jnp.zeros(identified.state_size).at[0].set(1.0)
         cost = Tracking(error, jnp.zeros(1), _Target(waveform, len(error)))
         online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
-        # All of the residual variance is process noise; the sensor has next to none.
+        # All of the residual variance counts as process noise, and almost none as noise
+        # of the sensor.
         process = jnp.diag(NOISE**2 * error)
         # The outputs among the states start at PEEP.
         mean = error.at[1].set(1.0) * waveform.peep
@@ -306,13 +312,13 @@ def contenders(
     )
 
     def residuals(**kept):
-        # So that the network adds nothing before it is trained.
+        # With this offset the network adds nothing before it is trained.
         offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
         summed = eqx.filter_vmap(lambda a, b: Summed(a, b, offset=offset))
         start = stack([summed(pids["leaky PID"], trainer.policies((count,), 9))])
         return trainer(start, steps, 10, **kept)
 
-    # No control is a PID without gains, as which it compiles nothing of its own.
+    # Zero control, as a PID without gains, which needs no program of its own.
     none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
     rows = [Contender("zero", 0, none, True), *pid_contenders(pids)]
     seeds = f"({size.seeds} at once)" if size.seeds > 1 else ""

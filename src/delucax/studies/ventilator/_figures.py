@@ -57,7 +57,7 @@ def tracking_figure(
     chosen = ("MLP for all", "MPC", "CNN", "PID + MLP", "MLP", "least error")
     of = lambda label: [mean_error(rows, label, "unseen", name) for name in names]
     errors = {label: of(label) for label in (*PID_ROWS, *chosen)}
-    # Those of controllers that were not run are NaN.
+    # The errors of controllers that were not run are NaN.
     bars = {"best PID": np.nanmin([errors[label] for label in PID_ROWS], axis=0)}
     bars |= {label: errors[label] for label in chosen if np.isfinite(errors[label][0])}
     colors = {label: _color(label, k) for k, label in enumerate(bars)}
@@ -70,7 +70,7 @@ def tracking_figure(
 
 
 def _draw_bars(ax: Axes, bars: dict[str, Any], colors: dict[str, str]) -> None:
-    """Bars of several labels side by side, a group for each lung."""
+    """Draw the bars of several labels side by side, in a group for each lung."""
     width = 0.8 / len(bars)
     for k, (label, values) in enumerate(bars.items()):
         place = np.arange(len(values)) + (k - (len(bars) - 1) / 2) * width
@@ -87,11 +87,11 @@ def _color(label: str, index: int) -> str:
 def simulator_figure(
     test: lung.Breaths, models: dict[str, Any], names: list[str], table: Rows
 ) -> NotebookFigure:
-    """A breath that was not learned from as simulators see it, and their errors."""
+    """A test breath as the simulators predict it, and the errors of the simulators."""
     figure = NotebookFigure(figsize=(9.5, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.5))
     middle = len(names) // 2
-    # One that reaches a pressure that is often asked for.
+    # A breath that reaches about 30 cmH2O.
     breath = int(np.argmin(np.abs(np.max(test.pressure[middle], axis=-1) - 30)))
     u, read = test.u_in[middle, breath], np.asarray(test.pressure[middle, breath])
     times = float(np.ravel(test.dt)[0]) * np.arange(len(u))
@@ -118,7 +118,7 @@ def simulator_figure(
 
 
 def draw_breath(path: Path, envs: Environment, runs: Any) -> None:
-    """A breath in the middle one of the lungs, as a moving picture."""
+    """Save an animation of a breath in the middle one of the lungs."""
     middle = len(envs.dt) // 2
     env = lung.BreathWaveform.at_pip(unstack(envs)[middle], SHOWN)
     animate(env, unstack(runs)[middle], path=path, max_frames=40)

@@ -20,29 +20,30 @@ from ._stages import ABORT, BREATH, SHOWN, TEST_PIPS, TRAIN_PIPS
 
 Rows = list[dict[str, Any]]
 Lungs = tuple[Environment, list[str]]
-"""Tasks that are stacked, and their names."""
+"""Stacked tasks of lungs, and their names."""
 Which = tuple[str, int]
 """The label of a controller, and its seed."""
 WRONG = ("single compartment", "balloon")
-"""Physics that the lungs of the study do not have."""
+"""The models whose physics is not that of the lungs of the study."""
 PID_ROWS = (
     *("leaky PID", "PID", "trained leaky PID", "trained PID", "PID + feed-forward"),
     *("tuned PID + feed-forward", "tuned leaky PID + feed-forward"),
 )
 FLOORS = ("zero", "bang-bang")
 SPLITS = {"seen": slice(len(TRAIN_PIPS)), "unseen": slice(len(TRAIN_PIPS), None)}
-"""Which of the peak pressures `TRAIN_PIPS + TEST_PIPS` a row of the report is of."""
+"""The slices of the peak pressures `TRAIN_PIPS + TEST_PIPS`, by the names in the
+report."""
 LEARNED = ("MLP", "MLP for all", "CNN", "PID + MLP", "GPC", "MPC")
 
 
 def error_rows(
     contenders: list[Contender], lungs: Lungs, between: Lungs | None, keys: PRNGKey
 ) -> tuple[Rows, dict[str, Any]]:
-    """The error of each controller in each lung, averaged over noise and pressures; and
-    by label a breath of the first seed in each, at the pressure `SHOWN`.
+    """The error of each controller in each lung, averaged over noise and pressures.
+    Also, by label, a breath of the first seed in each lung, at the pressure `SHOWN`.
 
-    `between` are other lungs, as many as the first, and the names of those that count:
-    controllers that are the same for all lungs are run in them too.
+    `between` are as many other lungs, and the names of those that count. Shared
+    controllers are run in these lungs too.
     """
     (envs, names), rows, runs = lungs, [], {}
     pips, count = jnp.asarray(TRAIN_PIPS + TEST_PIPS), len(names)
@@ -55,7 +56,7 @@ def error_rows(
         runs.setdefault(label, jax.tree.map(lambda a: a[:, 0, place], breaths))
         rows += rows_of(names, (label, seed), *errors)
         if shared and between is not None:
-            # As many lungs as before, so that nothing compiles again.
+            # The number of lungs is the same, so that nothing compiles again.
             others, other_names = between
             *errors, _ = closed_loop(others, whole, pips, keys, BREATH)
             splits = {"between": SPLITS["unseen"]}
@@ -66,8 +67,8 @@ def error_rows(
 def rows_of(
     names: list[str], run: Which, errors: Any, highest: Any = None, splits: Any = SPLITS
 ) -> Rows:
-    """A row for each lung and each split of the peak pressures, the last axis of the
-    errors and the highest pressures."""
+    """A row for each lung and each split of the peak pressures, which are the last axis
+    of `errors` and `highest`."""
     (label, seed), rows = run, []
     for split, at in splits.items():
         of_split = errors[..., at]
@@ -83,9 +84,10 @@ def rows_of(
 def save_controllers(
     folder: Path, contenders: list[Contender], names: list[str], rows: Rows
 ) -> list[str]:
-    """Save each as a controller of both valves, ready for a task.
+    """Save each controller as a controller of both valves, ready for a task.
 
-    Returns the names of those that are not saved, as a pressure passed the abort limit.
+    A controller is not saved if a pressure passed the abort limit. Returns the names of
+    these controllers.
     """
     unsafe = []
     for label, seed, controllers, shared in contenders:
@@ -93,7 +95,7 @@ def save_controllers(
             continue
         stem = label.lower().replace(" + ", "_").replace(" ", "_").replace("-", "_")
         runs = [r for r in rows if (r["controller"], r["seed"]) == (label, seed)]
-        # One that is shared is saved once, and judged by its runs in all lungs.
+        # A shared controller is saved once, and judged by its runs in all lungs.
         each = [controllers] if shared else unstack(controllers)
         for name, controller in zip([None] if shared else names, each, strict=True):
             file = folder / f"{stem if name is None else f'{stem}_{name}'}_{seed}.dlx"
@@ -125,7 +127,7 @@ def best_of(
 
 
 def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
-    """A column of the table of the simulators, by kind and lung; empty without it."""
+    """A column of the table of simulators, by kind and lung; empty if it is missing."""
     columns: dict[str, dict[str, float]] = {}
     for row in table:
         if column in row:
@@ -138,8 +140,9 @@ def summarise(
 ) -> dict[str, Any]:
     """The key figures of the study, and sentences about them.
 
-    `judge` says what the controllers were run in, and `unsafe` names those that were
-    not saved."""
+    `judge` says in what the controllers were run, and `unsafe` names the controllers
+    that were not saved.
+    """
     simulators = _by_kind(table, "mae")
     learned = simulators["learned"]
     names = [kind for kind in WRONG if kind in simulators]

@@ -21,11 +21,11 @@ from ._stages import INSPIRATION, Size, TRAIN_PIPS
 class Kind(NamedTuple):
     """A kind of lung model, and how it is fitted.
 
-    - `make`: a function of a key to the model before it is fitted.
-    - `positive`, `free`: what is fitted of it, names in one string; what stays
-        positive, and the rest. Where none is named, the weights.
-    - `steps`: how often the steps of the study are taken.
-    - `learning_rate`: of the fit.
+    - `make`: a function that makes the model from a key, before it is fitted.
+    - `positive`, `free`: the names of the parameters to fit, separated by spaces: those
+        that must stay positive, and the others. Without names, the weights are fitted.
+    - `steps`: a factor on the number of steps of the study.
+    - `learning_rate`: the learning rate of the fit.
     """
 
     make: Callable[[PRNGKey], lung.AbstractLung]
@@ -61,7 +61,7 @@ def task_of(resistance: float, compliance: float, sensor_delay: int) -> Environm
 
 
 def explored(size: Size) -> lung.Breaths:
-    """Breaths of the lungs of the study, stacked over them."""
+    """Breaths of the lungs of the study, stacked over the lungs."""
     made = []
     for i, (R, C) in enumerate(size.lungs):
         env = task_of(R, C, size.sensor_delay)
@@ -71,7 +71,7 @@ def explored(size: Size) -> lung.Breaths:
 
 
 def grouped(breaths: lung.Breaths) -> Any:
-    """The lungs of a file, and as many breaths of each (see `left_out`)."""
+    """The lungs of a file, and the same number of breaths of each lung."""
     R, C = np.asarray(breaths.resistance), np.asarray(breaths.compliance)
     lungs = sorted(set(zip(R.tolist(), C.tolist(), strict=True)))
     parts = [breaths[np.flatnonzero((R == r) & (C == c))] for r, c in lungs]
@@ -97,7 +97,7 @@ def left_out(recorded: lung.Breaths, breaths: lung.Breaths) -> str:
 
 
 def divided(breaths: lung.Breaths, key: PRNGKey) -> tuple[lung.Breaths, lung.Breaths]:
-    """Breaths of each lung to train on, and to test on."""
+    """Split the breaths of each lung into breaths to train on and to test on."""
     halves = [part.split(1 / 6, key=key) for part in unstack(breaths)]
     train, test = (stack(parts) for parts in zip(*halves, strict=True))
     return train, test
@@ -106,7 +106,7 @@ def divided(breaths: lung.Breaths, key: PRNGKey) -> tuple[lung.Breaths, lung.Bre
 def learned(
     train: lung.Breaths, size: Size, key: PRNGKey, **options: Any
 ) -> lung.LearnedLung:
-    """A learned lung of each lung, stacked."""
+    """A learned lung for each lung, stacked."""
     keys = jr.split(jr.fold_in(key, 2), train.pressure.shape[0])
     parts = zip(unstack(train), keys, strict=True)
     options |= dict(teacher_steps=size.teacher_steps, steps=size.simulator_steps)
@@ -117,7 +117,7 @@ def learned(
 def fitted(
     name: str, train: lung.Breaths, size: Size, key: PRNGKey, **options: Any
 ) -> lung.LungModel:
-    """Models of a kind, stacked, fitted to the breaths of each lung."""
+    """Models of one kind, fitted to the breaths of each lung and stacked."""
     kind = KINDS[name]
     keys = jr.split(jr.fold_in(key, 4), train.pressure.shape[0])
     sensor = train.dt[0], size.sensor_delay
@@ -137,8 +137,9 @@ def fitted(
 def closed_loop(
     envs: Environment, controllers: Any, pips: Array, keys: PRNGKey, horizon: int
 ) -> tuple[Array, Array, Trajectory]:
-    """Errors over an inspiration and the highest pressures of a controller in each
-    lung, and the breaths, shape `(lungs, keys, pips)`; controllers stacked."""
+    """Run the controller of each lung, which are stacked. Returns the errors over an
+    inspiration, the highest pressures, and the breaths, of shape
+    `(lungs, keys, pips)`."""
 
     def in_lung(env, controller):
         def one(pip, key):
@@ -155,8 +156,8 @@ def closed_loop(
 def closed_loop_errors(
     envs: Environment, models: dict[str, Any], controllers: Any
 ) -> dict[str, np.ndarray]:
-    """The mean distance of the pressures in each simulator from those in the lung,
-    under the same controller and without noise, by kind: shape `(lungs,)`."""
+    """The mean distance between the pressures in each simulator and in the lung, under
+    the same controller and without noise. By kind, of shape `(lungs,)`."""
     waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
     pips, keys = jnp.asarray(TRAIN_PIPS), jr.key(0)[None]

@@ -14,32 +14,33 @@ from ..._module import load, save
 
 
 TRAIN_PIPS = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
-"""Peak pressures that controllers are trained at."""
+"""The peak pressures at which controllers are trained [cmH2O]."""
 TEST_PIPS = (12.5, 17.5, 22.5, 27.5, 32.5)
 SHOWN = 27.5
-"""The peak pressure of the breaths in the figures, one of those."""
+"""The peak pressure of the breaths in the figures, one of `TEST_PIPS` [cmH2O]."""
 INSPIRATION = 29
-"""Steps of an inspiration, from which lungs are learned."""
+"""The number of steps of an inspiration, from which lungs are learned."""
 BREATH = 100
-"""Steps of a whole breath."""
+"""The number of steps of a whole breath."""
 ABORT = 60.0
-"""The pressure that no controller is to reach [cmH2O]."""
+"""The pressure that no controller may exceed [cmH2O]."""
 LUNGS = tuple((R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))
-"""Lungs of the public data set, (R, C)."""
+"""The lungs of the public data set, (R, C)."""
 BETWEEN = ((10.0, 15.0), (10.0, 35.0), (35.0, 15.0), (35.0, 35.0))
-"""Lungs between those that are trained on, (R, C)."""
+"""Lungs between those of the training, (R, C)."""
 SENSOR_DELAY = 2
-"""Samples that the sensor is late."""
+"""The delay of the sensor, in samples."""
 NOISE = 0.2
-"""The standard deviation of what the sensor adds [cmH2O]."""
+"""The standard deviation of the noise of the sensor [cmH2O]."""
 
 
 class Size(NamedTuple):
     """The sizes of a study; the full one by default.
 
-    `shared_network` are hidden units of the network for all lungs, and how many
-    controls it is given; `tuned` is how many PIDs with feed-forward are drawn;
-    `extras` are those rows that the claims do not need.
+    - `shared_network`: the hidden units of the network for all lungs, and the number of
+        controls among its inputs.
+    - `tuned`: the number of random PIDs with feed-forward.
+    - `extras`: whether to run the rows that the claims do not need.
     """
 
     breaths: int = 480
@@ -95,12 +96,12 @@ class Stages:
     **Arguments:**
 
     - `out`: the folder.
-    - `settings`: what the study is of; a folder holds one study.
-    - `say`: what to do with a line of text.
-    - `progress`: whether trainings show a bar.
+    - `settings`: the settings of the study. A folder holds one study.
+    - `say`: a function that gets each line of text.
+    - `progress`: whether trainings show a progress bar.
 
-    **Raises:** `ValueError` if the folder holds a study with other settings, or one
-        whose settings are damaged.
+    **Raises:** `ValueError` if the folder holds a study with other settings, or with
+        damaged settings.
     """
 
     out: Path
@@ -131,13 +132,13 @@ class Stages:
     def training(
         self, name: str, words: str, train: Callable[..., Any], *args: Any
     ) -> Any:
-        """A stage that trains: what `train` returns for the arguments and the options
-        of `fit`. Its checkpoints are kept until it is done."""
+        """Run a stage that calls `train` with `args` and options of `fit`. Its
+        checkpoints are kept until it is done."""
         options = dict(checkpoint=self.out / f"{name}.fit", progress=self.progress)
         return self.stage(name, words, lambda: train(*args, **options))
 
     def stage(self, name: str, words: str, make: Callable[[], Any]) -> Any:
-        """The value of `make()`; if it was made before, from its file."""
+        """The value of `make()`, or the stored value if the stage was done before."""
         path = self.out / f"{name}.dlx"
         if path.exists():
             stored = load(path)
@@ -155,7 +156,7 @@ class Stages:
         return value
 
     def write(self, name: str, text: str) -> None:
-        """Write a file whole or not at all."""
+        """Write a file, completely or not at all."""
         with replaced(self.out / name) as file:
             file.write(text.encode())
 

@@ -1,4 +1,4 @@
-"""The whole study in one command: breaths, simulators, PIDs, controllers, a report."""
+"""The whole study: breaths, simulators, PIDs, controllers and a report."""
 
 import hashlib
 import importlib.metadata
@@ -40,42 +40,44 @@ def lung_study(
     say: Callable[[str], Any] = print,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Learn simulators of lungs from breaths, and controllers in the simulators;
-    evaluate them on the lungs themselves, beside the best PIDs.
+    """Learn simulators of lungs from breaths, and train controllers in the simulators.
 
-    The lungs are those of the task `lung/double_compartment`, with the nine resistances
-    and compliances of the public data set: valves that lag, a sensor that is two
-    samples late and adds noise of 0.2 cmH2O. With `data`, the breaths are those of a
-    file; then what stands in for the lungs themselves is a grey-box lung fitted to the
-    same breaths, and there are no lungs between. Of the file's ventilator are taken for
-    granted: that its sensor is `sensor_delay` samples late and as noisy as ours, that
-    it breathes from a PEEP of about 5 cmH2O, and, in all but the learned lungs, that
-    its valves are ours.
+    The controllers are then tested in the lungs themselves, beside the best PIDs. The
+    lungs are those of the task `lung/double_compartment`, with the nine pairs of
+    resistance and compliance in the public data set. Their valves lag, and their sensor
+    is two samples late and adds noise of 0.2 cmH2O.
 
-    Each part is written to the folder when it is done, so that a study that was cut off
-    goes on from there.
+    With `data`, the breaths come from a file. The lungs themselves are then unknown, so
+    grey-box lungs that are fitted to the same breaths stand in for them, and no lungs
+    in between are tested. It is assumed that the sensor of the ventilator is
+    `sensor_delay` samples late with noise of 0.2 cmH2O, that the PEEP is about 5 cmH2O,
+    and, except for the learned lungs, that the valves are those of
+    [`delucax.lung.Valves`][].
+
+    Each part is stored in the folder when it is done, so that an interrupted study
+    continues there.
 
     **Arguments:**
 
-    - `out`: the folder to write to, `"lung"` by default. In it: `report.csv`,
+    - `out`: the folder to write to, `"lung"` by default. It gets `report.csv`,
         `simulators.csv`, `summary.json`, figures, `breath.gif`, the learned lungs
-        (`simulators.dlx`) and those controllers that stayed below the abort limit
+        (`simulators.dlx`), and the controllers that stayed below the abort limit
         (`controllers/*.dlx`), which `delucax.load` reads.
-    - `small`: two lungs and little of everything, in less than a minute; false by
-        default.
+    - `small`: whether to study two lungs with short trainings, in about a minute;
+        `False` by default.
     - `data`: a file that [`delucax.lung.read_breaths`][] reads; none by default.
-    - `seeds`: how many controllers of each kind are trained; 3 by default, and 1 if
+    - `seeds`: the number of controllers of each kind to train; 3 by default, or 1 with
         `small`.
-    - `sensor_delay`: how many samples late the sensor is, that of the file's ventilator
-        or of ours; 2 by default.
-    - `say`: what to do with a line of text; `print` by default.
-    - `progress`: whether trainings show a bar; true by default.
+    - `sensor_delay`: the delay of the sensor in samples, also of the sensor in `data`;
+        2 by default.
+    - `say`: a function that gets each line of text; `print` by default.
+    - `progress`: whether trainings show a progress bar; `True` by default.
 
     **Returns:** the rows of the report, dictionaries.
 
     **Raises:** `ValueError` if an argument is invalid, the folder holds a study with
-        other settings, a file in it is damaged, or the data are not what they should
-        be; `OSError` if a file cannot be read or written.
+        other settings, a file in it is damaged, or the data are invalid; `OSError` if a
+        file cannot be read or written.
 
     !!! example
 
@@ -91,7 +93,7 @@ def lung_study(
     recorded = None if data is None else lung.read_breaths(data)
     source = None
     if data is not None:
-        # By its name and content: with another content it is another study.
+        # The settings hold a hash, because a file with other content is another study.
         digest = hashlib.sha256(Path(data).read_bytes()).hexdigest()[:16]
         source = f"{Path(data)}, SHA-256 {digest}"
     version = importlib.metadata.version("delucax")
@@ -138,7 +140,7 @@ def lung_study(
         between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
-        # What no controller was trained in stands in for the lungs.
+        # Models in which no controller was trained stand in for the lungs.
         options: Any = dict(waveform=waveform, noise=NOISE, horizon=BREATH)
         boxes = unstack(models["grey box"])
         envs = stack([lung.learned_lung(box, **options) for box in boxes])
