@@ -284,8 +284,9 @@ class experiment:  # noqa: N801
         *,
         ids: Sequence[str] | Callable[[Any], str] | None = None,
     ) -> Callable[[Any], Experiment]:
-        """Call the function with each of `values`. Stacked decorators give all
-        combinations.
+        """Call the function with each of `values`.
+
+        Stacked decorators give all combinations.
 
         **Arguments:**
 

@@ -232,8 +232,9 @@ class Bootstrap:
     def paired(
         self, groups: Sequence[np.ndarray], ratio: bool = False
     ) -> tuple[float, float, float]:
-        """The statistic of the first members of pairs minus the statistic of the second
-        members, and its interval.
+        """The difference or ratio of the statistic between the members of pairs.
+
+        It is that of the first members minus, or over, that of the second members.
 
         **Arguments:**
 

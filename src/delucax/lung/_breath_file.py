@@ -1,5 +1,4 @@
-"""Reads and writes breaths as comma-separated values, in the format of a public data
-set of a ventilator."""
+"""Reads and writes breaths as comma-separated values, like a public data set."""
 
 import array
 import csv
@@ -31,14 +30,14 @@ def read_breaths(
     resistances: Sequence[float] = RESISTANCES,
     compliances: Sequence[float] = COMPLIANCES,
 ) -> Breaths:
-    """Read the inspirations of a file like the "Ventilator Pressure Prediction" data
-    set.
+    """Read the inspirations of recorded breaths from a file.
 
-    The columns are `id`, `breath_id`, `R` [cmH2O s/L], `C` [mL/cmH2O], `time_step` [s],
-    `u_in` (0 to 100 %), `u_out` (0 or 1) and `pressure` [cmH2O], in any order. The rows
-    of a breath follow each other. An inspiration ends when `u_out` is first 1. The
-    steps of the file are uneven, so each inspiration is sampled again every `dt`: the
-    pressure is interpolated linearly, and the controls are held.
+    The file has the columns of the "Ventilator Pressure Prediction" data set: `id`,
+    `breath_id`, `R` [cmH2O s/L], `C` [mL/cmH2O], `time_step` [s], `u_in` (0 to 100 %),
+    `u_out` (0 or 1) and `pressure` [cmH2O], in any order. The rows of a breath follow
+    each other. An inspiration ends when `u_out` is first 1. The steps of the file are
+    uneven, so each inspiration is sampled again every `dt`: the pressure is
+    interpolated linearly, and the controls are held.
 
     Numbers may be quoted and blank lines are ignored. Comments are not allowed.
 

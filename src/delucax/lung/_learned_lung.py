@@ -41,10 +41,10 @@ def _moments(breaths: Breaths) -> tuple[Array, ...]:
 
 
 class LearnedLung(AbstractDynamics):
-    r"""A lung learned from breaths: a network of the last controls and pressures, with
-    extra networks for the first steps of an inspiration.
+    r"""A lung learned from breaths: a network of the last controls and pressures.
 
-    At step $k$ of an inspiration, the normalised pressure is predicted as
+    There are extra networks for the first steps of an inspiration. At step $k$ of an
+    inspiration, the normalised pressure is predicted as
 
     $$p_{k + 1} = p_k + \ell^\top z + \mathrm{network}(z)
     + o_k^\top \tanh(H_k z_\mathrm{all})$$

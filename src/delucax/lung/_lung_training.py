@@ -184,7 +184,7 @@ def breath_error(
     - `horizon`: the number of steps per episode, 29 by default: 0.87 s of an
         inspiration.
 
-    **Returns:** the mean of `|p - r|` over the steps of each episode [cmH2O], shape
+    **Returns:** the mean of $|p - r|$ over the steps of each episode [cmH2O], shape
         `(pips,)`. It is NaN if a run failed.
 
     **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure

@@ -184,8 +184,7 @@ class SimulatedRunner:
         return not pressure <= self.abort
 
     def cleanup(self) -> None:
-        """Close the inspiratory valve, let the air out for 3 s, and close the
-        expiratory valve."""
+        """Let the air out for 3 s, and then close both valves."""
         self.actuate(0.0, 1.0)
         for _ in range(round(3.0 / self.dt)):
             self.wait()

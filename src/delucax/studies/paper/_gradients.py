@@ -85,10 +85,11 @@ def policy_gradient(small: bool = False) -> Finding:
     ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
     ax.figure.legend(frameon=False, fontsize=7, loc="outside right center")
     notes = (
-        f"u = -K (angle, velocity), the angle not wrapped; {EPISODE} steps of 0.05 s "
-        f"from hanging at rest, torque at most 10; descent with rate {RATE} on the "
-        "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
-        f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
+        "The policy is u = -K (angle, velocity), with an angle that is not wrapped. An "
+        f"episode has {EPISODE} steps of 0.05 s from hanging at rest, with a torque of "
+        f"at most 10. Gradient descent has the rate {RATE}, on the mean cost of Gym, "
+        "because it gets stuck on the sum. Evolution strategies are antithetic, with "
+        f"{seeds} seeds for each setting and {steps} updates. Lines are medians."
     )
     medians = "rollouts, median", "cost at the end, median"
     columns = "gradient", "runs", "reach 2.0", *medians
@@ -223,12 +224,13 @@ def estimator_variance(small: bool = False) -> Finding:
     long.set(xlabel="horizon, steps", ylabel="variance")
     long.legend(frameon=False, fontsize=8)
     notes = (
-        f"Networks of one layer, {widths[0]} to {widths[-1]} wide, for the pendulum, "
-        f"{HORIZON} steps; {BUDGET} rollouts in an estimate, {draws} estimates; noise "
-        f"of {ON_WEIGHTS} on the weights, or {ON_CONTROLS} on the control. The "
-        "variance is the trace of the covariance. Against the horizon: a network of "
-        f"width 32, starts at any angle and speed, {DRAWN} rollouts an estimate; the "
-        "norms are those of single rollouts."
+        f"Networks of one hidden layer, {widths[0]} to {widths[-1]} wide, control the "
+        f"pendulum for {HORIZON} steps. An estimate takes {BUDGET} rollouts, and there "
+        f"are {draws} estimates. The noise is {ON_WEIGHTS} on the weights, or "
+        f"{ON_CONTROLS} on the control. The variance is the trace of the covariance. "
+        "Against the horizon, the network has width 32, the starts are at any angle "
+        f"and speed, and an estimate takes {DRAWN} rollouts. The norms are those of "
+        "single rollouts."
     )
     title = "Variance of gradient estimators"
     tables = {"Variance / squared gradient": rows, "Against the horizon": over}

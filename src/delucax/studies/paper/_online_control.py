@@ -129,13 +129,13 @@ def pendulum_shock(small: bool = False) -> Finding:
     axes[0].figure.legend(*labels, loc="outside right", frameon=False)
     notes = (
         "Lines that coincide are drawn over each other, the later ones thinner. "
-        "Without feedback rounding alone lets the pendulum fall. "
-        f"Upright, g = 10, explicit Euler of {DT} s, torque at most {BOUND:g}, Q = R = "
-        f"I, {steps} steps, {seeds} starts off upright; the shock, 0.2 sin(k / 2 pi) "
-        "on the velocity with a phase a seed, fills the middle third. MPC looks "
-        f"{AHEAD} steps ahead, LQR standing for the rest. Learners have their "
-        "defaults. The paper gives no settings. Ratios are of paired means, 95% "
-        "intervals."
+        "Without feedback, rounding alone lets the pendulum fall. The pendulum has "
+        f"g = 10, explicit Euler steps of {DT} s, a torque of at most {BOUND:g}, "
+        f"Q = R = I, {steps} steps, and {seeds} starts off upright. The shock, "
+        "0.2 sin(k / 2 pi) on the velocity with a phase for each seed, fills the "
+        f"middle third. MPC looks {AHEAD} steps ahead, and the cost-to-go of LQR "
+        "stands for the rest. Learners have their defaults. The paper gives no "
+        "settings. Ratios are of paired means, with 95% intervals."
     )
     title = "Adaptive control for the inverted pendulum"
     tables = {"Average cost": rows}
@@ -250,9 +250,10 @@ def lq_perturbations(small: bool = False) -> Finding:
     axes[0].set_ylabel("average cost so far")
     axes[0].legend(frameon=False)
     notes = (
-        f"The double integrator, Q = R = I, from rest, {steps} steps, {seeds} seeds "
-        "with the same perturbations for all; all at their defaults. The paper gives "
-        "neither matrices nor horizon. Intervals are 95%."
+        f"The double integrator starts from rest, with Q = R = I, {steps} steps and "
+        f"{seeds} seeds. All controllers have their defaults, and meet the same "
+        "perturbations. The paper gives neither matrices nor horizon. Intervals are "
+        "95%."
     )
     title = "Linear-quadratic control with adversarial perturbations"
     tables = {"Average cost": rows}

@@ -96,13 +96,13 @@ def oracle_complexity(small: bool = False) -> Finding:
     ax.set(xlabel="calls of the dynamics", ylabel="cost above the optimum")
     ax.legend(frameon=False, fontsize=8)
     notes = (
-        f"The planar quadrotor, {STEPS} steps of 0.05 s from (1, 1) at rest to the "
-        f"origin, from hovering. Central differences have the spacing {SPACING:g}; the "
-        "formula printed in the paper has a plus where the difference needs a minus. "
-        "Samples: the Jacobian is estimated by evolution strategies, from antithetic "
-        "Gaussian perturbations of the same size, drawn anew at each point; at most "
-        f"{iterations} iterations. "
-        "Calls are those of the whole solve, line search included."
+        f"The planar quadrotor flies {STEPS} steps of 0.05 s, from rest at (1, 1) to "
+        "the origin. The first guess is to hover. Central differences have the spacing "
+        f"{SPACING:g}. The formula printed in the paper has a plus where the difference "
+        "needs a minus. With samples, the Jacobian is estimated by evolution "
+        "strategies, from antithetic Gaussian perturbations of the same size, which "
+        f"are new at each point. There are at most {iterations} iterations. The calls "
+        "are those of the whole solve, with the line search."
     )
     title = "Dynamics calls of model-based planning"
     tables = {"One plan": rows}

@@ -55,9 +55,9 @@ def wall_clock(small: bool = False) -> Finding:
         for label, ratio, limit in cases
     ]
     notes = (
-        f"{steps:,} steps with all controls zero, compilation apart; mean and standard "
-        f"deviation over {runs} runs, and the median ratio. Gymnasium has become "
-        "several times as fast since the paper's 54 us."
+        f"The times are those of {steps:,} steps with zero control, without "
+        f"compilation: the mean and standard deviation over {runs} runs. Ratios are "
+        "medians. Gymnasium has become several times as fast since the paper's 54 us."
     )
     tables = {"Time a step": rows}
     return Finding("Simulation wall-clock time", claims, tables, notes=notes)
