@@ -132,8 +132,7 @@ class Runner:
         return self._traced(arguments, numbers)
 
     def _traced(self, arguments: dict[str, Any], numbers: Any) -> Any:
-        """Call the function for all seeds at once, and trace as many numbers as
-        possible.
+        """Call the function for all seeds, with as many numbers traced as possible.
 
         Tracing is tried with all numbers, then with floats only, then with no numbers.
         The choice is cached by the signature, so that it does not depend on the cases
