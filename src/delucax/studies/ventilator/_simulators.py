@@ -137,9 +137,8 @@ def fitted(
 def closed_loop(
     envs: Environment, controllers: Any, pips: Array, keys: PRNGKey, horizon: int
 ) -> tuple[Array, Array, Trajectory]:
-    """Run the controller of each lung, which are stacked. Returns the errors over an
-    inspiration, the highest pressures, and the breaths, of shape
-    `(lungs, keys, pips)`."""
+    """Run the controllers, one for each lung. Returns the errors over an inspiration,
+    the highest pressures, and the breaths, of shape `(lungs, keys, pips)`."""
 
     def in_lung(env, controller):
         def one(pip, key):
