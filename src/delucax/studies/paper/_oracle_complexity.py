@@ -98,11 +98,11 @@ def oracle_complexity(small: bool = False) -> Finding:
     notes = (
         f"The planar quadrotor flies {STEPS} steps of 0.05 s, from rest at (1, 1) to "
         "the origin. The first guess is to hover. Central differences have the spacing "
-        f"{SPACING:g}. The formula in the paper has a plus where it needs a minus. With "
-        "samples, the Jacobian is estimated by evolution strategies, from antithetic "
-        "Gaussian perturbations of the same size, which are new at each point. There "
-        f"are at most {iterations} iterations. The calls are those of the whole solve, "
-        "with the line search."
+        f"{SPACING:g}. The formula in the paper has a plus where it needs a minus. "
+        "With samples, the Jacobian is estimated by evolution strategies, from "
+        "antithetic Gaussian perturbations of the same size, which are new at each "
+        f"point. There are at most {iterations} iterations. The calls are those of the "
+        "whole solve, with the line search."
     )
     title = "Dynamics calls of model-based planning"
     tables = {"One plan": rows}
