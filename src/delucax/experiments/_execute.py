@@ -22,9 +22,10 @@ from ._experiment import arguments_of, Experiment
 from ._store import RESERVED
 
 
-# The most compiled programs to keep: a sweep over a static value would fill the memory.
+# The largest number of compiled programs to keep. A sweep over a static value would
+# otherwise fill the memory.
 _PROGRAMS = 128
-# The most characters of an error or a traceback to store.
+# The largest number of characters of an error or a traceback to store.
 _LONGEST = 8000
 # The types of numbers to trace, tried in this order.
 _TRACED_KINDS = (bool, int, float, complex), (float, complex), ()

@@ -14,7 +14,7 @@ from ._results import Results
 from ._statistics import Bootstrap, interquartile_mean, is_number
 
 
-# The most panels of a figure, and the most cases of a panel.
+# The largest number of panels in a figure, and of cases in a panel.
 _PANELS, _CASES = 30, 60
 
 

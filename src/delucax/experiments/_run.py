@@ -80,8 +80,8 @@ def run(
     - `mesh`: a `jax.sharding.Mesh`. The seeds of each case are spread over its first
         axis. None by default; only for one worker.
     - `fresh`: whether to run cases that are already stored; `False` by default.
-    - `retry`: whether to run cases again that raised an error, expected or not; `False`
-        by default.
+    - `retry`: whether to run again the cases that raised an error, expected or not;
+        `False` by default.
     - `progress`: whether to show the progress of the run and of each worker; `True` by
         default.
 

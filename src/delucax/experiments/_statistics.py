@@ -234,7 +234,8 @@ class Bootstrap:
     ) -> tuple[float, float, float]:
         """The difference or ratio of the statistic between the members of pairs.
 
-        It is that of the first members minus, or over, that of the second members.
+        This is the statistic of the first members minus, or over, the statistic of the
+        second members.
 
         **Arguments:**
 
