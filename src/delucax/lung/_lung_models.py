@@ -51,7 +51,7 @@ class LungModel(eqx.Module):
         ```
 
         ```text
-        Array([ 5. ,  5. ,  5. ,  9.5, 10.9], dtype=float32)
+        Array([ 5. ,  5. ,  5. ,  9.5, 11.5], dtype=float32)
         ```
     """
 
