@@ -1,4 +1,4 @@
-"""Controllers, plants and functions as programs in C."""
+"""Export of controllers, plants and functions to C, and loading of that C."""
 
 from ._c import c as c
 from ._load import load as load

@@ -1,7 +1,7 @@
-"""Programs as nodes in blocks, and the elimination of dead code.
+"""A program as blocks of nodes, and the elimination of dead code.
 
-Loops and branches have blocks of their own, which may read the values of the blocks
-around them.
+The body of a loop is a block of its own, and so is each branch of a choice. It may read
+the values of the blocks around it.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from ._keys import as_words
 
 
 class Const:
-    """A known array, of their words where it is one of keys."""
+    """A known array. Random keys are stored as their words."""
 
     __slots__ = ("dtype", "shape", "value")
 
@@ -23,8 +23,8 @@ class Const:
 
 
 class Var:
-    """An array that is computed. `weight` counts its uses, one in a loop twice;
-    `remaining` counts those that are still to be written."""
+    """An array that is computed at run time. `weight` counts its uses, and a use in a
+    loop twice. `remaining` counts the uses that are not written yet."""
 
     __slots__ = ("depth", "dtype", "remaining", "shape", "weight")
 
@@ -37,7 +37,7 @@ Atom = Const | Var
 
 
 class Node:
-    """An operation. `where` says which line of Python asked for it."""
+    """An operation. `where` names the line of Python that it comes from."""
 
     __slots__ = ("ins", "op", "outs", "params", "where")
 
@@ -47,13 +47,13 @@ class Node:
 
     @property
     def blocks(self) -> "list[Block]":
-        """The bodies of a loop, or the branches of a choice."""
+        """The condition and the body of a loop, or the branches of a choice."""
         return self.params.get("blocks", [])
 
 
 class Block:
-    """Nodes in order, from `params` to `outs`. `draws`: whether some may draw random
-    numbers."""
+    """Nodes in order, with the inputs `params` and the outputs `outs`. `draws` says
+    whether they may draw random numbers."""
 
     def __init__(self, parent: "Block | None", repeats: bool, draws: bool = False):
         self.parent, self.repeats = parent, repeats
@@ -65,20 +65,20 @@ class Block:
         self.known: dict[Any, Sequence[Atom]] = {}
 
     def param(self, shape: Any, dtype: Any) -> Var:
-        """A new parameter."""
+        """Add an input."""
         var = Var(shape, dtype, self.depth)
         self.params.append(var)
         return var
 
 
 def eliminate_dead_code(block: Block) -> None:
-    """Remove the nodes that no result depends on, and what loops carry to no use."""
+    """Remove the nodes that no result depends on, and what loops carry unused."""
     _keep(block, set(), True)
 
 
 def _keep(block: Block, needed: set[Var], drops: bool) -> None:
-    """Add to `needed` what the results of a block depend on; with `drops`, remove
-    the rest."""
+    """Add to `needed` the variables that the results of a block depend on. With
+    `drops`, also remove the other nodes."""
     needed.update(a for a in block.outs if isinstance(a, Var))
     kept = []
     for node in reversed(block.nodes):
@@ -92,7 +92,7 @@ def _keep(block: Block, needed: set[Var], drops: bool) -> None:
                 _narrow(node, live, needed)
                 for inner in node.blocks:
                     _keep(inner, needed, True)
-            # What is left after that is of use.
+            # All that `_narrow` has left is used.
             used = range(len(node.ins)) if drops else live
             count = 0 if drops else _carried(node)
             needed.update(
@@ -113,8 +113,8 @@ def _carried(node: Node) -> int:
 
 
 def _live(node: Node, needed: set[Var]) -> set[int]:
-    """The indices of the carried values that are of use. What the body reads is added
-    to `needed`."""
+    """The indices of the carried values that are used. Adds to `needed` what the body
+    reads."""
     *tests, body = node.blocks
     count = _carried(node)
     for test in tests:
@@ -139,7 +139,7 @@ def _live(node: Node, needed: set[Var]) -> set[int]:
 
 
 def _narrow(node: Node, live: set[int], needed: set[Var]) -> None:
-    """Remove what a loop carries, reads or stacks to no use."""
+    """Remove what a loop carries, reads or stacks unused."""
     body, count = node.blocks[-1], _carried(node)
     ins = [
         k
@@ -161,7 +161,7 @@ def _narrow(node: Node, live: set[int], needed: set[Var]) -> None:
 
 
 def count_readers(block: Block) -> None:
-    """Count the readers of each value."""
+    """Count the readers of each variable: set `weight` and `remaining`."""
 
     def read(atom, block):
         if isinstance(atom, Var):
@@ -178,7 +178,7 @@ def count_readers(block: Block) -> None:
 
 
 def _repeats_within(block: Block | None, depth: int) -> bool:
-    """Whether a loop lies between the block and that depth."""
+    """Whether a loop lies between a block and a depth."""
     while block is not None and block.depth > depth:
         if block.repeats:
             return True

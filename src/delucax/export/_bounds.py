@@ -1,7 +1,8 @@
-"""How often a loop goes round at most.
+"""The largest number of rounds of a `while` loop.
 
-It counts its rounds in what it carries, and proceeds while the count is on one side of
-a number. The test may be in its condition, or in the round before, which sets a flag.
+It is known if the loop carries a counter, and goes on while the counter is on one side
+of a limit. The loop may test the counter in its condition. It may also test it in its
+body, and set a flag that the condition reads.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ class Definitions:
     def __init__(self, block: Block):
         self.made: dict[Var, Node] = {}
         self.carried: dict[Var, tuple[Atom, Atom]] = {}
-        """The first value of what a loop carries, and that after a round."""
+        """For each value that a loop carries: the first value, and the one after a round."""
         self._add(block)
 
     def _add(self, block: Block) -> None:
@@ -35,8 +36,8 @@ class Definitions:
 
 
 class Bound(NamedTuple):
-    """A loop whose rounds are bounded: its blocks, its first values, and the
-    definitions of all that it reads."""
+    """The bound of a loop: its condition and body, the first values of what it carries,
+    and the definitions of what it reads."""
 
     cond: Block
     body: Block
@@ -44,16 +45,17 @@ class Bound(NamedTuple):
     definitions: Definitions
 
     def rounds(self) -> int | None:
-        """The most rounds; `None` if they are not counted."""
+        """The largest number of rounds; `None` if no counter bounds it."""
         return self._while(self.cond, self.cond.outs[0], True)
 
     def _made(self, atom: Atom) -> Node | None:
         return None if isinstance(atom, Const) else self.definitions.made.get(atom)
 
     def _while(self, block: Block, atom: Any, value: bool) -> int | None:
-        """The round from which on a truth value is never this one."""
+        """The round from which on `atom` never has the truth value `value`; `None` if
+        that is unknown."""
         if atom in block.params and block is self.cond:
-            # A flag that the round before has set.
+            # A flag that the previous round has set.
             return self._while(
                 self.body, self.body.outs[block.params.index(atom)], value
             )
@@ -71,7 +73,7 @@ class Bound(NamedTuple):
         return self._counted(node, value, block is self.body)
 
     def _counted(self, test: Node, value: bool, is_late: bool) -> int | None:
-        """The rounds while a test has a value, if it is one of a count."""
+        """As `_while`, for a comparison of a counter with a limit."""
         op = test.op if value else _OPPOSITE.get(test.op, "")
         if op not in _TESTS:
             return None
@@ -84,7 +86,7 @@ class Bound(NamedTuple):
             k = self._counter(block, left)
         if k is None:
             return None
-        # In the body the count is that before the round, or that after it.
+        # The body tests the counter from before the round, or from after it.
         late = int(is_late and left in block.params)
         start, steps = self.starts[k], self._steps(k)
         if not isinstance(start, Const) or start.value.ndim or steps is None:
@@ -101,7 +103,7 @@ class Bound(NamedTuple):
         return max(exact + 1 + late, int(is_late))
 
     def _counter(self, block: Block, atom: Any) -> int | None:
-        """Which of the values that are carried it is."""
+        """The index of `atom` among the carried values; `None` if it is not carried."""
         if isinstance(atom, Const):
             return None
         for group in (block.params, self.body.outs if block is self.body else []):
@@ -112,7 +114,7 @@ class Bound(NamedTuple):
     def _limit(
         self, atom: Atom, sign: int, visited: tuple[Var, ...] = ()
     ) -> float | None:
-        """The largest that a number can be; the smallest if the sign is -1."""
+        """The largest value that `atom` can have; the smallest if `sign` is -1."""
         if isinstance(atom, Const):
             ends = atom.value.max, atom.value.min
             return float(ends[sign < 0]()) if atom.value.size else None
@@ -132,8 +134,8 @@ class Bound(NamedTuple):
         return sign * (min(known) if is_any else max(known))
 
     def _steps(self, k: int) -> tuple[float, float] | None:
-        """By how much the first round changes what is carried, and by how much each
-        later one."""
+        """The change of the carried value `k` in the first round, and in each later
+        round; `None` if it is unknown."""
         param, node = self.body.params[k], self._made(self.body.outs[k])
         if node is not None and node.op == "cond":
             node = self._counting(node, self.body.outs[k], param)
@@ -151,7 +153,7 @@ class Bound(NamedTuple):
             (b,) = node.ins
         first = later = b
         if not isinstance(b, Const) and b in self.body.params:
-            # Such as a flag that is set from the second round on.
+            # The step is carried too: a flag, say, that is set from the second round on.
             j = self.body.params.index(b)
             first, later = self.starts[j], self.body.outs[j]
         pair = [a.value for a in (first, later) if isinstance(a, Const)]
@@ -160,8 +162,8 @@ class Bound(NamedTuple):
         return turn * float(pair[0]), turn * float(pair[1])
 
     def _counting(self, node: Node, out: Any, param: Var) -> Node | None:
-        """The node that counts in one branch, if the other, which leaves the count as
-        it is, is taken in the last round alone."""
+        """The node that counts in one branch of a choice. `None` unless the other
+        branch leaves the counter unchanged, and only the last round takes it."""
         if len(node.blocks) != 2:
             return None
         at = node.outs.index(out)

@@ -1,4 +1,4 @@
-"""The entry: a function or a controller as a program in C."""
+"""The function `export.c`, which writes programs in C."""
 
 from pathlib import Path
 from typing import Any
@@ -32,52 +32,58 @@ def c(
 ) -> Report:
     """Write a controller, a plant or a function as a program in C.
 
-    `NAME.h` and `NAME.c` are written to `directory`: C99, which needs `math.h` alone.
-    The program takes no memory but the stack, has no recursion and no variable that
-    outlives a call, and ends all its loops after a number of rounds that the report
-    says. What does not depend on the inputs, such as weights, is in it as constants.
+    The files are `NAME.h` and `NAME.c` in `directory`. They are C99 and need no library
+    except the standard `math.h`. The program uses the stack only: it allocates no
+    memory. It has no recursion, and no variable that outlives a call. Every loop has a
+    bound. All that does not depend on the inputs, such as weights, becomes a constant.
 
-    Of a controller there are `NAME_init(state)`, `NAME_step(state, t, y, u)` and
-    `NAME_applied(state, u, cost)`, which do what its `init`, its call and its `applied`
-    do. A step returns 0, or a flag if its input or what it computes is not finite:
-    `NAME_BAD_INPUT` or `NAME_BAD_RESULT`. The control is the last good one then (zeros
-    before there is one), and the state stays as it was before the step. What raises an
-    error at run time in Python, such as `equinox.error_if`, gives `NAME_BAD_RESULT`.
+    A controller becomes three functions, which do what its `init`, `__call__` and
+    `applied` do: `NAME_init(state)`, `NAME_step(state, t, y, u)` and
+    `NAME_applied(state, u, cost)`. A step returns 0, or a flag if a number is not
+    finite: `NAME_BAD_INPUT` for an input, `NAME_BAD_RESULT` for a result. The control
+    is then `fallback`, and the state stays as it was before the step. A step in which
+    Python would raise an error, for example with `equinox.error_if`, returns
+    `NAME_BAD_RESULT`.
 
-    Of a function there is `NAME(inputs..., outputs...)`, which takes numbers by value
-    and arrays by pointers to their entries, the last index running fastest, writes its
-    outputs in every case, and returns the same flags. The arrays that it closes over
-    become constants. Of a plant that is its field or its step, a function of
-    `(t, x, u)`, and of `w` where the plant names its disturbances.
+    A function becomes `NAME(inputs..., outputs...)`. It takes numbers by value, and
+    arrays as pointers to their entries in row-major order. It always writes its
+    outputs, and returns the same flags. Arrays that it closes over become constants.
+
+    A plant becomes such a function: a system its vector field, and dynamics their step.
+    The inputs are `(t, x, u)`, and `w` if the disturbance enters the equations of the
+    plant.
 
     **Arguments:**
 
     - `function_or_controller`: a [`delucax.AbstractController`][], an
         [`delucax.AbstractSystem`][], an [`delucax.AbstractDynamics`][], or a function
         of arrays.
-    - `directory`: where the files go; it is made if need be.
-    - `name`: an identifier in C, with which all public names begin.
-    - `dtype`: `"float32"` or `"float64"`, of all real numbers; by default that of the
-        arrays in what is given. It need not be the one of this process.
-    - `example`: the inputs of a function, a tuple of arrays, numbers or
-        `jax.ShapeDtypeStruct`, or pytrees of them, of which the shapes count; of a
-        controller an observation, where its size cannot be found out.
-    - `fallback`: the control where a step fails, shape `(m,)`; by default the last good
-        one.
-    - `key`: a random key, for a controller that draws, such as
-        [`delucax.controllers.BPC`][]. The state holds its two words, and C draws the
-        numbers that JAX would: those of `init(key=key)`, each time it starts.
-    - `plant`: whose names and units the header of a controller tells; by default those
-        of a plant that the controller holds.
-    - `max_iterations`: the most rounds of each loop for which no bound is found. A loop
-        that would go on is left there, and the flag is `NAME_BAD_RESULT`.
+    - `directory`: the folder to write to. It is created if it does not exist.
+    - `name`: an identifier in C. All public names in the C begin with it.
+    - `dtype`: the type of all real numbers, `"float32"` or `"float64"`. By default it
+        is the type of the arrays in `function_or_controller` and `example`. It may
+        differ from the precision of JAX in this process.
+    - `example`: for a function, a tuple of its inputs: arrays, numbers,
+        `jax.ShapeDtypeStruct`, or pytrees of them. Only their shapes and types count.
+        For a controller, an observation; you need it only if its size cannot be found
+        out from the controller.
+    - `fallback`: the control of a step that fails, shape `(m,)`. By default it is the
+        control of the last step that succeeded, or zeros before the first.
+    - `key`: a random key, for a controller that draws random numbers, such as
+        [`delucax.controllers.BPC`][]. The state in C holds the two words of the key. C
+        draws the numbers that JAX would draw after `init(key=key)`, and the same ones
+        after each start.
+    - `plant`: a plant whose names and units are written into the header of a
+        controller. By default it is a plant that the controller holds.
+    - `max_iterations`: the most rounds of a loop for which no bound is found. A loop
+        that would need more rounds stops there, and the flag is `NAME_BAD_RESULT`.
 
     **Returns:** a [`delucax.export.Report`][].
 
-    **Raises:** `ValueError` for what cannot be written in C, such as eigenvalues,
-    calls of Python and random draws of a function, with the line of your code; for a
-    name that is no identifier; and for a directory that cannot be written. Then no file
-    is changed.
+    **Raises:** `ValueError` if something cannot be written in C, such as eigenvalues,
+    calls of Python, or random draws of a function; the message names the line of your
+    code. Also if `name` is not an identifier, or `directory` cannot be written to. No
+    file changes then.
 
     !!! example
 
@@ -94,14 +100,18 @@ def c(
             report = dlx.export.c(
                 lambda x: jnp.sum(x**2), folder, name="square", example=(jnp.ones(3),)
             )
+        report
+        ```
+
+        ```text
         ```
     """
     where = "export.c"
     if not isinstance(name, str) or not _file.is_public(name):
         raise ValueError(
             f"{where}: name must be an identifier in C of at most 63 letters, such as "
-            "'controller', that neither C and its headers use, nor the routines in the "
-            f"file, such as 'minimum_f32', got {name!r}."
+            "'controller', and must not be a name of C, of its headers or of a routine "
+            f"in the file, such as 'minimum_f32', got {name!r}."
         )
     folder = Path(as_path(directory, "directory", where))
     if key is not None:
@@ -137,7 +147,9 @@ def c(
         ):
             if given is not None:
                 raise ValueError(
-                    f"{where}: {label} is given, but there is no controller."
+                    f"{where}: {label} is given, but only a controller takes it, and "
+                    "function_or_controller is a "
+                    f"{type(function_or_controller).__name__}."
                 )
         given = _as_function(function_or_controller, example, where)
         function, example, labels, notes = given
@@ -151,7 +163,7 @@ def c(
 
 
 def _as_function(given: Any, example: Any, where: str) -> Any:
-    """A function, its example, the names of its arguments, and a comment."""
+    """The function to export, its example, the names of its arguments, and a comment."""
     if not isinstance(given, AbstractSystem | AbstractDynamics):
         if not isinstance(example, tuple | list):
             raise ValueError(
@@ -161,7 +173,9 @@ def _as_function(given: Any, example: Any, where: str) -> Any:
         kind = getattr(given, "__name__", type(given).__name__)
         return given, example, None, [f"The function {kind} in C, made by delucax.", ""]
     if example is not None:
-        raise ValueError(f"{where}: example is given, but a plant tells its sizes.")
+        raise ValueError(
+            f"{where}: example is given, but a plant knows its sizes: leave it out."
+        )
     n, m, k = given.state_size, given.control_size, given.disturbance_size
     sizes: list[Any] = [0.0, _zeros(n), _zeros(m)]
     labels = ["t", "x", "u"]
@@ -187,7 +201,7 @@ def _zeros(size: int) -> Any:
 
 
 class _Plant(eqx.Module):
-    """The function of a plant."""
+    """The vector field of a system, or the step of dynamics, as a function."""
 
     plant: Any
 

@@ -1,4 +1,4 @@
-"""The precision of a program: the arrays of a function in it, and JAX set to it."""
+"""The precision of a program: casts the arrays of a function, and sets JAX to it."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def dtype_of(tree: Any, given: Any, where: str) -> np.dtype:
-    """The type of the real numbers: the one that is given, or that of the arrays."""
+    """The type of the real numbers: `given`, or by default the type of the arrays."""
     if given is not None:
         name = getattr(given, "__name__", None) or str(given)
         if name not in ("float32", "float64"):
@@ -22,8 +22,8 @@ def dtype_of(tree: Any, given: Any, where: str) -> np.dtype:
     dtype = jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if dtype not in (np.float32, np.float64):
         raise ValueError(
-            f"{where}: dtype must be 'float32' or 'float64', which the arrays can be "
-            f"cast to with dtype=; they are {dtype}."
+            f"{where}: dtype must be 'float32' or 'float64', but the arrays are {dtype}. "
+            "Give dtype= to cast them."
         )
     return np.dtype(dtype)
 
@@ -41,7 +41,7 @@ def _is_real(leaf: Any) -> bool:
 
 
 def cast(tree: Any, dtype: np.dtype) -> Any:
-    """The tree with its real arrays in that precision."""
+    """The tree with its real arrays in the precision `dtype`."""
 
     def one(leaf):
         if _is_array(leaf) and _is_real(leaf) and leaf.dtype != dtype:
@@ -52,5 +52,5 @@ def cast(tree: Any, dtype: np.dtype) -> Any:
 
 
 def precision(dtype: np.dtype) -> Any:
-    """A context in which JAX computes in that precision; for this thread alone."""
+    """A context in which JAX computes in the precision `dtype`, in this thread only."""
     return jax.enable_x64(dtype == np.float64)

@@ -1,4 +1,4 @@
-"""The C compiler at hand, and what it made, on disk."""
+"""The C compiler, and the cache on disk of the libraries that it makes."""
 
 import hashlib
 import os
@@ -16,15 +16,15 @@ from .._programs import prune, user_folder
 
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 _COMPILERS = ("cc", "gcc", "clang")
-# Bytes that all libraries on disk may take.
+# The most bytes that all libraries on disk may take.
 _LIMIT = 2**28
 
 
 def find_compiler(compiler: str | None, where: str) -> list[str]:
-    """The command of a C compiler: the one that is given, that of the variable `CC`, or
-    the first of the usual names that is there.
+    """The command of a C compiler: the one that is given, else the environment variable
+    `CC`, else the first of the usual names that is installed.
 
-    **Raises:** `ValueError` if there is none.
+    **Raises:** `ValueError` if no compiler is found.
     """
     if compiler is not None and not isinstance(compiler, str):
         raise ValueError(
@@ -40,19 +40,19 @@ def find_compiler(compiler: str | None, where: str) -> list[str]:
     raise ValueError(
         f"{where}: no C compiler was found: looked for {', '.join(map(repr, sought))} "
         "on the path. Install one (Debian's package gcc, Xcode's command line tools), "
-        "or name one with `compiler` or the variable CC."
+        "or name one with `compiler` or the environment variable CC."
     )
 
 
 def shared_library(
     source: Path, command: Sequence[str], flags: Sequence[str], where: str
 ) -> Path:
-    """The shared library of a C file with a header of the same name beside it.
+    """The shared library of a C file, whose header has the same name.
 
-    It is kept among the user's caches, under a name that follows from what it was made
-    of, so that the same files are compiled once.
+    The library is kept in the user's cache. Its name is a hash of the files, the
+    compiler and the flags, so the same files are compiled only once.
 
-    **Raises:** `ValueError` with the compiler's words if it fails.
+    **Raises:** `ValueError` with the message of the compiler if it fails.
     """
     parts = [part.read_bytes() for part in (source.with_suffix(".h"), source)]
     about = os.stat(command[0])
@@ -65,7 +65,7 @@ def shared_library(
         folder.mkdir(parents=True, exist_ok=True)
         prune(folder, _LIMIT)
         building = tempfile.TemporaryDirectory(dir=folder)
-    except (OSError, RuntimeError):  # no home, or none that can be written to
+    except (OSError, RuntimeError):  # no home, or it is read-only
         folder = Path(tempfile.mkdtemp(prefix="delucax-"))
         library = folder / library.name
         building = tempfile.TemporaryDirectory(dir=folder)
@@ -79,5 +79,5 @@ def shared_library(
                 f"{where}: {command[0]} could not compile {source.name} with "
                 f"{' '.join(flags)}:\n{words}"
             )
-        os.replace(made, library)  # at once, for another process may do the same
+        os.replace(made, library)  # atomic: another process may do the same
     return library

@@ -1,4 +1,4 @@
-"""A controller in C: its state, and the functions that act on it."""
+"""The C of a controller: the struct of its state, and the functions that act on it."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +28,7 @@ from ._values import Scalars, Table, Value, View
 
 
 _LEAVE = "return"
-"""As if it were a variable that is needed, for it stands alone in its branch."""
+"""A `return` alone in its branch counts as writing this name, so that it is kept."""
 
 
 def export_controller(
@@ -41,7 +41,7 @@ def export_controller(
     plant: Any,
     most: int | None,
 ) -> Any:
-    """The header and the source of a controller, and what its report needs."""
+    """The header and the source of a controller, and the values that its report needs."""
     traced = TracedController(controller, dtype, example, key)
     (m,) = traced.controls
     if plant is not None:
@@ -49,7 +49,7 @@ def export_controller(
         if plant.control_size != m:
             raise ValueError(
                 f"export.c: plant must have {m} controls, as many as the controller "
-                f"gives, got {plant.control_size}."
+                f"returns, got {plant.control_size}."
             )
     if fallback is not None:
         fallback = np.asarray(finite_vector(fallback, m, "fallback", "export.c"), dtype)
@@ -111,8 +111,8 @@ def _members(traced: TracedController) -> list[Array]:
     for array, path in zip(traced.start, traced.paths, strict=True):
         if not is_supported(array.dtype):
             raise Unsupported(
-                f"export.c: state{path} cannot be exported: its type {array.dtype} "
-                "has no form in C."
+                f"export.c: state{path} cannot be exported, because C has no type "
+                f"for {array.dtype}."
             )
     names = _file.free_names(p.strip(".[]") or "memory" for p in traced.paths)
     return [
@@ -122,7 +122,7 @@ def _members(traced: TracedController) -> list[Array]:
 
 
 def _places(state: Sequence[Array]) -> list[Value]:
-    """The members of the state, as arrays."""
+    """The members of the struct `state`, as arrays."""
     places: list[Value] = []
     for array in state:
         name, dtype = f"state->{array.name}", np.dtype(array.dtype)
@@ -217,8 +217,8 @@ def _applied(traced, name, state, shared, most):
 def _changed(
     program: Program, traced: TracedController, places: Any, after: Any
 ) -> Any:
-    """The members of the state that change, their new values, and those of these that
-    must be finite, as they are at first."""
+    """The members of the state that change, their new values, and those new values that
+    must be finite: the ones of members that are finite at the start."""
     parts = [
         (place, ready(program, value), bool(np.all(np.isfinite(first))))
         for place, value, first in zip(places, after, traced.start, strict=True)
@@ -230,7 +230,7 @@ def _changed(
 
 
 def _is_same(place: Value, value: Value) -> bool:
-    """Whether a member of the state stays as it is."""
+    """Whether the new value of a member of the state is the old one."""
     if isinstance(place, View):
         return (
             isinstance(value, View)
@@ -243,7 +243,9 @@ def _is_same(place: Value, value: Value) -> bool:
 
 def _comment(controller, plant, traced, name, fallback) -> list[str]:
     (m,), p = traced.controls, traced.observations
-    answer = "fallback" if fallback is not None else "the last good control, or 0"
+    answer = "the fallback"
+    if fallback is None:
+        answer = "the last good one, or 0 before the first"
     lines = [
         f"{name}: a controller in C, made by delucax from a "
         f"{type(controller).__name__}.",
@@ -252,12 +254,12 @@ def _comment(controller, plant, traced, name, fallback) -> list[str]:
         f"  flag = {name}_step(&state, t, y, u);",
         f"  {name}_applied(&state, u, cost);",
         "",
-        "A step takes the time t and the observation y, and gives the control u. Then",
-        "applied is told the control that was really applied, and its cost.",
+        f"{name}_step takes the time t and the observation y, and writes the control u.",
+        f"Then pass to {name}_applied the control that was really applied, and its cost.",
         "",
-        "A step returns 0; or a flag if t or y, or what it computes, is not finite.",
-        f"The control is {answer} then, and the state is as before the step.",
-        "What applied computes is not kept either if it is not finite.",
+        f"{name}_step returns 0, or a flag if t, y or a result is not finite.",
+        f"The control is then {answer}, and the state does not change.",
+        f"{name}_applied does not change the state if a result is not finite.",
         *_named(controller, plant, m, p),
     ]
     if fallback is not None:
@@ -267,7 +269,7 @@ def _comment(controller, plant, traced, name, fallback) -> list[str]:
 
 
 def _named(controller: Any, plant: Any, m: int, p: int) -> list[str]:
-    """The names of controls and observations, where a plant is known."""
+    """The names of controls and observations, if a plant is known."""
     plants = [plant] if plant is not None else parts_of(controller, AbstractPlant)
     if not plants or plants[0].control_size != m:
         return []

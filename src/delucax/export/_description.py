@@ -1,4 +1,4 @@
-"""What a header says of its program, for a machine to read."""
+"""The description of a program that its header holds in a form for machines."""
 
 import json
 from pathlib import Path
@@ -9,10 +9,14 @@ _MARK = "delucax export:"
 
 
 class Array(NamedTuple):
-    """An array that goes in or out, or is kept.
+    """An input, an output, or a member of the state.
 
-    **Attributes:** `name` in C; `shape`; `dtype`, such as `"float64"`; `path`, where it
-    is in the controller's state or in what the function returns.
+    **Attributes:**
+
+    - `name`: its name in C.
+    - `shape`: its shape.
+    - `dtype`: its type, such as `"float64"`.
+    - `path`: its place in the state of the controller, or in what the function returns.
     """
 
     name: str
@@ -22,15 +26,19 @@ class Array(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What a header says of its program.
+    """The description of a program, as its header holds it.
 
-    **Attributes:** `name`; `kind`, `"controller"` or `"function"`; `dtype` of its real
-    numbers; `inputs`, `outputs` and `state`, tuples of arrays; `state_bytes`, the size
-    of its struct where each number lies at a multiple of its own size; `macro`, with
-    which the names of its macros begin.
+    **Attributes:**
 
-    The inputs of a controller are `t` and `y`, and its output is `u`. A function takes
-    its inputs, those without an axis by value, then a pointer for each output.
+    - `name`: the name of the program.
+    - `kind`: `"controller"` or `"function"`.
+    - `dtype`: the type of its real numbers.
+    - `inputs`, `outputs`, `state`: tuples of arrays. The inputs of a controller are `t`
+        and `y`, and its output is `u`. A function takes its inputs, numbers by value
+        and arrays by pointer, then a pointer for each output.
+    - `state_bytes`: the size of the struct of the state, if each number is aligned to
+        its own size.
+    - `macro`: the start of the names of its macros.
     """
 
     name: str
@@ -46,16 +54,16 @@ class Description(NamedTuple):
         return self.name.upper()
 
     def comment(self) -> str:
-        """A comment of C that `described` reads."""
+        """The comment in C that `described` reads."""
         text = json.dumps(self._asdict())
-        # A slash may be escaped in JSON, and no comment ends early.
+        # JSON may escape a slash. Without this, `*/` in a name would end the comment.
         return f"/* {_MARK} {text.replace('*/', '*' + chr(92) + '/')} */"
 
 
 def described(header: str | Path) -> Description:
-    """The description in a header, given its path.
+    """The description in the header at this path.
 
-    **Raises:** `ValueError` if there is none.
+    **Raises:** `ValueError` if the header has no description.
     """
     for line in Path(header).read_text(encoding="utf-8").splitlines():
         if line.startswith(f"/* {_MARK}"):

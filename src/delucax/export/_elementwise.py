@@ -1,7 +1,8 @@
-"""Operations on single entries: from the primitive of JAX to an expression of C.
+"""Operations on single entries: from a primitive of JAX to an expression of C.
 
-In a template `{0}`, `{1}` are the operands, `{f}` the suffix of the functions of
-`math.h`. What needs an operand twice is a routine.
+In a template, `{0}` and `{1}` are the operands, `{f}` is the suffix of the functions of
+`math.h`, and `@name` calls a routine. An operation that reads an operand twice is a
+routine, so that the operand is computed once.
 """
 
 import math
@@ -92,8 +93,8 @@ Operation = Callable[[list[Expr]], Expr]
 
 
 def operation(op: str, params: Any, dtypes: list[Any], out: Any, shared: Any) -> Any:
-    """The function that makes the expression of an entry, and its cost; `None` if the
-    operation is of another kind."""
+    """The function that makes the expression of an entry, and the cost of the operation.
+    `None` if the operation does not act on single entries."""
     out, kind = np.dtype(out), dtypes[0]
     if op in _COMPARED:
         return (lambda given: _compared(op, given)), 1
@@ -132,7 +133,7 @@ def _written(
     words = dict(f="f" if of == np.float32 else "", t="", u="")
     low, high = -math.inf, math.inf
     if of.kind in "iu":
-        # Shorter ones would be promoted to int, whose products may overflow.
+        # C would promote shorter types to int, and a product may overflow an int.
         bits = max(8 * of.itemsize, 32)
         words["t"], words["u"] = c_type(of), c_type(f"uint{bits}")
         low, high = _range(template, given, of)
@@ -142,7 +143,7 @@ def _written(
         if "({u})" in template and not (limits.min <= low and high <= limits.max):
             low, high = -math.inf, math.inf
         elif "({u})" in template:
-            # No overflow, so that the sum may be written as one.
+            # It cannot overflow, so the casts to and from unsigned are not needed.
             template = template.replace("({t})", "").replace("({u})", "")[1:-1]
     if "@" in template:
         for name in _routines_in(template):
@@ -160,12 +161,12 @@ def _routines_in(template: str) -> list[str]:
 
 
 def _is_call(template: str) -> bool:
-    """Whether it is one call of a function."""
+    """Whether the template is a single call of a function."""
     return template.endswith(")") and template[0].isalpha() and " / " not in template
 
 
 def _range(template: str, given: list[Expr], of: np.dtype) -> Any:
-    """Between which the result lies."""
+    """The ends of the interval in which the result lies."""
     (a, b), *more = ((e.low, e.high) for e in given)
     if not more:
         return -math.inf, math.inf
@@ -194,7 +195,7 @@ def _compared(op: str, given: list[Expr]) -> Expr:
         a, b = a._replace(low=max(a.low, 0)), b._replace(low=max(b.low, 0))
     answer = None
     if a.dtype.kind in "iub":
-        # Loop counters are compared with their bounds.
+        # The result is often known: loop counters are compared with their bounds.
         less, above = a.high < b.low, a.low > b.high
         if less or above:
             answer = {"eq": 0, "ne": 1, "lt": less, "le": less}.get(op, above)

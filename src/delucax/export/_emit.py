@@ -1,4 +1,4 @@
-"""Statements of C as they are written: scopes, variables, memory, loops."""
+"""The writer of statements in C: scopes, variables, memory and loops."""
 
 import contextlib
 import itertools
@@ -13,7 +13,7 @@ from ._values import Buffer, Formula, Scalars, Table, Value, View
 
 
 class Line:
-    """A statement. It is left out if nothing reads what it writes."""
+    """A statement. It is removed later if nothing reads what it writes."""
 
     __slots__ = ("reads", "text", "writes")
 
@@ -22,7 +22,7 @@ class Line:
 
 
 class Group:
-    """A loop, or a choice: scopes with a line before each."""
+    """A loop or a choice: scopes, each with a header line."""
 
     __slots__ = ("headers", "reads", "scopes")
 
@@ -39,7 +39,7 @@ class Scope:
         self.cost = 0
 
     def is_within(self, other: "Scope") -> bool:
-        """Whether it is `other`, or inside."""
+        """Whether this scope is `other`, or lies inside it."""
         scope: Scope | None = self
         while scope is not None:
             if scope is other:
@@ -49,10 +49,13 @@ class Scope:
 
 
 class Writer:
-    """Writes the statements of one function of C.
+    """Writes the statements of one function in C.
 
-    **Arguments:** `unroll`: arrays of up to so many entries are variables, and no
-    memory. `shared`: names, tables and routines of the file.
+    **Arguments:**
+
+    - `unroll`: arrays with at most this many entries become variables; larger ones
+        become memory.
+    - `shared`: the tables and routines of the file.
     """
 
     def __init__(self, unroll: int, shared: "Shared"):
@@ -61,7 +64,7 @@ class Writer:
         self.buffers: list[Buffer] = []
         self._count = itertools.count()
         self.failed: Expr | None = None
-        """Whether an error was raised, in a program that can raise one."""
+        """The flag of a raised error; `None` if the program cannot raise one."""
         self._stored: dict[Any, tuple[Scope, Value, View]] = {}
 
     # Statements
@@ -74,11 +77,11 @@ class Writer:
         self.scope.items.append(Line(text, reads, writes))
 
     def name(self, letter: str) -> str:
-        """A new name."""
+        """A new name that begins with `letter`."""
         return f"{letter}{next(self._count)}"
 
     def define(self, expr: Expr) -> Expr:
-        """A variable with the value of an expression."""
+        """A new constant with the value of an expression."""
         if expr.value is not None or expr.text.isidentifier():
             return expr
         name = self.name("v")
@@ -87,11 +90,11 @@ class Writer:
         return expr._replace(text=name, reads=frozenset([name]), cost=0)
 
     def copy_of(self, expr: Expr) -> Expr:
-        """A variable of its own with the value of another."""
+        """A new constant with the value of a variable."""
         return self.define(expr._replace(text=f"({expr.text})"))
 
     def variable(self, dtype: Any, start: Expr | None = None) -> Expr:
-        """A variable that changes."""
+        """A new variable that may change."""
         name = self.name("v")
         if start is None:
             self.line(f"{c_type(dtype)} {name};", NOTHING, name)
@@ -110,13 +113,13 @@ class Writer:
         return self.failed
 
     def assign(self, variable: Expr, expr: Expr) -> None:
-        """Change a variable."""
+        """Assign a new value to a variable."""
         if expr.text != variable.text:
             text = f"{variable.text} = {bare(expr.text)};"
             self.line(text, expr.reads, variable.text, expr.cost)
 
     def store(self, view: View, indices: Sequence[Index], expr: Expr) -> None:
-        """Write an entry."""
+        """Write an entry of an array in memory."""
         target = view.at(tuple(indices))
         reads = expr.reads | (target.reads - {view.buffer.name})
         text = f"{target.text} = {bare(expr.text)};"
@@ -145,7 +148,7 @@ class Writer:
             yield tuple([stack.enter_context(self.loop(n)) for n in shape])
 
     def choose(self, which: Expr, count: int, inside: Any) -> None:
-        """`inside(k)` for the k-th case; the first and last are for what is beyond."""
+        """Write `inside(k)` for case `k`. A number beyond the cases takes the nearest."""
         which = self.define(which)
         headers, scopes, outside = [], [], self.scope
         for k in range(count):
@@ -167,7 +170,7 @@ class Writer:
     # Memory
 
     def buffer(self, dtype: Any, size: int) -> Buffer:
-        """New memory."""
+        """New memory for `size` entries."""
         buffer = Buffer(self.name("b"), dtype, size, self.scope, True)
         self.buffers.append(buffer)
         return buffer
@@ -177,7 +180,7 @@ class Writer:
         return View(self.buffer(dtype, int(np.prod(shape, dtype=int))), shape)
 
     def stored(self, value: Value) -> View:
-        """The array in memory."""
+        """The array as a view of memory, to which it is written if need be."""
         if isinstance(value, View):
             return value
         if isinstance(value, Table):
@@ -185,24 +188,24 @@ class Writer:
             name = self.shared.table(least)
             buffer = Buffer(name, value.dtype, least.size, None, False)
             return View(buffer, value.shape, strides)
-        # What was stored in a branch is not there after it.
+        # A copy that was stored in a branch does not exist outside that branch.
         if id(value) in self._stored:
             scope, same, view = self._stored[id(value)]
             if same is value and self.scope.is_within(scope):
                 return view
         view = self.copied(value)
-        # Others may read it again, so that nothing may change it.
+        # The copy may be read again, so nothing may change it.
         view.buffer.is_own = False
         self._stored[id(value)] = self.scope, value, view
         return view
 
     def packed(self, value: Value) -> View:
-        """The array in memory, its entries one after another."""
+        """The array as a contiguous view of memory."""
         view = self.stored(value)
         return view if view.is_contiguous else self.copied(view)
 
     def copied(self, value: Value) -> View:
-        """A copy in memory of its own."""
+        """A copy of the array in new memory."""
         view = self.new_view(value.shape, value.dtype)
         self.fill(view, value)
         return view
@@ -226,7 +229,7 @@ class Writer:
             self.store(view, indices, value.at(indices))
 
     def copy(self, view: View, value: View) -> None:
-        """Copy memory."""
+        """Copy one contiguous view to another."""
         kind = c_type(value.dtype, stored=True)
         text = f"memcpy({view.pointer}, {value.pointer}, "
         reads = view.start.reads | value.start.reads | {value.buffer.name}
@@ -234,7 +237,7 @@ class Writer:
         self.line(f"{text}{value.size} * sizeof({kind}));", reads, target)
 
     def zeros(self, shape: Sequence[int], dtype: Any) -> View:
-        """Memory that is zero."""
+        """New memory for an array of zeros."""
         view = self.new_view(shape, dtype)
         kind = c_type(dtype, stored=True)
         text = f"memset({view.pointer}, 0, {view.size} * sizeof({kind}));"
@@ -242,7 +245,7 @@ class Writer:
         return view
 
     def place(self, shape: Sequence[int], dtype: Any) -> Value:
-        """Where a value that changes is kept: variables, or memory."""
+        """The place of an array that may change: variables, or memory."""
         size = int(np.prod(shape, dtype=int))
         if size > self.unroll:
             return self.new_view(shape, dtype)
@@ -250,7 +253,7 @@ class Writer:
         return Scalars(shape, dtype, parts, frozenset())
 
     def put(self, place: Value, value: Value) -> None:
-        """Set what is kept."""
+        """Set the array at a place."""
         if isinstance(place, View):
             if value is not place:
                 self.fill(place, value)
@@ -259,7 +262,7 @@ class Writer:
             self.assign(variable, expr)
 
     def put_all(self, places: Sequence[Value], values: Sequence[Value]) -> None:
-        """Set all at once: each value may read what the others change."""
+        """Set several arrays at once. A value may read the places that the others set."""
         pairs = [
             (p, v)
             for p, v in zip(places, values, strict=True)
@@ -278,7 +281,7 @@ class Writer:
                 )
                 others = changed_names - own if value.size == 1 else changed_names
                 parts = [self.define(e) if e.reads & others else e for e in value.parts]
-                # A variable is copied, as it may change before it is read.
+                # A variable is copied, because it may change before it is read.
                 parts = [self.copy_of(e) if e.text in others else e for e in parts]
                 value = Scalars(value.shape, value.dtype, parts, frozenset())
             elif isinstance(place, Scalars):
@@ -301,7 +304,7 @@ class Writer:
     # Values
 
     def formula(self, shape: Any, dtype: Any, at: Any, of: Iterable[Value], cost: int):
-        """A formula, whose few entries are written out."""
+        """An array that is a function of its indices. A small one is written out."""
         shape, of = tuple(shape), list(of)
         if int(np.prod(shape, dtype=int)) <= self.unroll:
             corners = itertools.product(*map(range, shape))
@@ -311,12 +314,12 @@ class Writer:
         return Formula(shape, dtype, at, of, cost)
 
     def indexable(self, value: Value) -> Value:
-        """An array that loops can read."""
+        """The array in a form that can be read inside a loop."""
         is_few = isinstance(value, Scalars) and value.size > 1
         return self.stored(value) if is_few else value
 
     def cheap(self, value: Value) -> Value:
-        """An array of which reading an entry costs no operation."""
+        """The array in a form in which reading an entry costs no operation."""
         if isinstance(value, Formula) and value.cost:
             return self.stored(value)
         if isinstance(value, Scalars):
@@ -325,7 +328,7 @@ class Writer:
         return value
 
     def settled(self, value: Value, weight: int) -> Value:
-        """A value for so many readers."""
+        """The array in a form for `weight` readers: costly entries are computed once."""
         if isinstance(value, Formula):
             return self.copied(value) if weight > 1 and value.cost else value
         if isinstance(value, Scalars):
@@ -338,35 +341,35 @@ class Writer:
 
 
 class Shared:
-    """What the functions of a file have in common: tables and routines."""
+    """The tables and the routines that the functions of a file share."""
 
     def __init__(self):
         self.tables: dict[Any, tuple[str, np.ndarray]] = {}
         self.routines: dict[str, str] = {}
 
     def table(self, array: np.ndarray) -> str:
-        """The name of a known array."""
+        """The name of the table of a known array."""
         key = str(array.dtype), array.size, array.tobytes()
         if key not in self.tables:
             self.tables[key] = f"c{len(self.tables)}", array
         return self.tables[key][0]
 
     def routine(self, name: str, dtype: Any, out: Any = None) -> str:
-        """The name of a routine."""
+        """The name of a routine, which is added to the file."""
         name, text = routine(name, dtype, out)
         self.routines[name] = text
         return name
 
 
 def same_memory(a: Value, b: Value) -> bool:
-    """Whether both are one piece of memory."""
+    """Whether both arrays are the same view of memory."""
     if not (isinstance(a, View) and isinstance(b, View)) or a.buffer is not b.buffer:
         return False
     return (a.shape, a.strides, a.start) == (b.shape, b.strides, b.start)
 
 
 def bare(text: str) -> str:
-    """An expression without parentheses around the whole."""
+    """The expression without the parentheses around it, if there are any."""
     if not text.startswith("("):
         return text
     depth = 0
@@ -378,5 +381,5 @@ def bare(text: str) -> str:
 
 
 def numbers(array: np.ndarray) -> str:
-    """The entries of a known array."""
+    """The entries of a known array as text in C."""
     return ", ".join(literal(x, array.dtype).text for x in array.flat)

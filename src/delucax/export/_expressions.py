@@ -1,7 +1,7 @@
-"""Expressions of C: their text, their type, what they read, and what is known of them.
+"""Expressions of C: their text, their type, what they read, and their known bounds.
 
-An index is an affine function of loop counters, so that reads of neighbouring entries
-look so in C, and a compiler can make vectors of them.
+An index is an affine function of loop counters. So reads of neighbouring entries are
+visible in C, and a compiler can vectorise them.
 """
 
 import math
@@ -29,12 +29,12 @@ NOTHING: frozenset[str] = frozenset()
 
 
 def is_supported(dtype: Any) -> bool:
-    """Whether C has the type."""
+    """Whether the type can be written in C."""
     return str(dtype) in _LOCAL
 
 
 def c_type(dtype: Any, stored: bool = False) -> str:
-    """The type in C, of a variable or of the entries of an array."""
+    """The type in C: of a variable, or, if `stored`, of the entries of an array."""
     if stored and np.dtype(dtype).kind == "b":
         return "unsigned char"
     return _LOCAL[str(np.dtype(dtype))]
@@ -43,9 +43,14 @@ def c_type(dtype: Any, stored: bool = False) -> str:
 class Expr(NamedTuple):
     """An expression.
 
-    **Attributes:** `text`, which may stand anywhere a primary expression may; `reads`,
-    the variables and arrays in it; `cost`, its operations; `value`, if it is known;
-    `low` and `high`, between which an integer lies.
+    **Attributes:**
+
+    - `text`: its text, in parentheses if it needs them.
+    - `dtype`: its type.
+    - `reads`: the variables and arrays that it reads.
+    - `cost`: the number of its operations.
+    - `value`: its value, if it is known.
+    - `low`, `high`: the bounds of an integer.
     """
 
     text: str
@@ -58,12 +63,12 @@ class Expr(NamedTuple):
 
 
 def union(sets: Iterable[frozenset[str]]) -> frozenset[str]:
-    """The names in any of the sets."""
+    """The union of sets of names."""
     return frozenset().union(*sets)
 
 
 def literal(value: Any, dtype: Any) -> Expr:
-    """A number."""
+    """A known number as an expression."""
     dtype = np.dtype(dtype)
     value = dtype.type(value)
     kind = dtype.kind
@@ -78,7 +83,7 @@ def literal(value: Any, dtype: Any) -> Expr:
         elif kind == "u":
             text += "u"
         if number < 0:
-            # The most negative number is no literal of its type.
+            # C has no literal for the most negative integer.
             least = number == np.iinfo(dtype).min
             text = f"({text[1:] if least else text})" if not least else _least(dtype)
         return Expr(text, dtype, value=number, low=number, high=number)
@@ -104,9 +109,9 @@ def _least(dtype: np.dtype) -> str:
 
 
 class Index(NamedTuple):
-    """`const + sum of coefficient * term`, the terms being integers in C.
+    """An index, `const + sum of coefficient * term`, where the terms are integers in C.
 
-    **Attributes:** `terms`: `(text, coefficient, low, high)` of each.
+    **Attributes:** `terms`: the tuple `(text, coefficient, low, high)` of each term.
     """
 
     const: int = 0
@@ -139,7 +144,7 @@ class Index(NamedTuple):
         return not self.terms
 
     def plus(self, other: "Index | int", times: int = 1) -> "Index":
-        """The sum with `times` an index."""
+        """The sum of this index and `times` another."""
         if isinstance(other, int | np.integer):
             return self._replace(const=self.const + int(other) * times)
         if times == 0:
@@ -153,7 +158,7 @@ class Index(NamedTuple):
         return Index(const, kept, self.reads | other.reads)
 
     def expr(self, dtype: Any) -> Expr:
-        """The index as a number."""
+        """The index as an expression."""
         if self.is_known:
             return literal(self.const, dtype)
         text = self.text
@@ -169,7 +174,7 @@ def known(number: int | np.integer) -> Index:
 
 
 def index_of(expr: Expr) -> Index:
-    """A whole number as an index."""
+    """An integer expression as an index."""
     if expr.value is not None:
         return Index(int(expr.value))
     return Index(0, ((expr.text, 1, expr.low, expr.high),), expr.reads)

@@ -1,5 +1,5 @@
-"""Factors of matrices, triangular systems, sorting and random bits: routines of C,
-called for each matrix, row or entry."""
+"""Operations that call a routine of C for each matrix, row or entry: factors of
+matrices, triangular systems, sorting and random bits."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from ._values import broadcast, Scalars
 
 
 def _call(e, name, dtype, writes, *arguments, cost):
-    """A call of a routine; arguments are numbers, views and offsets."""
+    """Write a call of a routine. Arguments are numbers, or pairs of a view and offset."""
     words, reads = [], NOTHING
     for argument in arguments:
         if isinstance(argument, tuple):
@@ -59,7 +59,7 @@ def triangular_solve(e, node, a, b):
     a, place = e.packed(a), e.copied(b)
     rows, columns = place.shape[-2:]
     left, lower = p["left_side"], p["lower"]
-    # X A = B is A' X' = B', and A' is A read the other way round.
+    # X A = B is A' X' = B'. To read A', swap the strides of A.
     turned = p["transpose_a"] == left
     strides = (1, n) if turned else (n, 1)
     lower = lower != turned
@@ -170,7 +170,7 @@ def sort(e, node, *xs):
 
 
 def threefry(e, node, *ins):
-    """Two random words of each entry, which the routine returns as one."""
+    """Two random words for each entry. The routine returns both in one integer."""
     shape, word = node.outs[0].shape, node.outs[0].dtype
     ins = [e.indexable(e.cheap(x)) if not e.is_few(node.outs[0]) else x for x in ins]
     name, long = e.shared.routine("threefry", word), np.dtype(np.uint64)

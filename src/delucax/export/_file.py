@@ -1,4 +1,4 @@
-"""The files of a program in C: their text, and writing both or none."""
+"""The header and the source of a program in C: their text, and how they are written."""
 
 import contextlib
 import keyword
@@ -48,22 +48,21 @@ _LIBRARY = frozenset(
 )
 _HEADERS = frozenset(["math", "string", "stdint", "stddef", "stdio", "stdlib"])
 _LONGEST = 63
-"""Letters of a name that C99 tells apart."""
+"""C99 tells names apart by this many letters."""
 _OWN = re.compile(r"[vbci][0-9]+|work_.*|.*_[fiub][0-9]+|.*_b")
 _MACROS = re.compile(r"(FP|M|MATH|SIZE|U?INT\w*)_[A-Z0-9_]+")
 
 
 def is_free(name: str) -> bool:
-    """Whether a name may be one in C."""
+    """Whether a name may be used inside a function in C."""
     simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
     taken = _OWN.fullmatch(name) or _MACROS.fullmatch(name)
     return simple and not _is_in(name, _RESERVED) and not taken
 
 
 def is_public(name: str) -> bool:
-    """Whether a program may have this name, whose functions others link with: one that
-    is free among those of C, its library and headers, and of the routines in the
-    file."""
+    """Whether a program may have this name. It must not be a name of C, of its library
+    and headers, or of a routine in the file, because other code links with it."""
     simple = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
     ours = re.fullmatch(r".*_[fiu](8|16|32|64)|work", name) is not None
     fits = simple and not ours and not _MACROS.fullmatch(name)
@@ -72,14 +71,14 @@ def is_public(name: str) -> bool:
 
 
 def _is_in(name: str, names: frozenset[str]) -> bool:
-    """Whether a name is taken: of most functions there are those of float and long
-    double."""
+    """Whether a name is taken, also as a variant of a function for `float` or `long
+    double`, such as `sinf`."""
     single = name[:-1] if name[-1:] in ("f", "l") else name
     return not names.isdisjoint((name, single))
 
 
 def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Names in C like those given, no two the same."""
+    """Names in C that are like those given, and all different."""
     used, made = set(taken), []
     for name in names:
         name = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "value"
@@ -97,7 +96,7 @@ def free_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 
 class Function:
-    """A function of the file: its signature, and the program in it."""
+    """A function of the file: its signature and its program."""
 
     def __init__(self, signature: str, program: Program, roots: set[str], exits: str):
         self.signature, self.program, self.exits = signature, program, exits
@@ -106,7 +105,7 @@ class Function:
 
     @property
     def stack(self) -> int:
-        """Bytes of arrays and variables."""
+        """The bytes of its arrays and variables."""
         return self.bytes + _variables(self.program.top)
 
     def text(self, arguments: Iterable[str]) -> list[str]:
@@ -136,7 +135,7 @@ def _variables(scope: Scope) -> int:
 
 
 def source(name: str, functions: list[tuple[Function, list[str]]], shared: Shared):
-    """The text of the file, and the bytes of its constants."""
+    """The text of the C file, and the bytes of its constants."""
     used = frozenset().union(*(f.needed for f, _ in functions))
     tables, size = _layout.constants(shared, used)
     bodies = [f.text(arguments) for f, arguments in functions]
@@ -192,7 +191,7 @@ def header(description: Description, comment: list[str], body: list[str]) -> str
 
 
 def write_both(directory: Path, texts: dict[str, str]) -> tuple[str, ...]:
-    """Write files: all of them, or none."""
+    """Write all files, or none of them if there is an error."""
     beside = {
         directory / name: directory / f".{name}.{secrets.token_hex(4)}"
         for name in texts
@@ -207,7 +206,7 @@ def write_both(directory: Path, texts: dict[str, str]) -> tuple[str, ...]:
             path.replace(target)
     except OSError as error:
         raise ValueError(
-            f"export.c: directory must be one that can be written, got {directory}: "
+            f"export.c: directory must be one that can be written to, got {directory}: "
             f"{error}."
         ) from error
     finally:
@@ -220,7 +219,7 @@ def write_both(directory: Path, texts: dict[str, str]) -> tuple[str, ...]:
 def report(
     files: tuple[str, ...], functions: list[Any], constants: int, state: int, text: str
 ) -> Report:
-    """The report of these functions."""
+    """The report on the functions of a file."""
     bounds = dict.fromkeys(b for f in functions for b in f.program.bounds)
     return Report(
         files,

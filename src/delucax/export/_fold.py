@@ -1,4 +1,4 @@
-"""Constant folding, by NumPy."""
+"""Constant folding with NumPy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ def _broadcast(x, *, shape, broadcast_dimensions, **_):
 
 
 def _pad(x, fill, *, padding_config):
-    # A negative margin cuts off.
+    # A negative margin removes entries.
     shape = [
         low + high + n + max(n - 1, 0) * inside
         for n, (low, high, inside) in zip(x.shape, padding_config, strict=True)
@@ -124,8 +124,8 @@ FOLDS: dict[str, Callable[..., Any]] = {
 
 
 def folded(op: str, values: list[Any], params: Any, dtypes: list[Any]) -> Any:
-    """The results of an operation on arrays of NumPy, or `None` if it is not known
-    here."""
+    """The results of an operation on NumPy arrays, or `None` if NumPy cannot compute
+    it here."""
     if op not in FOLDS:
         return None
     with np.errstate(all="ignore"):
@@ -137,7 +137,7 @@ def folded(op: str, values: list[Any], params: Any, dtypes: list[Any]) -> Any:
 
 
 def is_all(value: Any, number: int) -> bool:
-    """Whether each entry of an array is that number."""
+    """Whether all entries of an array are equal to `number`."""
     return (
         value.dtype.kind in "iuf" and value.size > 0 and bool(np.all(value == number))
     )

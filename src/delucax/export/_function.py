@@ -1,4 +1,4 @@
-"""A plain function in C."""
+"""The C of a function of arrays."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -21,24 +21,25 @@ from ._values import Buffer, Scalars, Value, View
 
 
 FEW = 8
-"""Arrays of up to so many entries are variables,"""
+"""Arrays with at most this many entries become variables."""
 FEW_IN_LONG = 4
-"""and in a long program, for its text to stay short."""
+"""The same in a long program, so that its text stays short."""
 _LONG = 600
+"""A program with at least this many nodes is long."""
 
 
 def new_program(block: Block, shared: Shared, most: int | None) -> Program:
-    """A program to write the block with."""
+    """A new program that can write the block."""
     return Program(block, FEW if nodes_in(block) < _LONG else FEW_IN_LONG, shared, most)
 
 
 def nodes_in(block: Block) -> int:
-    """The number of nodes."""
+    """The number of nodes in a block, with those of the blocks inside it."""
     return sum(1 + sum(map(nodes_in, node.blocks)) for node in block.nodes)
 
 
 def argument(program: Program, name: str, shape: Sequence[int], dtype: Any) -> Value:
-    """An array that is given by a pointer, a number by value."""
+    """An argument of the function: an array by pointer, or a number by value."""
     if not shape:
         expr = Expr(name, np.dtype(dtype), frozenset([name]))
         return Scalars((), np.dtype(dtype), [expr], frozenset())
@@ -46,12 +47,12 @@ def argument(program: Program, name: str, shape: Sequence[int], dtype: Any) -> V
 
 
 def memory(name: str, shape: Sequence[int], dtype: Any) -> Buffer:
-    """Memory outside of the function."""
+    """Memory outside the function, which an argument points to."""
     return Buffer(name, dtype, int(np.prod(shape, dtype=int)), None, False)
 
 
 def finite_test(program: Program, values: Sequence[Value]) -> Expr:
-    """Whether all numbers are finite, and no error was raised until now."""
+    """Whether all numbers are finite and no error has been raised so far."""
     parts, names = [], frozenset()
     if program.failed is not None:
         parts, names = [f"!{program.failed.text}"], program.failed.reads
@@ -76,7 +77,7 @@ def finite_test(program: Program, values: Sequence[Value]) -> Expr:
 
 
 def ready(program: Program, value: Value) -> Value:
-    """The array computed: in variables, or in memory."""
+    """The array after its computation: in variables, or in memory."""
     if not value.size:
         return Scalars(value.shape, value.dtype, [], frozenset())
     if isinstance(value, Scalars):
@@ -86,12 +87,12 @@ def ready(program: Program, value: Value) -> Value:
 
 
 def kind_in_c(array: Array, real: str) -> str:
-    """The type of the entries in the header."""
+    """The type of the entries of an array, as the header names it."""
     return real if array.dtype.startswith("float") else c_type(array.dtype, stored=True)
 
 
 def parameter(name: str, array: Array, real: str, is_output: bool = False) -> str:
-    """An argument in a signature."""
+    """The declaration of an argument in a signature."""
     kind = kind_in_c(array, real)
     if is_output:
         return f"{kind} *{name}"
@@ -107,7 +108,7 @@ def export_function(
     notes: Sequence[str],
     most: int | None,
 ) -> Any:
-    """The header and the source of a function, and its report without the files."""
+    """The header and the source of a function, and the values that its report needs."""
     function = cast(function, dtype)
     with precision(dtype):
         given, structure = jax.tree_util.tree_flatten_with_path(tuple(example))
@@ -169,9 +170,8 @@ def export_function(
         *(_line(a) for a in inputs),
         *(f"{_line(a)}, output" for a in outputs),
         "",
-        "Returns 0; or a flag if an input or a result is not finite. The results are",
-        "what the arithmetic gives in every case. Memory of results must not overlap",
-        "that of inputs.",
+        "Returns 0, or a flag if an input or a result is not finite. The outputs are",
+        "written in every case. Their memory must not overlap the memory of inputs.",
     ]
     body = [
         f"enum {{ {macro}_BAD_INPUT = 1, {macro}_BAD_RESULT = 2 }};",
@@ -193,7 +193,7 @@ def _word(path: Any) -> str:
 
 
 def _shape(value: Any, dtype: np.dtype, path: Any) -> Any:
-    """The shape and the type of an input."""
+    """The shape and the type of an input of the example."""
     where = f"export.c: example{jax.tree_util.keystr(path)}"
     try:
         kind = getattr(value, "dtype", None)
@@ -217,7 +217,7 @@ def _shape(value: Any, dtype: np.dtype, path: Any) -> Any:
 
 
 def _names_of(function: Any, count: int) -> list[str]:
-    """The names of the arguments of a function, as far as it has any."""
+    """The names of the arguments of a function, or `in0`, ... if they have none."""
     try:
         parameters = [*inspect.signature(function).parameters.values()]
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Operations whose indices are computed."""
+"""Operations whose indices are computed at run time."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from ._values import remapped
 
 
 def clamped(e: Any, expr: Expr, most: int) -> Index:
-    """A computed index, brought between 0 and `most`."""
+    """A computed index, clamped to the interval from 0 to `most`."""
     if expr.value is not None:
         return known(min(max(int(expr.value), 0), most))
     if expr.low >= 0 and expr.high <= most:
@@ -111,7 +111,7 @@ def _chosen(e, inside, yes, no):
 
 
 def _starts(e, numbers, shape, sizes, indices, batch, drops):
-    """Where a window begins, brought inside; and whether it was, if that matters."""
+    """The clamped start of a window, and whether it lay inside, if that matters."""
     is_gather = hasattr(numbers, "start_index_map")
     axes = (
         numbers.start_index_map if is_gather else numbers.scatter_dims_to_operand_dims

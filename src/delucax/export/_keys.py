@@ -1,4 +1,4 @@
-"""Keys of `jax.random` as the two words that they are."""
+"""Keys of `jax.random` as arrays of two words each."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,37 +10,37 @@ from jax.extend.random import threefry_prng_impl as threefry
 
 
 def is_key(dtype: Any) -> bool:
-    """Whether arrays of this type are keys."""
+    """Whether arrays of this type are random keys."""
     return jnp.issubdtype(dtype, jax.dtypes.prng_key)
 
 
 def is_ours(dtype: Any) -> bool:
-    """Whether a key is of the generator that is written in C."""
+    """Whether keys of this type belong to the generator that C has."""
     return str(dtype) == f"key<{threefry.tag}>"
 
 
 def as_words(leaf: Any) -> Any:
-    """The words of keys, along a last axis; other arrays stay as they are."""
+    """The words of random keys, along a new last axis. Other arrays do not change."""
     return jax.random.key_data(leaf) if is_key(leaf.dtype) else leaf
 
 
 def as_keys(leaf: Any, dtype: Any) -> Any:
-    """Keys again, if that is their type."""
+    """The random keys that have these words, if `dtype` is a type of keys."""
     if not is_key(dtype):
         return leaf
     return jax.random.wrap_key_data(leaf, impl=threefry.name)
 
 
 def form(aval: Any) -> tuple[tuple[int, ...], Any]:
-    """The shape and the type of an array, of the words where it is one of keys."""
+    """The shape and the type of an array. For random keys, of their words."""
     if not is_key(aval.dtype):
         return tuple(aval.shape), aval.dtype
     return (*aval.shape, *threefry.key_shape), np.dtype(np.uint32)
 
 
 def on_words(eqn: Any) -> Callable[..., Any] | None:
-    """What an equation on keys does to their words; `None` if it draws numbers in a
-    way that has no form."""
+    """The function of words that does what an equation does to keys. `None` if the
+    equation draws random numbers in a way that C cannot."""
     op, params = eqn.primitive.name, eqn.params
     (first, *_), (out, *_) = eqn.invars, eqn.outvars
     axes = len(first.aval.shape)
@@ -64,13 +64,13 @@ def on_words(eqn: Any) -> Callable[..., Any] | None:
         return fold_in
     if op.startswith("random"):
         return None
-    # What moves keys moves each of their words.
+    # An operation that moves keys moves each of their words.
     along = [-1 if is_key(v.aval.dtype) else None for v in eqn.invars]
     return jax.vmap(lambda *ins: eqn.primitive.bind(*ins, **params), along, -1)
 
 
 def _each(function: Callable[..., Any], axes: int) -> Callable[..., Any]:
-    """The function of each key of an array."""
+    """The function, mapped over the axes of an array of keys."""
     for _ in range(axes):
         function = jax.vmap(function)
     return function

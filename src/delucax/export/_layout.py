@@ -1,4 +1,4 @@
-"""The text of a function: dead stores are removed, and arrays share memory."""
+"""The text of a function. Removes dead stores, and lets arrays share memory."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -11,7 +11,7 @@ from ._values import Buffer
 
 
 def eliminate_dead_stores(top: Scope, roots: Iterable[str]) -> frozenset[str]:
-    """Remove the statements that no root depends on; returns the names that stay."""
+    """Remove the statements that no root depends on. Returns the names that stay."""
     writers: dict[str, list[Any]] = {}
 
     def index(scope, around):
@@ -45,7 +45,7 @@ def eliminate_dead_stores(top: Scope, roots: Iterable[str]) -> frozenset[str]:
                 needed.add(name)
                 for entry in writers.get(name, ()):
                     keep(*entry)
-        # A loop that stays also needs the line that leaves it.
+        # A loop that stays also needs the statement that leaves it.
         before = len(kept)
         for item, needs, around in exits:
             if all(id(g) in groups for g in around):
@@ -69,7 +69,7 @@ def eliminate_dead_stores(top: Scope, roots: Iterable[str]) -> frozenset[str]:
 
 
 def live_ranges(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]:
-    """The live range of each buffer: the statements of its first and last use."""
+    """The live range of each buffer: the numbers of its first and last statement."""
     homes = {b.name: b.home for b in buffers}
     first: dict[str, int] = {}
     last: dict[str, int] = {}
@@ -92,7 +92,7 @@ def live_ranges(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]
             clock += 1
             touched |= inside
             for name in inside:
-                # What outlives a round of a loop is live during the whole loop.
+                # A buffer from outside a loop is live during the whole loop.
                 if any(s.repeats and not homes[name].is_within(s) for s in item.scopes):
                     first[name], last[name] = min(first[name], begin), clock
         return touched
@@ -102,8 +102,8 @@ def live_ranges(top: Scope, buffers: list[Buffer]) -> dict[str, tuple[int, int]]
 
 
 def placed(buffers: list[Buffer], top: Scope) -> tuple[list[str], int]:
-    """The declarations of the buffers, and their bytes. Those whose live ranges do not
-    overlap share memory."""
+    """The declarations of the buffers, and their bytes. Buffers share memory if their
+    live ranges do not overlap."""
     used = live_ranges(top, buffers)
     lines, total = [], 0
     kinds: dict[Any, list[Buffer]] = {}
@@ -134,7 +134,7 @@ def placed(buffers: list[Buffer], top: Scope) -> tuple[list[str], int]:
 
 
 def printed(scope: Scope, depth: int = 1) -> list[str]:
-    """The lines of the statements."""
+    """The statements of a scope, as lines of text."""
     lines, margin = [], "  " * depth
     for item in scope.items:
         if isinstance(item, Line):
@@ -152,7 +152,7 @@ def printed(scope: Scope, depth: int = 1) -> list[str]:
 
 
 def constants(shared: Shared, used: frozenset[str]) -> tuple[list[str], int]:
-    """The definitions of tables, and their bytes."""
+    """The definitions of the tables that are used, and their bytes."""
     lines, total = [], 0
     for name, array in shared.tables.values():
         if name in used:
@@ -164,7 +164,7 @@ def constants(shared: Shared, used: frozenset[str]) -> tuple[list[str], int]:
 
 
 def _wrapped(text: str, width: int = 88) -> list[str]:
-    """Lines of a long list."""
+    """A long definition, broken into lines."""
     lines = []
     while len(text) > width:
         cut = text.rfind(" ", 0, width)

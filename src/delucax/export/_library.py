@@ -1,4 +1,4 @@
-"""Exported C behind `ctypes`, on arrays of NumPy."""
+"""Calls of exported C on NumPy arrays, through `ctypes`."""
 
 import ctypes
 import functools
@@ -11,13 +11,13 @@ from ._description import Description
 
 
 def address(array: np.ndarray) -> ctypes.c_void_p:
-    """A pointer to the numbers of an array. A function takes it as it is, so that it is
-    made once where calls should be quick."""
+    """A pointer to the numbers of an array. Make it once if calls must be fast: a
+    function takes the same pointer again."""
     return ctypes.c_void_p(array.__array_interface__["data"][0])
 
 
 def passed(array: np.ndarray) -> Any:
-    """An input of a function: a number by value, an array by its address."""
+    """An input of a function: a number by value, or an array by pointer."""
     if array.shape:
         return address(array)
     return np.ctypeslib.as_ctypes_type(array.dtype)(array.item())
@@ -26,8 +26,8 @@ def passed(array: np.ndarray) -> Any:
 def function_of(path: str, name: str, *, quick: bool = False) -> Any:
     """A function of a shared library that returns an `int`.
 
-    A `quick` one keeps Python's lock, which takes as long to give back as the
-    arithmetic of a small step.
+    With `quick`, calls keep Python's global interpreter lock, because releasing it
+    takes as long as the arithmetic of a small step.
     """
     library = ctypes.PyDLL(path) if quick else ctypes.CDLL(path)
     return library[name]
@@ -36,7 +36,7 @@ def function_of(path: str, name: str, *, quick: bool = False) -> Any:
 def as_input(
     value: Any, shape: tuple[int, ...], dtype: Any, name: str, where: str
 ) -> np.ndarray:
-    """An argument as a contiguous array of that shape and type."""
+    """The argument as a contiguous array of the given shape and type."""
     try:
         array = np.asarray(value)
     except ValueError:  # ragged
@@ -58,7 +58,7 @@ def as_input(
 
 
 class ControllerCalls:
-    """The functions of an exported controller. What goes in is left as it is."""
+    """The functions of an exported controller. They do not change their arguments."""
 
     def __init__(self, path: str, about: Description):
         (_, (_, y, *_)), ((_, self.controls, *_),) = about.inputs, about.outputs
@@ -70,13 +70,13 @@ class ControllerCalls:
         self.state_bytes = about.state_bytes
 
     def init(self) -> np.ndarray:
-        """The bytes of a new state."""
+        """The bytes of a new state, from `NAME_init`."""
         memory = np.zeros(self.state_bytes, np.uint8)
         self._init(address(memory))
         return memory
 
     def in_place(self, memory: np.ndarray, y: np.ndarray, u: np.ndarray) -> Any:
-        """`step(t) -> flag` and `applied(cost)`, which read and write these arrays."""
+        """The functions `step(t) -> flag` and `applied(cost)` on the given arrays."""
         real, at = self._real, [address(array) for array in (memory, y, u)]
         state, observation, control = at
         step, applied = self._step, self._applied
@@ -93,27 +93,27 @@ class ControllerCalls:
         return u, memory, step(t)
 
     def applied(self, u: Any, cost: Any, memory: Any) -> np.ndarray:
-        """The bytes of the next state."""
+        """The bytes of the state after `NAME_applied`."""
         u, memory = np.ascontiguousarray(u, self.dtype), np.array(memory)
         self._applied(address(memory), address(u), self._real(cost))
         return memory
 
 
 class FunctionCall:
-    """An exported function of arrays."""
+    """The call of an exported function of arrays."""
 
     def __init__(self, path: str, about: Description):
         self.about = about
         self._function = function_of(path, about.name)
 
     def __call__(self, *inputs: np.ndarray) -> tuple[list[np.ndarray], int]:
-        """The results, and the flag."""
+        """The outputs, and the flag."""
         outputs = [np.empty(shape, dtype) for _, shape, dtype, _ in self.about.outputs]
         return outputs, self._function(*map(passed, inputs), *map(address, outputs))
 
 
 @functools.lru_cache(maxsize=256)
 def calls_of(path: str, about: Description) -> Any:
-    """What calls a library, made once for each."""
+    """The calls of a library. The same object is returned every time."""
     kinds: Any = {"controller": ControllerCalls, "function": FunctionCall}
     return kinds[about.kind](path, about)

@@ -1,4 +1,4 @@
-"""Loops, choices and errors."""
+"""Rules for loops, choices and errors."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ def scan(e, node, *ins):
 
 
 def _unread():
-    """In place of an array that nothing reads."""
+    """A stand-in for an array that nothing reads."""
     return Scalars((), np.dtype(float), [Expr("0", np.dtype(float))], frozenset())
 
 
@@ -48,7 +48,7 @@ def _row(x, shape, index):
 
 
 def _places(e: Any, node: Any, ins: Any, carried: int) -> list[Value]:
-    """Where the carried values are kept, with their first values."""
+    """The places of the carried values, set to the first values."""
     places: list[Value] = []
     for k, x in enumerate(ins[:carried]):
         if int(np.prod(x.shape, dtype=int)) <= e.unroll:
@@ -62,7 +62,7 @@ def _places(e: Any, node: Any, ins: Any, carried: int) -> list[Value]:
 
 
 def _adopt(e, places):
-    """Memory that is carried belongs to the body of the loop while that is written."""
+    """Give the carried memory to the body of the loop, so that the body may change it."""
     for place in places:
         if isinstance(place, View):
             place.buffer.block = e.scope
@@ -82,8 +82,8 @@ def while_(e, node, *starts):
         bound = e.most
     if bound is None:
         why = (
-            "no bound of its rounds is known: count them in what it carries, from a "
-            "number that is known, or give max_iterations"
+            "the number of its rounds has no known bound. Let the loop carry a counter "
+            "that starts at a constant, or give max_iterations"
         )
         raise refuse("while_loop", why, node.where)
     e.bounds.append((node.where, bound))
@@ -97,7 +97,7 @@ def while_(e, node, *starts):
     if is_sure:
         e.line(f"if (!{test.text}) break;", test.reads, None, test.cost)
     else:
-        # Another round than the last that is allowed is a failure of the step.
+        # If the loop needs more rounds than it may have, the step fails.
         test = e.define(test)
         over = f"({name} == {bound} && {test.text})"
         failed = e.failure()
@@ -136,7 +136,7 @@ def cond(e, node, which):
 
 
 def error(e, node):
-    """The program goes on, and its flag tells of it."""
+    """Note that an error was raised. The program goes on, and the flag reports it."""
     e.assign(e.failure(), literal(True, bool))
     fill = lambda out: np.nan if out.dtype.kind == "f" else 0
     return [

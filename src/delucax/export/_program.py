@@ -1,4 +1,4 @@
-"""Writes a block: each node by the rule of its operation."""
+"""The writer of blocks: it writes each node by the rule of its operation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,7 +24,7 @@ _RULES: dict[str, Any] = (
 
 
 class Program(Writer):
-    """Writes the nodes of blocks. `values` are the arrays, by their variables."""
+    """Writes the nodes of blocks. `values` holds the array of each variable."""
 
     def __init__(self, block: Block, unroll: int, shared: Any, most: int | None):
         super().__init__(unroll, shared)
@@ -34,17 +34,17 @@ class Program(Writer):
         self.bounds: list[tuple[str, int]] = []
 
     def is_few(self, array: Any) -> bool:
-        """Whether an array is kept in variables."""
+        """Whether an array is so small that it is kept in variables."""
         return int(np.prod(array.shape, dtype=int)) <= self.unroll
 
     def read(self, atom: Atom) -> Value:
-        """The value of an atom."""
+        """The array of an atom."""
         if isinstance(atom, Const):
             return Table(atom.value, self.shared.table)
         return self.values[atom]
 
     def bind(self, var: Var, value: Value) -> None:
-        """Set the value of a variable."""
+        """Set the array of a variable."""
         value = self.settled(value, var.weight)
         if not var.remaining:
             return
@@ -53,7 +53,7 @@ class Program(Writer):
             buffer.holders += 1
 
     def release(self, atom: Atom) -> None:
-        """Count one use less."""
+        """Note that one use of the atom is written."""
         if not isinstance(atom, Var):
             return
         atom.remaining -= 1
@@ -62,8 +62,8 @@ class Program(Writer):
                 buffer.holders -= 1
 
     def owned(self, atom: Atom, x: Value) -> View:
-        """Memory with the entries of an array, to be changed: that of the array itself
-        where nothing else reads it."""
+        """Memory with the entries of an array, which may be changed. It is the memory of
+        the array itself if nothing else reads that."""
         if isinstance(x, View) and isinstance(atom, Var) and not atom.remaining:
             buffer = x.buffer
             mine = buffer.is_own and buffer.block is self.scope
@@ -72,7 +72,7 @@ class Program(Writer):
         return self.copied(x)
 
     def run(self, block: Block) -> list[Value]:
-        """Write a block; its results."""
+        """Write a block. Returns its results."""
         for node in block.nodes:
             self.write(node)
         outs = [self.read(a) for a in block.outs]

@@ -1,4 +1,4 @@
-"""What C cannot take, and the line of Python that asks for it."""
+"""Errors for what cannot be written in C, with the line of Python it comes from."""
 
 import contextlib
 import os
@@ -24,11 +24,11 @@ _WHY = {
 
 
 class Unsupported(ValueError):
-    """What C cannot take."""
+    """The error for something that cannot be written in C."""
 
 
 def refuse(name: str, why: str, where: str) -> Unsupported:
-    """The error for an operation that has no form in C."""
+    """The error for the operation `name`, for the reason `why`."""
     why = _WHY.get(name, why)
     line = f" at {where}" if where else ""
     return Unsupported(f"export.c: {name}{line} cannot be exported: {why}.")
@@ -41,13 +41,13 @@ _NAME = str(Path(_PACKAGE).relative_to(_ROOT)) + os.sep
 
 
 def line_of(eqn: Any, around: str) -> str:
-    """The line of the user's code that an equation comes from, be it that of the call
-    around it; or else the function of delucax."""
+    """The line of the user's code that an equation comes from. If there is none, the
+    line of the call `around` it, or the function of delucax."""
     traceback, ours = eqn.source_info.traceback, ""
     for frame in traceback.frames if traceback else ():
         file = frame.file_name
         if file.startswith(_HERE):
-            break  # beyond is whoever exports
+            break  # further frames are the call of export.c
         if not file.startswith((*_LIBRARIES, _PACKAGE, "<")):
             return f"{Path(file).name}:{frame.line_num}"
         if file.startswith(_PACKAGE) and not ours:
