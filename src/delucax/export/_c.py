@@ -104,6 +104,11 @@ def c(
         ```
 
         ```text
+        constants   0 bytes
+        state       0 bytes
+        stack       68 bytes
+        operations  12 a call
+        lines of C  24
         ```
     """
     where = "export.c"
@@ -163,7 +168,7 @@ def c(
 
 
 def _as_function(given: Any, example: Any, where: str) -> Any:
-    """The function to export, its example, the names of its arguments, and a comment."""
+    """The function, its example, the names of its arguments, and lines of a comment."""
     if not isinstance(given, AbstractSystem | AbstractDynamics):
         if not isinstance(example, tuple | list):
             raise ValueError(

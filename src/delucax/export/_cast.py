@@ -22,8 +22,8 @@ def dtype_of(tree: Any, given: Any, where: str) -> np.dtype:
     dtype = jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if dtype not in (np.float32, np.float64):
         raise ValueError(
-            f"{where}: dtype must be 'float32' or 'float64', but the arrays are {dtype}. "
-            "Give dtype= to cast them."
+            f"{where}: dtype must be 'float32' or 'float64', got arrays of {dtype}; "
+            "give dtype= to cast them."
         )
     return np.dtype(dtype)
 

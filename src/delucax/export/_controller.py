@@ -41,7 +41,7 @@ def export_controller(
     plant: Any,
     most: int | None,
 ) -> Any:
-    """The header and the source of a controller, and the values that its report needs."""
+    """The header and the source of a controller, and the values for its report."""
     traced = TracedController(controller, dtype, example, key)
     (m,) = traced.controls
     if plant is not None:
@@ -254,8 +254,8 @@ def _comment(controller, plant, traced, name, fallback) -> list[str]:
         f"  flag = {name}_step(&state, t, y, u);",
         f"  {name}_applied(&state, u, cost);",
         "",
-        f"{name}_step takes the time t and the observation y, and writes the control u.",
-        f"Then pass to {name}_applied the control that was really applied, and its cost.",
+        f"{name}_step takes the time t and the observation y. It writes the control u.",
+        f"Then pass to {name}_applied the control that was applied, and its cost.",
         "",
         f"{name}_step returns 0, or a flag if t, y or a result is not finite.",
         f"The control is then {answer}, and the state does not change.",

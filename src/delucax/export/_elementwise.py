@@ -93,8 +93,8 @@ Operation = Callable[[list[Expr]], Expr]
 
 
 def operation(op: str, params: Any, dtypes: list[Any], out: Any, shared: Any) -> Any:
-    """The function that makes the expression of an entry, and the cost of the operation.
-    `None` if the operation does not act on single entries."""
+    """The function that makes the expression of an entry, and the number of operations
+    in it. `None` if the operation does not act on single entries."""
     out, kind = np.dtype(out), dtypes[0]
     if op in _COMPARED:
         return (lambda given: _compared(op, given)), 1

@@ -148,7 +148,7 @@ class Writer:
             yield tuple([stack.enter_context(self.loop(n)) for n in shape])
 
     def choose(self, which: Expr, count: int, inside: Any) -> None:
-        """Write `inside(k)` for case `k`. A number beyond the cases takes the nearest."""
+        """Write `inside(k)` for case `k`. Numbers beyond the cases take the nearest."""
         which = self.define(which)
         headers, scopes, outside = [], [], self.scope
         for k in range(count):
@@ -262,7 +262,7 @@ class Writer:
             self.assign(variable, expr)
 
     def put_all(self, places: Sequence[Value], values: Sequence[Value]) -> None:
-        """Set several arrays at once. A value may read the places that the others set."""
+        """Set several arrays at once. A value may read a place that is set."""
         pairs = [
             (p, v)
             for p, v in zip(places, values, strict=True)
@@ -328,7 +328,7 @@ class Writer:
         return value
 
     def settled(self, value: Value, weight: int) -> Value:
-        """The array in a form for `weight` readers: costly entries are computed once."""
+        """The array for `weight` readers: entries with a cost are computed once."""
         if isinstance(value, Formula):
             return self.copied(value) if weight > 1 and value.cost else value
         if isinstance(value, Scalars):

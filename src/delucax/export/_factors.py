@@ -11,7 +11,7 @@ from ._values import broadcast, Scalars
 
 
 def _call(e, name, dtype, writes, *arguments, cost):
-    """Write a call of a routine. Arguments are numbers, or pairs of a view and offset."""
+    """Write a call of a routine. Arguments are numbers or pairs `(view, offset)`."""
     words, reads = [], NOTHING
     for argument in arguments:
         if isinstance(argument, tuple):

@@ -108,7 +108,7 @@ def export_function(
     notes: Sequence[str],
     most: int | None,
 ) -> Any:
-    """The header and the source of a function, and the values that its report needs."""
+    """The header and the source of a function, and the values for its report."""
     function = cast(function, dtype)
     with precision(dtype):
         given, structure = jax.tree_util.tree_flatten_with_path(tuple(example))

@@ -1,4 +1,4 @@
-"""Exported C, compiled and called."""
+"""The function `export.load`, which compiles and loads exported C."""
 
 import contextlib
 import os
@@ -20,25 +20,25 @@ def load(
     compiler: str | None = None,
     flags: Sequence[str] = FLAGS,
 ) -> LoadedController | LoadedFunction:
-    """What [`delucax.export.c`][] wrote, compiled here and ready to be called.
+    """Compile C that [`delucax.export.c`][] wrote, and load it into Python.
 
-    The library is kept among the user's caches, and is compiled again only if the C,
-    the compiler or the flags change. Nothing is written to `directory`.
+    The compiled library is kept in the user's cache. It is compiled again only if the
+    C, the compiler or the flags change. Nothing is written to `directory`.
 
     **Arguments:**
 
     - `directory`: the folder that holds `NAME.h` and `NAME.c`.
-    - `name`: which of them, if there are several.
-    - `compiler`: the command of a C compiler. By default that of the variable `CC`, or
-        the first of `cc`, `gcc` and `clang` that is there.
-    - `flags`: given to it, by default those of an exact comparison with JAX:
-        `-ffp-contract=off` keeps products and sums apart.
+    - `name`: the name of the export, needed if the folder holds several.
+    - `compiler`: the command of a C compiler. By default it is the environment variable
+        `CC`, or else the first of `cc`, `gcc` and `clang` that is installed.
+    - `flags`: arguments of the compiler. By default they make the results comparable
+        with JAX: `-ffp-contract=off` keeps the compiler from fusing products and sums.
 
-    **Returns:** a [`delucax.export.LoadedController`][] for a controller, a
-    [`delucax.export.LoadedFunction`][] for a function.
+    **Returns:** a [`delucax.export.LoadedController`][] for a controller, or a
+    [`delucax.export.LoadedFunction`][] for a function or a plant.
 
-    **Raises:** `ValueError` if the folder has no export, or several and no `name` is
-    given; if there is no compiler, or it fails, whose words are shown.
+    **Raises:** `ValueError` if the folder holds no export, or several and no `name` is
+    given; if no compiler is found; or if it fails, with its message.
 
     !!! example
 
@@ -54,6 +54,10 @@ def load(
             dlx.export.c(law, folder, name="law")
             controller = dlx.export.load(folder)
         dlx.rollout(env, controller, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+
+        ```text
+        Array(0.0736, dtype=float32)
         ```
     """
     where = "export.load"
@@ -72,23 +76,23 @@ def load(
 
 
 def _find(folder: Path, name: str | None, where: str) -> Description:
-    """The description of the export in a folder."""
+    """The description of the export `name` in a folder."""
     if not folder.is_dir():
         raise ValueError(f"{where}: directory must be a folder, got {str(folder)!r}.")
     headers = [h for h in sorted(folder.glob("*.h")) if h.with_suffix(".c").exists()]
     exports: dict[str, Description] = {}
     for header in headers:
-        with contextlib.suppress(ValueError):  # it may be of another program
+        with contextlib.suppress(ValueError):  # the header of another program
             exports[header.stem] = described(header)
     if not exports:
         raise ValueError(
-            f"{where}: directory must hold what delucax.export.c wrote, and "
-            f"{str(folder)!r} has none."
+            f"{where}: directory must hold what delucax.export.c wrote, got "
+            f"{str(folder)!r}, which holds no export."
         )
     if name is None and len(exports) > 1:
         raise ValueError(
-            f"{where}: name must say which, for {str(folder)!r} holds "
-            f"{', '.join(exports)}."
+            f"{where}: name must say which export to load, because {str(folder)!r} "
+            f"holds {', '.join(exports)}."
         )
     which = next(iter(exports)) if name is None else name
     if which not in exports:

@@ -1,4 +1,4 @@
-"""Exported C as a controller, and as a function."""
+"""Exported C as a controller and as a function in Python."""
 
 import functools
 import warnings
@@ -21,7 +21,8 @@ class LoadedState(NamedTuple):
     """The state of a controller in C.
 
     - `memory`: the bytes of its struct.
-    - `declared`: how often it gave its declared answer, as a number was not finite.
+    - `declared`: the number of steps in which a number was not finite, so that the
+        control was the fallback.
     """
 
     memory: Any
@@ -29,19 +30,26 @@ class LoadedState(NamedTuple):
 
 
 class LoadedController(AbstractController):
-    """A controller in C, as [`delucax.export.load`][] returns it.
+    """A controller in C. [`delucax.export.load`][] returns one.
 
-    It is a controller like others: [`delucax.rollout`][] takes it, under `jit` and
-    `vmap` too, where Python calls the C at each step. With arrays of NumPy it is called
-    at once and gives arrays of NumPy. The precision inside is that of the export. It
-    has no derivative.
+    Use it like any other controller. [`delucax.rollout`][] takes it, also under `jit`
+    and `vmap`; Python then calls the C at each step. If you call it with NumPy arrays,
+    JAX is not used, and it returns NumPy arrays. It computes in the precision of the
+    export. It has no derivative.
 
-    Where a number is not finite the C gives the control that was declared when it was
-    exported, and a flag: a rollout counts these in `trajectory.incidents` as
-    `"declared_answer"`, and [`delucax.export.Running`][] warns.
+    If a number is not finite, the control is the `fallback` of
+    [`delucax.export.c`][]: by default the last good control. A rollout records each
+    such step in `trajectory.incidents` as `"declared_answer"`, and
+    [`delucax.export.Running`][] warns.
 
-    **Arguments:** `library`, `description`: the compiled file, and what its header
-        says; [`delucax.export.load`][] gives both.
+    **Arguments:**
+
+    - `library`: the path of the compiled library.
+    - `description`: the description of the program, from its header.
+        [`delucax.export.load`][] sets both.
+
+    **Raises:** `ValueError` when called if an argument has the wrong shape, or the
+    state is not one that `init` returned.
 
     !!! example
 
@@ -57,6 +65,11 @@ class LoadedController(AbstractController):
             controller = dlx.export.load(folder)
         state = controller.init()
         u, state = controller(0.0, np.array([0.1, 0.0]), state)
+        u
+        ```
+
+        ```text
+        array([-2.], dtype=float32)
         ```
     """
 
@@ -108,8 +121,8 @@ class LoadedController(AbstractController):
         return state._replace(memory=memory)
 
     def _memory_of(self, state: Any) -> Any:
-        """The bytes of a state; raises if it is another controller's, because the C
-        would read beyond it."""
+        """The bytes of a state. Raises if it is not a state of this controller, because
+        the C would read beyond its end."""
         if not isinstance(state, LoadedState) or (
             state.memory.shape != (self._calls.state_bytes,)
         ):
@@ -120,7 +133,7 @@ class LoadedController(AbstractController):
         return state.memory
 
     def running(self) -> "Running":
-        """The controller with a state of its own, for a loop in Python.
+        """The controller with its state inside, for a loop in Python.
 
         **Returns:** a [`delucax.export.Running`][].
         """
@@ -128,11 +141,17 @@ class LoadedController(AbstractController):
 
 
 class Running:
-    """A controller in C that keeps its state: what a program on a board does.
+    """A controller in C that keeps its state between steps, as a program on a board
+    does.
 
-    **Arguments:** `controller`: a [`delucax.export.LoadedController`][].
+    **Arguments:**
 
-    **Attributes:** `flag`: that of the last step, 0 if all numbers were finite.
+    - `controller`: a [`delucax.export.LoadedController`][].
+
+    **Attributes:**
+
+    - `flag`: the flag of the last step. It is 0 if all numbers were finite, 1 if an
+        input was not, and 2 if a result was not.
 
     !!! example
 
@@ -146,7 +165,11 @@ class Running:
         with tempfile.TemporaryDirectory() as folder:
             dlx.export.c(law, folder, name="law")
             law = dlx.export.load(folder).running()
-        u = law.step(0.0, np.array([0.1, 0.0]))
+        law.step(0.0, np.array([0.1, 0.0]))
+        ```
+
+        ```text
+        array([-2.], dtype=float32)
         ```
     """
 
@@ -157,42 +180,53 @@ class Running:
         self.reset()
 
     def reset(self) -> None:
-        """Begin again."""
+        """Start again from the first state."""
         self._memory, self.flag = self._calls.init(), 0
         self._step, self._applied = self._calls.in_place(self._memory, self._y, self._u)
 
     def step(self, t: float, y: Any) -> np.ndarray:
-        """The control for an observation; warns where it is the declared one.
+        """One step. Warns if a number is not finite; the control is then the fallback.
 
-        **Arguments:** `t`: time. `y`: observation, a vector.
+        **Arguments:** `t`: time, a number. `y`: observation, a vector.
 
-        **Returns:** the control, a vector.
+        **Returns:** the control, shape `(m,)`.
+
+        **Raises:** `ValueError` if `y` has the wrong shape.
         """
         self._y[...] = as_input(y, self._y.shape, self._y.dtype, "y", self._name)
         self.flag = self._step(t)
         if self.flag:
-            _warn(self._name, self.flag, ", and the control is the declared one")
+            _warn(self._name, self.flag, ", and the control is the fallback")
         return self._u.copy()
 
     def applied(self, u: Any, cost: float) -> None:
-        """Tell the controller what was applied, and its cost.
+        """Tell the controller which control was applied, and its cost.
 
-        **Arguments:** `u`: control, a vector. `cost`: its stage cost.
+        **Arguments:** `u`: control, shape `(m,)`. `cost`: its stage cost, a number.
+
+        **Raises:** `ValueError` if `u` has the wrong shape.
         """
         self._u[...] = as_input(u, self._u.shape, self._u.dtype, "u", self._name)
         self._applied(cost)
 
 
 class LoadedFunction:
-    """A function in C, as [`delucax.export.load`][] returns it.
+    """A function in C. [`delucax.export.load`][] returns one.
 
-    It takes and returns arrays of NumPy, or of JAX where one is among the arguments,
-    under `jit` and `vmap` too. The results are those of the function that was exported,
-    as a flat tuple if there are several. It has no derivative. A result that is not
-    finite is returned as it is, with a warning outside `jit`.
+    It takes and returns NumPy arrays. If one of the arguments is a JAX array, it
+    returns JAX arrays, also under `jit` and `vmap`. It returns what the exported
+    function returns, as a flat tuple if there are several results. It has no
+    derivative. A result that is not finite is returned as it is; with NumPy arrays
+    there is a warning.
 
-    **Arguments:** `library`, `description`: the compiled file, and what its header
-        says; [`delucax.export.load`][] gives both.
+    **Arguments:**
+
+    - `library`: the path of the compiled library.
+    - `description`: the description of the program, from its header.
+        [`delucax.export.load`][] sets both.
+
+    **Raises:** `ValueError` when called with the wrong number of arguments, or an
+    argument of the wrong shape or type.
 
     !!! example
 
@@ -207,6 +241,10 @@ class LoadedFunction:
             sine = dlx.export.load(folder)
         sine(np.ones(3))
         ```
+
+        ```text
+        array([0.8415, 0.8415, 0.8415], dtype=float32)
+        ```
     """
 
     def __init__(self, library: str, description: Description):
@@ -217,7 +255,8 @@ class LoadedFunction:
         if len(inputs) != len(about.inputs):
             names = ", ".join(name for name, *_ in about.inputs)
             raise ValueError(
-                f"{about.name}: takes {names}, got {len(inputs)} arguments."
+                f"{about.name}: the arguments must be {names}, got {len(inputs)} "
+                "arguments."
             )
         if _on_host(*inputs):
             results, flag = self._call(*inputs)
@@ -239,14 +278,15 @@ class LoadedFunction:
         return results[0] if len(results) == 1 else tuple(results)
 
     def bind(self, *arrays: np.ndarray) -> Callable[[], int]:
-        """The call in given memory, which takes a fraction of a microsecond.
+        """Bind the function to arrays that it reads and writes. A call then takes a
+        fraction of a microsecond.
 
-        **Arguments:** `*arrays`: of NumPy, contiguous and of the precision of the C:
-            those that are read, then those that results are written to. None may
-            overlap another.
+        **Arguments:** `*arrays`: the arrays to read, then the arrays to write the
+            results to. They are contiguous NumPy arrays with the types of the C, and
+            must not overlap. Numbers are arrays of shape `()`.
 
-        **Returns:** a function without arguments that returns the flag. It holds
-        Python's lock while it runs.
+        **Returns:** a function without arguments, which returns the flag. It holds
+        Python's global interpreter lock while it runs.
 
         **Raises:** `ValueError` if an array does not fit.
         """
@@ -260,7 +300,7 @@ class LoadedFunction:
             fits = isinstance(array, np.ndarray) and array.flags.c_contiguous
             if not fits or (array.dtype, array.shape) != (np.dtype(dtype), shape):
                 raise ValueError(
-                    f"{about.name}: {name} must be a contiguous array of NumPy of "
+                    f"{about.name}: {name} must be a contiguous NumPy array of dtype "
                     f"{dtype} and shape {shape}, got {shortened(array)}."
                 )
         function = function_of(self.library, about.name, quick=True)
@@ -285,13 +325,14 @@ def _warn(name: str, flag: int, then: str = "") -> None:
 
 
 def _on_host(*given: Any) -> bool:
-    """Whether none of them is of JAX."""
+    """Whether none of the arguments is a JAX array."""
     return not any(isinstance(value, jax.Array) for value in given)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _called(call: Callable, shapes: Any, *inputs: Array) -> Any:
-    """`call` of arrays, which Python calls when the compiled program gets there."""
+    """`call` of the inputs, as a callback: Python calls it when the compiled program
+    runs."""
     like = lambda leaf: np.shape(leaf)
 
     def each(*given):
@@ -318,6 +359,6 @@ def _cast(answers: Any, shapes: Any) -> tuple[np.ndarray, ...]:
 @_called.defjvp
 def _no_derivative(call: Any, shapes: Any, primals: Any, tangents: Any) -> Any:
     raise ValueError(
-        "export.load: what runs in C has no derivative. Differentiate what was "
-        "exported, or put jax.lax.stop_gradient around the arguments."
+        "export.load: what runs in C has no derivative. Differentiate the original in "
+        "Python, or put jax.lax.stop_gradient around the arguments."
     )

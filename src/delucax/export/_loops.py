@@ -62,7 +62,7 @@ def _places(e: Any, node: Any, ins: Any, carried: int) -> list[Value]:
 
 
 def _adopt(e, places):
-    """Give the carried memory to the body of the loop, so that the body may change it."""
+    """Give the carried memory to the body of the loop, which may then change it."""
     for place in places:
         if isinstance(place, View):
             place.buffer.block = e.scope

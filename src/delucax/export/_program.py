@@ -62,8 +62,8 @@ class Program(Writer):
                 buffer.holders -= 1
 
     def owned(self, atom: Atom, x: Value) -> View:
-        """Memory with the entries of an array, which may be changed. It is the memory of
-        the array itself if nothing else reads that."""
+        """Memory with the entries of an array, which may be changed: the memory of the
+        array itself if nothing else reads that, else a copy."""
         if isinstance(x, View) and isinstance(atom, Var) and not atom.remaining:
             buffer = x.buffer
             mine = buffer.is_own and buffer.block is self.scope
@@ -96,7 +96,7 @@ class Program(Writer):
         elif node.op in _RULES:
             made = _RULES[node.op](self, node, *ins)
         else:
-            raise refuse(node.op, "there is no form of it in C", node.where)
+            raise refuse(node.op, "this operation is not implemented in C", node.where)
         made = made if isinstance(made, list) else [made]
         for var, value in zip(node.outs, made, strict=True):
             self.bind(var, value)

@@ -1,4 +1,4 @@
-"""Sums over axes, and products of matrices."""
+"""Rules for reductions over axes, cumulative sums and products of matrices."""
 
 import itertools
 from typing import Any
@@ -43,7 +43,7 @@ def _neutral(op, dtype):
 
 
 def _spread(shape, axes, kept, reduced):
-    """The index of the operand."""
+    """The index of the operand, from the indices of its kept and reduced axes."""
     kept, reduced = iter(kept), iter(reduced)
     return tuple(next(reduced if a in axes else kept) for a in range(len(shape)))
 
@@ -85,7 +85,7 @@ def reduce(e, node, x):
 
 
 def _by_entry(e, out, compute):
-    """An array of which each entry is computed by statements."""
+    """An array whose entries are computed by statements, one after another."""
     if e.is_few(out):
         corners = itertools.product(*map(range, out.shape))
         parts = [compute(tuple(map(known, i))) for i in corners]
@@ -97,7 +97,7 @@ def _by_entry(e, out, compute):
 
 
 def extreme(e, node, x):
-    """The index of the first largest or smallest entry; of a NaN if there is one."""
+    """The index of the first largest or smallest entry, or of the first NaN."""
     (axis,), out, x = node.params["axes"], node.outs[0], e.indexable(e.cheap(x))
     sign = ">" if node.op == "argmax" else "<"
 
@@ -204,8 +204,8 @@ def dot(e, node, a, b):
             return sum_
 
         return e.formula(out.shape, out.dtype, total, (a, b), 2 * count)
-    # The last index of the result runs innermost where both it and the right factor
-    # lie in a row: no sum waits for the one before it.
+    # If the last axis of the result and of the right factor is contiguous, it is the
+    # innermost loop: then no sum waits for the one before it.
     a = e.indexable(e.cheap(a))
     a, b = _in_rows(e, a, free_a, free_b, in_a), e.indexable(e.cheap(b))
     b = e.stored(b) if isinstance(b, Table) else b
@@ -234,7 +234,7 @@ def dot(e, node, a, b):
         with e.loop(last) as k:
             e.store(place, (*before, k), literal(0, out.dtype))
         with e.over(extents) as inner:
-            # A compiler does not know that it stays as it is while sums are written.
+            # Read once: a compiler does not know that it stays the same in the loop.
             held, same = None, 0 if free_b else 1
             if free_a or free_b:
                 held = e.define(factors((*before, known(0)), inner)[same])
@@ -247,7 +247,7 @@ def dot(e, node, a, b):
 
 
 def _product(times, left, right):
-    """The product, or `None` if it is with a constant zero."""
+    """The product. A factor that is the constant 1 is left out."""
     if left.value == 1:
         return right
     if right.value == 1:
@@ -256,7 +256,7 @@ def _product(times, left, right):
 
 
 def _in_rows(e, a, free_a, free_b, in_a):
-    """A constant matrix that multiplies a vector, laid out by columns."""
+    """The left factor. A constant matrix times a vector is stored by columns."""
     if free_b or not isinstance(a, Table) or len(free_a) != 1 or len(in_a) != 1:
         return a
     if free_a[0] == len(a.shape) - 1 or len(a.shape) != 2:

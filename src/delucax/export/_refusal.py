@@ -18,7 +18,7 @@ _WHY = {
     "eig": "there is no routine for eigenvalues",
     "eigh": "there is no routine for eigenvalues",
     "svd": "there is no routine for singular values",
-    "schur": "there is no routine for it",
+    "schur": "there is no routine for Schur factors",
     "conv_general_dilated": "there is no routine for convolutions",
 }
 

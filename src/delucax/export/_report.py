@@ -1,22 +1,23 @@
-"""What a program in C needs."""
+"""The report on the resources that a program in C needs."""
 
 from typing import NamedTuple
 
 
 class Report(NamedTuple):
-    """What a program in C needs.
+    """The resources that a program in C needs. [`delucax.export.c`][] returns it.
 
     **Attributes:**
 
-    - `files`: the paths that were written.
-    - `constants`: bytes of constants.
-    - `state`: bytes of the state.
-    - `stack`: bytes of arrays and variables of one call, at most; those of the
-        functions of `math.h` come on top.
-    - `operations`: arithmetic operations of one call at most, a function of `math.h`
-        being one.
-    - `bounds`: `(line, rounds)` of each loop that may end early.
-    - `lines`: of C.
+    - `files`: the paths of the files that were written.
+    - `constants`: the bytes of constants.
+    - `state`: the bytes of the state; 0 for a function.
+    - `stack`: the most bytes of arrays and variables in one call. The functions of
+        `math.h` need some more.
+    - `operations`: the most arithmetic operations of one call. A function of `math.h`
+        counts as one.
+    - `bounds`: `(line, rounds)` for each loop that may end early: the line of Python
+        that it comes from, and its most rounds.
+    - `lines`: the lines of C in `NAME.c`.
 
     !!! example
 
@@ -28,8 +29,15 @@ class Report(NamedTuple):
         law = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
         with tempfile.TemporaryDirectory() as folder:
             report = dlx.export.c(law, folder, name="law")
-        assert report.stack < 100
-        print(report)
+        report
+        ```
+
+        ```text
+        constants   0 bytes
+        state       4 bytes
+        stack       72 bytes
+        operations  9 a call
+        lines of C  36
         ```
     """
 

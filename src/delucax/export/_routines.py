@@ -1,7 +1,7 @@
-"""Routines of C that programs call: those that are called are put into the file.
+"""Routines of C that programs call. A file holds only the routines that it calls.
 
-`T` is the type of the entries, `S` the suffix of its name, `F` that of the functions of
-`math.h`, and `U` the unsigned integer of the same size.
+In their text, `T` is the type of the entries, `S` is the suffix of its name, `F` is the
+suffix of the functions of `math.h`, and `U` is the unsigned integer of the same size.
 """
 
 import re
@@ -23,17 +23,17 @@ _SCALAR = {
     "one_minus_square": """
 static T one_minus_square_S(T x) { return (1 - x) * (1 + x); }""",
     "maximum": """
-/* The larger number, or NaN if there is one. */
+/* The larger number, or NaN if one of them is NaN. */
 static T maximum_S(T a, T b) { return a > b || a != a ? a : b; }""",
     "minimum": """
-/* The smaller number, or NaN if there is one. */
+/* The smaller number, or NaN if one of them is NaN. */
 static T minimum_S(T a, T b) { return a < b || a != a ? a : b; }""",
     "sign": "static T sign_S(T x) { return x > 0 ? 1 : x < 0 ? -1 : x; }",
     "precedes": """
-/* Whether a comes before b, NaN being last. */
+/* Whether a comes before b. NaN comes last. */
 static int precedes_S(T a, T b) { return a < b || (a == a && b != b); }""",
     "erf_inv": """
-/* The inverse of erf: Winitzki's estimate, then steps of Halley's method. */
+/* The inverse of erf: Winitzki's estimate, then three steps of Halley's method. */
 static T erf_inv_S(T x) {
   const T a = fabsF(x), rest = 1 - a;
   if (!(a < 1)) return a == 1 ? x * INFINITY : NAN;
@@ -47,7 +47,7 @@ static T erf_inv_S(T x) {
   return x < 0 ? -y : y;
 }""",
     "digamma": """
-/* The logarithmic derivative of the gamma function: recurrence, then Stirling. */
+/* The derivative of log gamma: recurrence, then Stirling's series. */
 static T digamma_S(T x) {
   const T pi = (T)3.14159265358979323846;
   T y = 0;
@@ -63,7 +63,7 @@ static T digamma_S(T x) {
   return y + logF(x) - 1 / (2 * x) - tail;
 }""",
     "rounded": """
-/* x rounded to so many bits of the mantissa. */
+/* x rounded to the given number of bits of the mantissa. */
 static T rounded_S(T x, int bits) {
   int exponent;
   if (x - x != 0) return x;
@@ -79,13 +79,13 @@ _INTEGER = {
     "sign": "static T sign_S(T x) { return (x > 0) - (x < 0); }",
     "absolute": "static T absolute_S(T x) { return x < 0 ? (T)(0 - (U)x) : x; }",
     "quotient": """
-/* As XLA has it where the quotient is not defined. */
+/* If the quotient is not defined, the result is the one of XLA. */
 static T quotient_S(T a, T b) {
   if (b == 0) return (T)-1;
   return b == (T)-1 ? (T)(0 - (U)a) : a / b;
 }""",
     "remainder": """
-/* As XLA has it where the remainder is not defined. */
+/* If the remainder is not defined, the result is the one of XLA. */
 static T remainder_S(T a, T b) {
   if (b == 0) return a;
   return b == (T)-1 ? 0 : a % b;
@@ -114,7 +114,7 @@ static T shift_signed_S(T a, T n) { return n < 8 * sizeof(T) ? (T)(a >> n) : 0; 
 }
 
 _ORDER = """
-/* The order of n keys, ascending, NaN last; keys that are equal keep theirs. */
+/* The ascending order of n keys. NaN comes last. Equal keys keep their order. */
 static void order_S(int n, const T *key, int step, int32_t *order) {
   for (int i = 1; i < n; ++i) {
     const int32_t moved = order[i];
@@ -130,7 +130,7 @@ static void order_S(int n, const T *key, int step, int32_t *order) {
 }"""
 
 _THREEFRY = """
-/* The block of two words that the generator of JAX makes of a key and a count. */
+/* Threefry-2x32, JAX's random generator: two words from a key and a counter. */
 static uint64_t threefry_S(T key0, T key1, T x, T y) {
   static const int turns[8] = {13, 15, 26, 6, 17, 29, 16, 24};
   const T key[3] = {key0, key1, key0 ^ key1 ^ 0x1BD11BDAu};
@@ -152,7 +152,7 @@ _OTHERS = {
     "order": _ORDER,
     "threefry": _THREEFRY,
     "cholesky": """
-/* The lower factor of a symmetric matrix; all NaN if it is not positive definite. */
+/* The lower Cholesky factor. All NaN if the matrix is not positive definite. */
 static void cholesky_S(int n, const T *a, T *l) {
   for (int i = 0; i < n; ++i) {
     for (int j = 0; j <= i; ++j) {
@@ -171,8 +171,8 @@ static void cholesky_S(int n, const T *a, T *l) {
   }
 }""",
     "triangular": """
-/* Solves A X = B in place, A being lower or upper triangular, with ones on its diagonal
-   if unit. The strides of rows and columns are (ar, ac) and (br, bc). */
+/* Solves A X = B in place, for a lower or upper triangular A. If unit, its diagonal is
+   1. The strides of rows and columns are (ar, ac) in A, and (br, bc) in B. */
 static void triangular_S(int n, int m, const T *a, int ar, int ac, int lower, int unit,
                          T *b, int br, int bc) {
   for (int r = 0; r < n; ++r) {
@@ -191,7 +191,7 @@ static void triangular_S(int n, int m, const T *a, int ar, int ac, int lower, in
   }
 }""",
     "lu": """
-/* The factors of an m by n matrix in place, with partial pivots. */
+/* The LU factors of an m by n matrix, in place, with partial pivoting. */
 static void lu_S(int m, int n, T *a, int32_t *pivots, int32_t *order) {
   for (int i = 0; i < m; ++i) order[i] = i;
   for (int k = 0; k < m && k < n; ++k) {
@@ -218,7 +218,7 @@ static void lu_S(int m, int n, T *a, int32_t *pivots, int32_t *order) {
   }
 }""",
     "permutation": """
-/* The order of n rows after k exchanges. */
+/* The order of n rows after k exchanges of rows. */
 static void permutation_S(int n, int k, const T *pivots, T *order) {
   for (int i = 0; i < n; ++i) order[i] = i;
   for (int i = 0; i < k; ++i) {
@@ -228,7 +228,7 @@ static void permutation_S(int n, int k, const T *pivots, T *order) {
   }
 }""",
     "reflections": """
-/* Householder's reflections of an m by n matrix, in place as LAPACK keeps them. */
+/* The Householder reflections of an m by n matrix, stored in place as in LAPACK. */
 static void reflections_S(int m, int n, T *a, T *tau) {
   for (int k = 0; k < m && k < n; ++k) {
     T rest = 0;
@@ -250,7 +250,7 @@ static void reflections_S(int m, int n, T *a, T *tau) {
   }
 }""",
     "orthogonal": """
-/* The first columns of the product of k reflections: q is m by c, a is m by n. */
+/* The first c columns of the product of k reflections. q is m by c, a is m by n. */
 static void orthogonal_S(int m, int c, int n, int k, const T *a, const T *tau, T *q) {
   for (int i = 0; i < m; ++i)
     for (int j = 0; j < c; ++j) q[i * c + j] = i == j;
@@ -275,7 +275,7 @@ static R bits_S(T x) {
 }"""
 
 _TO_INTEGER = """
-/* Towards zero; what is beyond the integers becomes the last one, and NaN zero. */
+/* Rounds towards zero, and clamps to the integers of the type. NaN becomes 0. */
 static R to_integer_S(T x) {
   if (x != x) return 0;
   if (x < (T)LOW) return LOWEST;
@@ -320,7 +320,7 @@ def _word(text: str, old: str, new: str) -> str:
 
 def _power(exponent: int, dtype: np.dtype) -> str:
     lines, left, have = [], exponent, False
-    # Unsigned numbers wrap around, as those of XLA do; short ones would become int.
+    # XLA wraps integers around, as unsigned ones do. `1u *` keeps short ones unsigned.
     wraps = dtype.kind in "iu"
     kind, one = ("U", "1u * ") if wraps else ("T", "")
     while left:

@@ -1,4 +1,4 @@
-"""Operations that move entries: index maps where they can be, else copies in memory."""
+"""Operations that move entries: as index maps if possible, else as copies in memory."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ Rule = Callable[..., Any]
 
 
 def mapped(e: Any, value: Value, shape: Sequence[int], index: Any) -> Value:
-    """As `remapped`, of an array that loops can read if they will."""
+    """As `remapped`. If the result is large, `value` is stored for loops to read."""
     size = int(np.prod(shape, dtype=int))
     if size > e.unroll:
         value = e.indexable(value)
@@ -167,7 +167,7 @@ def pad(e, node, x, fill):
             if all(0 <= k < n for k, n in zip(into, out.shape, strict=True)):
                 grid[tuple(into)] = expr
         return scalars(out, grid, (x, fill))
-    # Only what falls inside is copied.
+    # Copy only the entries that lie inside the result.
     ranges = []
     for n, size, (low, _, inside) in zip(x.shape, out.shape, config, strict=True):
         step = inside + 1

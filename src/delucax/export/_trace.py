@@ -1,5 +1,5 @@
-"""From a jaxpr to blocks of nodes: calls are inlined, constants folded, and what does
-not change in a loop is moved out of it."""
+"""From a jaxpr to blocks of nodes. Calls are inlined, constants are folded, and nodes
+that do not change in a loop are moved before it."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -23,9 +23,9 @@ from ._refusal import line_of, refuse
 
 
 def trace(function: Callable[..., Any], *shapes: Any, draws: bool = False) -> Block:
-    """The block of a function of arrays, which returns a list of arrays.
+    """The block of a function that takes arrays and returns a list of arrays.
 
-    `draws`: whether it may draw random numbers.
+    **Arguments:** `draws`: whether the function may draw random numbers.
     """
     closed: Any = jax.make_jaxpr(function)(*shapes)
     jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), True)
@@ -39,7 +39,7 @@ def trace(function: Callable[..., Any], *shapes: Any, draws: bool = False) -> Bl
 
 
 def _inlined(closed: Any, args: Sequence[Atom], block: Block, where: str) -> list[Atom]:
-    """The outputs of a program for these inputs; its nodes go into the block."""
+    """The outputs of a jaxpr for the inputs `args`. Adds its nodes to the block."""
     jaxpr: Any = closed.jaxpr
     values: dict[Any, Atom] = dict(zip(jaxpr.invars, args, strict=True))
     for var, value in zip(jaxpr.constvars, closed.consts, strict=True):
@@ -68,7 +68,7 @@ _CALLS = "jaxpr", "call_jaxpr", "fun_jaxpr"
 
 
 def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]:
-    """The outputs of an equation in a block."""
+    """The outputs of an equation. Adds its nodes to the block."""
     op, params = eqn.primitive.name, eqn.params
     if op == "concatenate":
         ins = [a for a in ins if 0 not in a.shape] or ins
@@ -91,7 +91,7 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
         return _inlined(closed, ins, block, where)
     if op == "platform_index":
         platforms = params["platforms"]
-        # What is for every platform avoids what only XLA has.
+        # The branch for all platforms uses no operation that only XLA has.
         index = platforms.index(None) if None in platforms else 0
         return [Const(np.asarray(index, np.int32))]
     if "callback" in op or "debug" in op:
@@ -107,7 +107,7 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
         closed = jax.make_jaxpr(functools.partial(impl, **params))(*_shapes(ins))
         return _inlined(closed, ins, block, where)
     if not getattr(impl, "__module__", "functools").startswith(("jax", "functools")):
-        # It is said in terms of other operations, here or by another library.
+        # The operation is made of others: `impl` is traced. It is ours or a library's.
         impl = functools.partial(impl, **params)
         flat = lambda *args: jax.tree.leaves(impl(*args))
         closed = jax.make_jaxpr(flat)(*_shapes(ins))
@@ -116,20 +116,21 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
 
 
 def _drawn(eqn: Any, ins: Any, keys: Any, known: Any, block: Block, where: str):
-    """The outputs of an equation on keys, which are like `known` if its inputs are."""
+    """The outputs of an equation on keys; `known` are their forms if the inputs are
+    known."""
     op = eqn.primitive.name
     for kind in keys:
         if not is_ours(kind):
-            why = f"random numbers are drawn by threefry2x32 alone, not with a {kind}"
+            why = f"C draws random numbers with threefry2x32 only, not with a {kind}"
             raise refuse(op, why, where)
     function = on_words(eqn)
     moves = op in ("random_wrap", "random_unwrap") or not op.startswith("random")
     if function is None and known:
         return _computed(eqn, ins, known)
     if not (moves or known or block.draws):
-        raise refuse(op, "it draws random numbers", where)
+        raise refuse(op, "a function must take its random numbers as inputs", where)
     if function is None:
-        raise refuse(op, "there is no form of it in C", where)
+        raise refuse(op, "this operation is not implemented in C", where)
     flat = lambda *args: jax.tree.leaves(function(*args))
     return _inlined(jax.make_jaxpr(flat)(*_shapes(ins)), ins, block, where)
 
@@ -149,7 +150,7 @@ def _shapes(ins: list[Atom]) -> list[Any]:
 
 
 def _computed(eqn: Any, ins: list[Any], outs: Any) -> list[Atom]:
-    """The outputs of an equation whose inputs are known."""
+    """The outputs of an equation whose inputs are all known, computed now."""
     values = [a.value for a in ins]
     dtypes = [dtype for _, dtype in outs]
     result = folded(eqn.primitive.name, values, eqn.params, dtypes)
@@ -162,14 +163,14 @@ def _computed(eqn: Any, ins: list[Any], outs: Any) -> list[Atom]:
 
 
 def _is_error(callback: Any) -> bool:
-    """Whether it is the one with which Equinox raises an error."""
+    """Whether a callback is the one with which Equinox raises errors."""
     function = getattr(callback, "callback_func", callback)
     return getattr(function, "__module__", "") == "equinox._errors"
 
 
 def _failed(outs: Any, block: Block, where: str) -> Sequence[Atom]:
-    """What stands in place of an error that is raised at run time: a node that notes
-    it, whose values are NaN, or zero where they cannot be."""
+    """The outputs of a node that notes an error at run time, in place of raising it.
+    They are NaN, or zero if the type has no NaN."""
     kinds = tuple((shape, str(dtype)) for shape, dtype in outs)
     return _node("error", [], outs, dict(kinds=kinds), block, where)
 
@@ -177,11 +178,11 @@ def _failed(outs: Any, block: Block, where: str) -> Sequence[Atom]:
 def _node(
     op: str, ins: list[Atom], outs: Any, params: Any, block: Block, where: str
 ) -> Sequence[Atom]:
-    """The outputs of a new node, or of a like one that is there already."""
+    """The outputs of a new node, or of an equal node that exists already."""
     same = _unchanged(op, ins, outs, params)
     if same is not None:
         return [same]
-    # What does not depend on a loop is computed before it.
+    # A node that does not depend on a loop is computed before the loop.
     depth = max((a.depth for a in ins if isinstance(a, Var)), default=0)
     while (
         "blocks" not in params
@@ -198,7 +199,7 @@ def _node(
         around = around.parent
     for shape, dtype in outs:
         if not is_supported(dtype):
-            raise refuse(op, f"its type {dtype} has no form in C", where)
+            raise refuse(op, f"C has no type for {dtype}", where)
         if not all(isinstance(extent, int) for extent in shape):
             raise refuse(op, "its shape is not known", where)
     made = [Var(shape, dtype, block.depth) for shape, dtype in outs]
@@ -225,7 +226,7 @@ def _name(atom: Atom) -> Any:
 
 
 def _unchanged(op: str, ins: list[Atom], outs: Any, params: Any) -> Atom | None:
-    """An input that an operation leaves as it is."""
+    """The input that an operation returns unchanged; `None` if it changes it."""
     (shape, dtype), *more = outs
     if more or not ins:
         return None
@@ -265,7 +266,7 @@ def _inside(closed: Any, args: Sequence[Atom], block: Block, where: str) -> None
 
 
 def _counts(params: Any) -> tuple[int, int]:
-    """The numbers of constants and of carried values of a scan."""
+    """The number of constants and the number of carried values of a scan."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     consts, carry, _ = params["ft_in"].unpack()
@@ -281,7 +282,7 @@ def _scan(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom]
         empty = [Const(np.zeros(*form(v.aval))) for v in eqn.outvars[m:]]
         return [*carry, *empty]
     body = Block(block, True)
-    # What each step leaves as it is, is no part of the carry.
+    # Values that no step changes need not be carried.
     fixed = [closed.jaxpr.outvars[i] is closed.jaxpr.invars[n + i] for i in range(m)]
     given: list[Atom] = [
         a if same else body.param(a.shape, a.dtype)
@@ -330,8 +331,8 @@ def _while(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
 
 
 def _of_batch(params: Any) -> dict[str, Any]:
-    """One loop for a batch of them: it goes on while one member does, and those that
-    have ended keep their values."""
+    """One loop in place of a batch of loops. It goes on until all members have ended. A
+    member that has ended keeps its values."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     cond, body = params["cond_jaxpr"], params["body_jaxpr"]
     tests, turn = jaxpr_as_fun(cond), jaxpr_as_fun(body)

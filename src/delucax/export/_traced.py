@@ -1,4 +1,4 @@
-"""A controller as programs of arrays: its step, what it does when it is applied."""
+"""A controller as two programs of arrays: its step, and its `applied`."""
 
 from typing import Any
 
@@ -20,9 +20,12 @@ _MOST_TRIED = 16
 class TracedController:
     """The programs of a controller.
 
-    - `step`, `applied`: with the arrays of the state as further inputs and outputs.
-    - `start`, `paths`: these arrays at the start, and where they stand in the state.
-    - `observations`, `controls`: the size of an observation, the shape of a control.
+    - `step`, `applied`: the blocks of `__call__` and `applied`. The arrays of the state
+        are further inputs and outputs.
+    - `start`: the arrays of the first state.
+    - `paths`: the places of these arrays in the state.
+    - `observations`: the size of an observation.
+    - `controls`: the shape of a control.
     """
 
     def __init__(self, controller: Any, dtype: np.dtype, example: Any, key: Any):
@@ -51,7 +54,7 @@ class TracedController:
             def flatten(state):
                 changing, rest = eqx.partition(state, eqx.is_array)
                 flat, after = jax.tree.flatten(changing)
-                # The precision may be that of the process, of which C knows none.
+                # Compare kinds: a leaf may have the precision of this process.
                 alike = after == structure and all(
                     leaf.shape == shape
                     and (is_key(kind) or leaf.dtype.kind == kind.kind)
@@ -61,7 +64,7 @@ class TracedController:
                     raise Unsupported(
                         f"{_UNLIKE}, {eqx.tree_pformat(start)}, got "
                         f"{eqx.tree_pformat(state)}. What changes must be a JAX array "
-                        "from the start."
+                        "from init on."
                     )
                 return [
                     jnp.asarray(as_words(leaf), None if is_key(kind) else kind)
@@ -105,25 +108,25 @@ def _first_state(controller: AbstractController, dtype: np.dtype, key: Any) -> A
             raise
         raise Unsupported(
             f"export.c: {type(controller).__name__} cannot be exported without key=, "
-            f"such as jax.random.key(0), that its draws begin with ({error})"
+            f"because it draws random numbers; give jax.random.key(0), say ({error})"
         ) from error
     for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array)):
         if is_key(leaf.dtype) and not is_ours(leaf.dtype):
             raise Unsupported(
                 f"export.c: {type(controller).__name__} cannot be exported: it draws "
-                f"with a {leaf.dtype}, and C has threefry2x32 alone."
+                f"with a {leaf.dtype}, and C draws with threefry2x32 only."
             )
     return cast(state, dtype)
 
 
 def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: Any):
-    """The shape of the observation: that of the example, or the one size that fits."""
+    """The shape of an observation: as in the example, else the only size that fits."""
     if example is not None:
         y = np.asarray(example) if not hasattr(example, "shape") else example
         if len(y.shape) != 1:
             raise ValueError(
-                "export.c: example must be an observation, a vector, for a "
-                f"controller, got shape {tuple(y.shape)}."
+                "export.c: example must be an observation of a controller, a vector, "
+                f"got shape {tuple(y.shape)}."
             )
         return jax.ShapeDtypeStruct(tuple(y.shape), dtype)
     fitting = []
@@ -131,7 +134,7 @@ def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: A
         y = jax.ShapeDtypeStruct((size,), dtype)
         try:
             jax.eval_shape(step, number, y, *state)
-        except Exception:  # noqa: BLE001 - whatever the controller raises for it
+        except Exception:  # noqa: BLE001 - a controller may raise anything
             continue
         fitting.append(y)
         if len(fitting) > 1:
@@ -140,5 +143,5 @@ def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: A
         return fitting[0]
     raise ValueError(
         "export.c: example must be an observation (zeros of its shape are enough), "
-        "as the controller does not tell its size."
+        "because the controller does not fix its size."
     )

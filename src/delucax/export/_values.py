@@ -1,7 +1,7 @@
-"""Arrays while C is written: what an index reads.
+"""The arrays of a program while its C is written.
 
-An array may be a table of constants, a view of memory, a few scalars, or a formula that
-is written out where it is read.
+An array may be a table of constants, a view of memory, a few scalars, or a formula,
+which is written out wherever it is read.
 """
 
 import abc
@@ -30,8 +30,8 @@ _SMALL = 16
 class Buffer:
     """Memory: an argument, or a part of an array on the stack.
 
-    `home` is the scope that it was made in, and `block` the one in which it may be
-    changed.
+    `home` is the scope in which it was made, `block` the scope in which it may be
+    changed. `holders` counts the variables whose arrays use it.
     """
 
     __slots__ = ("block", "dtype", "holders", "home", "is_own", "name", "size")
@@ -43,7 +43,7 @@ class Buffer:
 
 
 class Value(abc.ABC):
-    """An array. `buffers` are the memory that reading it reads."""
+    """An array. Reading it reads the memory `buffers`."""
 
     shape: tuple[int, ...]
     dtype: Any
@@ -55,16 +55,16 @@ class Value(abc.ABC):
 
     @abc.abstractmethod
     def at(self, indices: Indices) -> Expr:
-        """The entry."""
+        """The entry at these indices."""
 
     def entries(self) -> list[Expr]:
-        """All of them, in order."""
+        """All entries, in row-major order."""
         ranges = map(range, self.shape)
         return [self.at(tuple(map(known, i))) for i in itertools.product(*ranges)]
 
 
 class Table(Value):
-    """A known array; `name` names it in C once it is read by an index."""
+    """A known array. `named` adds it to the file and returns its name in C."""
 
     def __init__(self, array: np.ndarray, named: Callable[[np.ndarray], str]):
         self.array, self.named = array, named
@@ -85,8 +85,8 @@ class Table(Value):
         return Expr(f"{name}[{index.text}]", self.dtype, reads, low=low, high=high)
 
     def least(self) -> tuple[np.ndarray, tuple[int, ...]]:
-        """The array without axes along which nothing changes, and strides to read it
-        with."""
+        """The array without the axes along which it is constant, and the strides to
+        read it with."""
         least, kept = self.array, []
         for axis, extent in enumerate(self.shape):
             first = least.take([0], axis)
@@ -98,7 +98,7 @@ class Table(Value):
 
     @property
     def is_uniform(self) -> bool:
-        """Whether all entries are the same."""
+        """Whether all entries are equal."""
         first = self.array.flat[:1]
         same = self.array == first
         if self.dtype.kind == "f":
@@ -107,7 +107,7 @@ class Table(Value):
 
 
 class Scalars(Value):
-    """A few entries, an expression for each."""
+    """An array of a few entries, with an expression for each entry."""
 
     def __init__(self, shape: Sequence[int], dtype: Any, parts: list[Expr], buffers):
         self.shape, self.dtype, self.parts = tuple(shape), dtype, parts
@@ -124,7 +124,7 @@ class Scalars(Value):
 
 
 class View(Value):
-    """Memory with an offset and strides."""
+    """An array in memory, with an offset and strides."""
 
     def __init__(
         self,
@@ -152,14 +152,14 @@ class View(Value):
 
     @property
     def pointer(self) -> str:
-        """The address of the first entry."""
+        """The address of the first entry, as text in C."""
         if self.start.is_known and self.start.const == 0:
             return self.buffer.name
         return f"{self.buffer.name} + {self.start.text}"
 
 
 class Formula(Value):
-    """A function of indices."""
+    """An array that is a function of its indices."""
 
     def __init__(
         self,
@@ -171,7 +171,7 @@ class Formula(Value):
     ):
         self.shape, self.dtype, self._at = tuple(shape), dtype, at
         self.buffers = frozenset().union(*(v.buffers for v in of))
-        # That of the formulas in it is done again wherever it is read.
+        # Each read computes the formulas inside again.
         self.cost = cost + sum(v.cost for v in of if isinstance(v, Formula))
 
     def at(self, indices: Indices) -> Expr:
@@ -179,7 +179,7 @@ class Formula(Value):
 
 
 def broadcast(indices: Indices, shape: Sequence[int]) -> Indices:
-    """The index of an operand, whose axes of one entry are read again and again."""
+    """The index of an operand that is broadcast along its axes of one entry."""
     if not shape:
         return ()
     pairs = zip(indices, shape, strict=True)
@@ -189,7 +189,7 @@ def broadcast(indices: Indices, shape: Sequence[int]) -> Indices:
 def remapped(
     value: Value, shape: Sequence[int], index: Callable[[Indices], Indices]
 ) -> Value:
-    """The array whose entry at `i` is that of `value` at `index(i)`, an affine map."""
+    """The array whose entry at `i` is `value` at `index(i)`, an affine map."""
     shape = tuple(shape)
     if isinstance(value, Scalars):
         corners = itertools.product(*map(range, shape))
@@ -211,7 +211,7 @@ def remapped(
 
 
 def reshaped(value: Value, shape: Sequence[int]) -> Value | None:
-    """The same entries in another shape; `None` if they must first be in memory."""
+    """The same entries in another shape; `None` if they must be copied for it."""
     shape = tuple(shape)
     if isinstance(value, Scalars):
         return Scalars(shape, value.dtype, value.parts, value.buffers)
@@ -219,7 +219,7 @@ def reshaped(value: Value, shape: Sequence[int]) -> Value | None:
         return Table(value.array.reshape(shape), value.named)
     if isinstance(value, View) and value.is_contiguous:
         return View(value.buffer, shape, None, value.start)
-    # Axes of one entry come and go freely.
+    # Axes of one entry may be added and removed freely.
     old = [axis for axis, n in enumerate(value.shape) if n != 1]
     new = [axis for axis, n in enumerate(shape) if n != 1]
     if [value.shape[a] for a in old] != [shape[a] for a in new]:
@@ -233,5 +233,5 @@ def reshaped(value: Value, shape: Sequence[int]) -> Value | None:
 
 
 def reads_of(parts: Sequence[Expr]) -> frozenset[str]:
-    """The names in the expressions."""
+    """The names that the expressions read."""
     return union(p.reads for p in parts) if parts else NOTHING
