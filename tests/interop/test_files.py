@@ -45,7 +45,7 @@ def test_time_is_what_the_file_or_the_caller_says(written):
         read_linear(path)
     path = written(A=A, B=B, dt=0.0)
     assert isinstance(read_linear(path), dlx.systems.LinearSystem)
-    with user_error(match=r"dt must be that of .*, 0.0, or left out, got 0.1"):
+    with user_error(match=r"dt must be 0.0, the one in .*, or left out, got 0.1"):
         read_linear(path, dt=0.1)
 
 

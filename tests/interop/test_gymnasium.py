@@ -106,7 +106,7 @@ def test_gymnasiums_time_limit_is_what_ends():
     assert length(make(horizon=5)) == 5
     assert length(make(max_episode_steps=250, disturbance=noisy)) == 200
     assert length(make(max_episode_steps=250, cost=final)) == 200
-    with user_error(match="truncate must be True where there are disturbances"):
+    with user_error(match="truncate must be True if there are disturbances"):
         interop.GymnasiumEnv(dlx.make("pendulum", disturbance=noisy), truncate=False)
     make = lambda **kwargs: gymnasium.make_vec("delucax/Pendulum-v1", 2, **kwargs)
     assert make().environment.horizon == 200

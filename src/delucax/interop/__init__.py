@@ -1,4 +1,5 @@
-"""Conversions to and from other libraries. gymnax and files need no extra."""
+"""Conversions to and from other libraries. The conversions to and from gymnax, and
+files of linear models, need no extra."""
 
 from . import gymnax as gymnax
 from ._linear_models import (

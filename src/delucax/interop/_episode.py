@@ -1,4 +1,4 @@
-"""Reset and step of an environment, shared by the adapters to other libraries."""
+"""The reset and the step of an environment, which the adapters share."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,9 +17,9 @@ from ..environments import Environment
 
 
 class HashableEnvironment:
-    """A hashable environment, equal to another if all of their numbers are.
+    """A hashable environment. Two are equal if all their numbers are equal.
 
-    It is the key of a cache of functions that have the numbers as constants.
+    It is the key in a cache of compiled functions, which hold the numbers as constants.
     """
 
     def __init__(self, env: Environment):
@@ -40,7 +40,7 @@ class HashableEnvironment:
 
 
 class Signals(NamedTuple):
-    """The disturbances and the sensor noise of a whole episode, where there are any."""
+    """The disturbances and the sensor noise of a whole episode; `None` if not drawn."""
 
     disturbances: Float[Array, "steps disturbances"] | None = None
     noise: Float[Array, "times observations"] | None = None
@@ -50,14 +50,15 @@ NO_SIGNALS = Signals()
 
 
 class EpisodeState(eqx.Module):
-    """The state of an episode: of the plant, the step count and the drawn signals.
+    """The state of an episode: the state of the plant, the number of steps, and the
+    signals that were drawn.
 
     **Arguments:**
 
-    - `state`: of the environment, shape `(state_size,)`.
-    - `time`: steps since it began.
-    - `signals`: the disturbances and the noise of the whole episode, drawn when it
-        began; none by default.
+    - `state`: the state of the environment, shape `(state_size,)`.
+    - `time`: the number of steps since the start of the episode.
+    - `signals`: the disturbances and the sensor noise of the whole episode, drawn at
+        its start; none by default.
     """
 
     state: Array
@@ -75,20 +76,20 @@ class StepOutcome(NamedTuple):
 
 
 def has_signals(env: Environment) -> bool:
-    """Whether anything is drawn for an episode."""
+    """Whether disturbances or sensor noise are drawn for an episode."""
     return not isinstance(env.disturbance, Zero) or env.sensor_noise is not None
 
 
 def begin(env: Environment, key: PRNGKey, state: State | None = None) -> EpisodeState:
-    """The start, by default that of the episode of `rollout` with the same key."""
+    """Start an episode: the one that `rollout` runs with this key, or from `state`."""
     start_key, w_key, noise_key, _ = env.split_key(key)
     x = env.reset(start_key) if state is None else state
     w = noise = None
     if env.disturbance is not None and not isinstance(env.disturbance, Zero):
         w = env.disturbance.draw(w_key, env.dt, env.horizon, x.dtype)
     if env.sensor_noise is not None:
-        # The state after the last step is observed too. Where what is recorded ends
-        # there, its last row is the noise of that.
+        # The state after the last step is observed too. If the recorded noise has no
+        # row for it, repeat its last row.
         recorded = env.sensor_noise.recorded_steps
         ends = recorded is not None and recorded <= env.horizon
         steps = env.horizon + (not ends)
@@ -98,12 +99,12 @@ def begin(env: Environment, key: PRNGKey, state: State | None = None) -> Episode
 
 
 def time_of(env: Environment, episode: EpisodeState) -> Scalar:
-    """The time, in the precision of the state."""
+    """The time of an episode, in the precision of its state."""
     return (episode.time * env.dt).astype(episode.state.dtype)
 
 
 def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"]:
-    """The encoded observation, with sensor noise."""
+    """The encoded observation with sensor noise, shape `(feature_size,)`."""
     x, noise = episode.state, episode.signals.noise
     y = env.dynamics.observe(time_of(env, episode), x)
     return env.encode(y if noise is None else (y + noise[episode.time]).astype(x.dtype))
@@ -112,7 +113,8 @@ def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"
 def step(
     env: Environment, episode: EpisodeState, action: Array, truncate: bool = True
 ) -> tuple[EpisodeState, StepOutcome]:
-    """One step. The last one, at the horizon if `truncate`, adds the final cost."""
+    """One step. The last step adds the final cost. With `truncate` the horizon ends an
+    episode."""
     x, w = episode.state, episode.signals.disturbances
     w = None if w is None else w[episode.time]
     transition = env.step(time_of(env, episode), x, action, w)
@@ -127,6 +129,6 @@ def step(
 
 
 def reads_first_argument(function: Callable[..., Any], *args: Any) -> bool:
-    """Whether anything is computed of the first of `args`, an array."""
+    """Whether the function uses the first of its arguments, an array."""
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     return any(jaxpr.invars[0] is v for e in jaxpr.eqns for v in e.invars)

@@ -1,4 +1,4 @@
-"""Linear models out of files and of python-control, and back."""
+"""Linear models from files, and from and to python-control."""
 
 import os
 from collections.abc import Sequence
@@ -18,22 +18,24 @@ from ..systems import LinearSystem
 def read_linear(
     path: str | os.PathLike, *, dt: Any = None
 ) -> LinearSystem | LinearDynamics:
-    """A linear model from a file of its matrices, `.npz` of NumPy or `.mat` of MATLAB.
+    r"""Read a linear model from a file of its matrices: `.npz` of NumPy or `.mat` of
+    MATLAB.
 
-    The file holds `A` and `B`, and may hold `C`, `E` (how disturbances enter), `D` if
-    it is zero, and the step `dt`.
+    The model is $\dot x = A x + B u + E w$ in continuous time, or
+    $x_{k+1} = A x_k + B u_k + E w_k$, with the observation $y = C x$. The file must
+    hold `A` and `B`. It may also hold `C`, `E`, the step `dt`, and a `D` that is zero.
 
     **Arguments:**
 
-    - `path`: the file.
-    - `dt`: the step, 0 for continuous time; by default the one that the file holds.
+    - `path`: the path of the file.
+    - `dt`: the step, or 0 for continuous time. By default it is the `dt` of the file.
 
-    **Returns:** [`delucax.LinearDynamics`][] with a step, and
-    [`delucax.systems.LinearSystem`][] in continuous time.
+    **Returns:** a [`delucax.systems.LinearSystem`][] if the step is 0, else
+    [`delucax.LinearDynamics`][].
 
-    **Raises:** `ValueError` if the file is of another kind, lacks `A`, `B` or a step,
-    has one that differs from `dt`, has a `D` that is not zero, or if shapes do not fit;
-    `OSError` if it cannot be read.
+    **Raises:** `ValueError` if the file has another format, lacks `A`, `B` or a step,
+    holds a step that differs from `dt` or a `D` that is not zero, or if shapes do not
+    fit. `OSError` if the file cannot be read.
 
     !!! example
 
@@ -42,7 +44,13 @@ def read_linear(
         import numpy as np
 
         np.savez("plant.npz", A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [1.0]], dt=0.1)
-        env = dlx.make("lds", system=dlx.interop.read_linear("plant.npz"))
+        model = dlx.interop.read_linear("plant.npz")
+        env = dlx.make("lds", system=model)
+        model.A
+        ```
+
+        ```text
+        OUT
         ```
     """
     where = "read_linear"
@@ -60,7 +68,7 @@ def read_linear(
     step = float(np.reshape(held.get("dt", dt), ()))
     if dt is not None and float(dt) != step:
         raise ValueError(
-            f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
+            f"{where}: dt must be {step}, the one in '{path}', or left out, got {dt}."
         )
     return _linear_model(held["A"], held["B"], held.get("C"), held.get("E"), step)
 
@@ -91,24 +99,28 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
 def to_control(
     model: LinearSystem | LinearDynamics, *, disturbances: bool = False
 ) -> Any:
-    """A linear model as a `control.StateSpace` of python-control,
+    """Convert a linear model to a `control.StateSpace` of python-control.
 
-    for its Bode, Nyquist and root-locus plots. Needs the extra `delucax[control]`. The
-    matrices are about the operating point, which `StateSpace` has no place for. States
-    and inputs keep their names; outputs are named after the states where the state is
-    observed, and `y[0]`, ... else.
+    Use it for the Bode, Nyquist and root-locus plots of python-control. It needs the
+    extra `delucax[control]`. The result describes deviations from the operating point
+    of the model: `StateSpace` cannot store that point. States and inputs keep their
+    names. If the whole state is observed, outputs have the names of the states, else
+    `y[0]`, `y[1]`, ...
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `disturbances`: append the columns of `E` to the inputs, named `w0`, ... (default:
-        controls alone).
+    - `disturbances`: whether to append the columns of `E` to the inputs, with the names
+        `w0`, `w1`, ... By default the inputs are the controls only. Dynamics without
+        `E` append the identity.
 
-    **Returns:** a `control.StateSpace`, with the step of the dynamics.
+    **Returns:** a `control.StateSpace`. Its step is the step of the dynamics, or 0 for
+    a system.
 
-    **Raises:** `ImportError` without python-control; `ValueError` if `model` is not
-    linear, is time-varying or is being traced, or if there is no `E` to append.
+    **Raises:** `ImportError` without python-control. `ValueError` if `model` is not
+    linear, is time-varying or is being traced, or is a system without `E` whose
+    disturbances are asked for.
 
     !!! example
 
@@ -116,7 +128,11 @@ def to_control(
         import delucax as dlx
 
         upright = dlx.linearize(dlx.systems.Pendulum())
-        dlx.interop.to_control(upright).poles()
+        dlx.interop.to_control(upright).poles().real
+        ```
+
+        ```text
+        OUTPOLES
         ```
     """
     where = "to_control"
@@ -157,24 +173,25 @@ def to_control(
 def from_control(
     system: Any, *, disturbances: Sequence[str | int] = ()
 ) -> LinearSystem | LinearDynamics:
-    """A `control.StateSpace` of python-control as a linear model,
+    """Convert a `control.StateSpace` of python-control to a linear model.
 
-    about the origin. Needs the extra `delucax[control]`. States and controls keep their
-    names. A `C` that is the identity is left out: the state is observed.
+    The operating point of the model is the origin. The conversion needs the extra
+    `delucax[control]`. States and controls keep their names. If `C` is the identity, it
+    is left out, because the state is then observed.
 
     **Arguments:**
 
     - `system`: a `control.StateSpace` without feed-through: its `D` must be zero.
-    - `disturbances`: the inputs, by name or index, that are disturbances: the columns
-        of `E`, in this order; none by default.
+    - `disturbances`: the inputs that are disturbances, by name or index. They become
+        the columns of `E`, in this order; none by default.
 
-    **Returns:** [`delucax.systems.LinearSystem`][] if its step is 0, and
-    [`delucax.LinearDynamics`][] if it has one (`True`, a step that is not given, is the
-    default of 1).
+    **Returns:** a [`delucax.systems.LinearSystem`][] if `system.dt` is 0, else
+    [`delucax.LinearDynamics`][] with that step. `True`, discrete time without a step,
+    becomes a step of 1.
 
-    **Raises:** `ImportError` without python-control; `ValueError` if `system` is no
-    `StateSpace`, has a `D` that is not zero, states neither continuous nor discrete
-    time, has no states, or has no such input.
+    **Raises:** `ImportError` without python-control. `ValueError` if `system` is not a
+    `StateSpace`, has a `D` that is not zero, has no time base or no states, or if one
+    of `disturbances` is not an input.
 
     !!! example
 
@@ -184,6 +201,10 @@ def from_control(
 
         integrator = control.ss([[0.0]], [[1.0]], [[1.0]], 0, inputs=["force"])
         dlx.interop.from_control(integrator).control_names
+        ```
+
+        ```text
+        ('force',)
         ```
     """
     where = "from_control"
@@ -232,7 +253,7 @@ def _check_no_feed_through(D: Any, where: str) -> None:
     """Raise if `D` is not zero."""
     if np.any(D):
         raise ValueError(
-            f"{where}: D must be zero, as the models here have no feed-through, got "
+            f"{where}: D must be zero, because delucax has no feed-through, got "
             f"{D.tolist()}."
         )
 
@@ -240,7 +261,7 @@ def _check_no_feed_through(D: Any, where: str) -> None:
 def _linear_model(
     A: Any, B: Any, C: Any, E: Any, dt: float, **names: Any
 ) -> LinearSystem | LinearDynamics:
-    """A system if the step is 0, which says continuous time; else dynamics."""
+    """A system if the step is 0 (continuous time), else dynamics."""
     if dt == 0:
         return LinearSystem(A, B, C, E, **names)
     return LinearDynamics(A, B, C, E, dt=dt, **names)

@@ -1,4 +1,4 @@
-"""The spaces of actions and of observations."""
+"""The spaces of actions and observations."""
 
 import sys
 from typing import Any
@@ -14,34 +14,33 @@ from ..environments import Environment
 
 
 def has_discrete_actions(env: Environment, discrete: bool | None, where: str) -> bool:
-    """Whether actions are indices into the table of `actions`: by default if there is
-    one."""
+    """Whether actions are indices into the table `env.actions`. By default they are if
+    the environment has such a table."""
     if discrete is None:
         return env.actions is not None
     if check_bool(discrete, "discrete", where) and env.actions is None:
         raise ValueError(
-            f"{where}: discrete needs a table of actions in the environment, which has "
-            "none."
+            f"{where}: discrete needs a table of actions, but the environment has none."
         )
     return bool(discrete)
 
 
 def action_ends(env: Environment) -> tuple[Any, Any]:
-    """`(low, high)` of the controls. An infinite side ends at 1000, because samples are
-    drawn from the space."""
+    """The bounds `(low, high)` of the controls. An infinite bound becomes 1000, because
+    users draw samples from the space."""
     return _finite_ends(env.control_bounds, env.control_size, 1e3)
 
 
 def observation_ends(env: Environment, largest: float = FLOAT32_MAX) -> tuple[Any, Any]:
-    """`(low, high)` of what `encode` returns; bounds that are infinite end at the
-    largest number."""
+    """The bounds `(low, high)` of what `encode` returns. An infinite bound becomes
+    `largest`."""
     bounds = env.observation_bounds
     bounds = (-FLOAT32_MAX, FLOAT32_MAX) if bounds is None else bounds
     return _finite_ends(bounds, env.feature_size, largest)
 
 
 def _finite_ends(bounds: Any, size: int, largest: float) -> tuple[Any, Any]:
-    """Finite bounds of shape `(size,)`, NumPy arrays unless they are traced."""
+    """Finite bounds of shape `(size,)`, as NumPy arrays unless they are traced."""
     low, high = (-np.inf, np.inf) if bounds is None else bounds
     numpy = np if is_concrete(low) and is_concrete(high) else jnp
     finite = lambda end: numpy.nan_to_num(end, posinf=largest, neginf=-largest)
@@ -50,7 +49,7 @@ def _finite_ends(bounds: Any, size: int, largest: float) -> tuple[Any, Any]:
 
 
 class Box:
-    """The arrays between two ends."""
+    """The space of arrays between two bounds."""
 
     def __init__(self, low: Any, high: Any, shape: tuple[int, ...], dtype: Any):
         self.low, self.high = low, high
@@ -61,7 +60,7 @@ class Box:
         return jr.uniform(key, self.shape, self.dtype, self.low, self.high)
 
     def contains(self, x: Any) -> Array:
-        """Whether `x` lies between the ends."""
+        """Whether `x` lies between the bounds."""
         return jnp.all((x >= self.low) & (x <= self.high))
 
     def __repr__(self):
@@ -69,7 +68,7 @@ class Box:
 
 
 class Discrete:
-    """The whole numbers from 0 to `n - 1`."""
+    """The space of the whole numbers from 0 to `n - 1`."""
 
     def __init__(self, n: int):
         self.n, self.shape, self.dtype = n, (), jnp.zeros((), int).dtype
@@ -79,7 +78,7 @@ class Discrete:
         return jr.randint(key, (), 0, self.n, self.dtype)
 
     def contains(self, x: Any) -> Array:
-        """Whether `x` is one of them."""
+        """Whether `x` is one of these numbers."""
         return (jnp.asarray(x) >= 0) & (jnp.asarray(x) < self.n)
 
     def __repr__(self):
@@ -87,15 +86,15 @@ class Discrete:
 
 
 def gymnax_space(space: int | tuple[Any, Any]) -> Any:
-    """A `Discrete` of that size, or a `Box` between two ends.
+    """A `Discrete` of a given size, or a `Box` between two bounds.
 
-    If gymnax has been imported, these are its own classes, because its clients call
-    `isinstance`.
+    If gymnax has been imported, these are the classes of gymnax, because code for
+    gymnax checks them with `isinstance`.
     """
     classes: Any = sys.modules.get("gymnax.environments.spaces", sys.modules[__name__])
     if isinstance(space, int):
         return classes.Discrete(space)
-    # A float if all entries are equal, so that the space is hashable; rejax needs that.
+    # Bounds are floats if all entries are equal: rejax needs a hashable space.
     is_number = lambda end: is_concrete(end) and np.all(end == end[0])
     low, high = (float(e[0]) if is_number(e) else jnp.asarray(e) for e in space)
     return classes.Box(low, high, space[0].shape, jnp.zeros(()).dtype)

@@ -1,6 +1,6 @@
-"""The tasks in Gymnasium's interface. Needs the extra `delucax[gymnasium]`.
+"""The tasks with Gymnasium's interface. Needs the extra `delucax[gymnasium]`.
 
-Importing it tells Gymnasium of them: `gymnasium.make("delucax/Pendulum-v1")`.
+The import registers the tasks, so that `gymnasium.make("delucax/Pendulum-v1")` works.
 """
 
 from ..._extras import extra as _extra

@@ -1,8 +1,8 @@
-"""The step of an environment in C, in memory that is made once.
+"""The step of an environment in C, in memory that is allocated once.
 
-The function in C is that of the packed array, as JAX compiles it. It is traced and
-written when it is first asked for, because that alone says what the environment does;
-what the compiler makes of it is kept on disk.
+The function in C is the same function of the packed array that JAX compiles. Each
+process traces the environment and writes the C again, because only the C says what the
+environment does. The compiled library is kept on disk.
 """
 
 import functools
@@ -19,7 +19,7 @@ from . import _program as programs
 
 
 class _Row:
-    """What is drawn for this step, in place of a table of all steps."""
+    """The row of this step, in place of a table of the rows of all steps."""
 
     def __init__(self, row: Any):
         self.row = row
@@ -29,10 +29,10 @@ class _Row:
 
 
 def exported_stepper(env: Environment, discrete: bool, truncate: bool) -> Any:
-    """What `stepper` makes of a program of JAX, in C.
+    """As `stepper`, with the step in C instead of JAX.
 
-    **Raises:** `ValueError` if the environment cannot be exported, or there is no
-    compiler.
+    **Raises:** `ValueError` if the environment cannot be exported, or no compiler is
+    found.
     """
     step, size = _loaded(HashableEnvironment(env), discrete, truncate)
 
@@ -40,7 +40,7 @@ def exported_stepper(env: Environment, discrete: bool, truncate: bool) -> Any:
         given, after = np.zeros(length, dtype), np.zeros(size, dtype)
 
         def begin(signals):
-            # The noise is of the state after the step.
+            # The noise is the one of the state after the step, hence the shift.
             drawn = signals.disturbances, signals.noise
             tables = [
                 np.asarray(table)[shift:]

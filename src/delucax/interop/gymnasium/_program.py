@@ -1,10 +1,10 @@
-"""An environment as Gymnasium sees it: its spaces, and compiled functions of one array.
+"""An environment for Gymnasium: its spaces, and compiled functions of one array.
 
-A call of a compiled function costs a few microseconds for each array that goes in or
-comes out, which is more than the arithmetic. So all that a step returns is one array,
-`[state, observation, reward, terminated, truncated, failed, step]`, which goes back in
-with the action at its end, in memory that NumPy and JAX share; and the numbers of the
-environment are compiled in.
+A call of a compiled function costs a few microseconds for each input and output, which
+is more than the arithmetic. So a step returns a single array,
+`[state, observation, reward, terminated, truncated, failed, step]`. The next step takes
+this array with the action at its end, in memory that NumPy and JAX share. The numbers
+of the environment are constants of the compiled functions.
 """
 
 import functools
@@ -32,15 +32,15 @@ from .._spaces import action_ends, observation_ends
 def read_options(
     options: Any, env: Environment, where: str, count: int | None = None
 ) -> tuple[jax.Array | None, Any]:
-    """The options of a reset: the state to begin at, or of each of `count`, and which
-    of these are reset; `None` for what is left out."""
+    """The options of a reset: the first state and the mask of the environments to
+    reset, each `None` if it is left out. There are `count` environments, or one."""
     names = ("state",) if count is None else ("state", "reset_mask")
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"{where}: options must be a dictionary, got {options!r}.")
     options = dict(options or {})
     if unknown := [repr(name) for name in options if name not in names]:
         raise ValueError(
-            f"{where}: options takes {' and '.join(map(repr, names))} alone, got "
+            f"{where}: options takes only {' and '.join(map(repr, names))}, got "
             f"{', '.join(unknown)}."
         )
     state, mask = options.get("state"), options.get("reset_mask")
@@ -59,43 +59,43 @@ def read_options(
 
 
 def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:
-    """The actions, indices into their table or controls, and what `encode` returns."""
+    """The spaces of the actions (indices or controls) and of the observations."""
     box = lambda ends: Box(ends[0].astype(np.float32), ends[1].astype(np.float32))
     actions: Any = env.actions
-    # Gymnasium's own spaces are infinite where bounds are.
+    # As in Gymnasium, the bounds of observations may be infinite.
     observations = box(observation_ends(env, np.inf))
     return Discrete(len(actions)) if discrete else box(action_ends(env)), observations
 
 
 BACKENDS = ("jax", "c")
 REWARD, TERMINATED, TRUNCATED, FAILED, STEP = range(-5, 0)
-# The memory that JAX shares with NumPy begins at a multiple of it.
+# JAX shares memory with NumPy only if its address is a multiple of this.
 _ALIGNMENT = 64
 
 
 class Program(NamedTuple):
-    """The compiled functions."""
+    """The compiled functions of an environment."""
 
     start: Any  # (key, state or None) -> packed, signals
     step: Any  # (packed and action, signals if there are any) -> packed
     start_batch: Any
     step_batch: Any
-    states: slice  # where they are in the packed array
+    states: slice  # the place of the state in the packed array
     observation: slice
     size: int
 
 
 def program(env: Environment, discrete: bool, truncate: bool = True) -> Program:
-    """The program of an environment; one that is the same compiles no more."""
+    """The program of an environment. Equal environments share one."""
     return _compiled(HashableEnvironment(env), discrete, truncate)
 
 
 def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
-    """An array of NumPy, and one of JAX in the same memory.
+    """A NumPy array, and a JAX array in the same memory.
 
-    What is written to the first is in the second, so that nothing is transferred when a
-    compiled function is called with it. It is for the function alone: JAX takes it to
-    be constant, and nothing may be written before what was called has returned.
+    What you write to the NumPy array is in the JAX array too, so a call of a compiled
+    function transfers nothing. Use the JAX array only for such calls, and write only
+    when the call has returned, because JAX takes its arrays to be constant.
     """
     itemsize = np.dtype(dtype).itemsize
     memory = np.zeros(size * itemsize + _ALIGNMENT, np.uint8)
@@ -105,8 +105,12 @@ def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
 
 
 def stepper(program: Program) -> Any:
-    """Given a size and a dtype: what makes the step of an episode from its signals, the
-    memory of the packed array and the action, and that of the packed array after it."""
+    """A function that allocates the memory of steps.
+
+    It takes a size and a dtype. It returns `begin`, the array of the packed array and
+    the action, and the packed array after a step. `begin` makes the step of an episode
+    from its signals.
+    """
 
     def allocate(size, dtype):
         given, in_jax = shared(size, dtype)
@@ -127,7 +131,7 @@ def stepper(program: Program) -> Any:
 
 
 def draw_key(generator: np.random.Generator) -> PRNGKey:
-    """A random key from a generator of NumPy's, which Gymnasium seeds."""
+    """A random key from the NumPy generator that Gymnasium seeds."""
     return jr.key(int(generator.integers(2**32)))
 
 
@@ -141,7 +145,7 @@ def _compiled(same: HashableEnvironment, discrete: bool, truncate: bool) -> Prog
         if episodes.has_signals(env):
             episode = episodes.begin(env, key, state)
         else:
-            # Not splitting the key saves a third of the time of a batched reset.
+            # Without splitting the key, a batched reset takes a third less time.
             x = env.reset(key) if state is None else state
             episode = EpisodeState(x, jnp.zeros((), int))
         no = jnp.zeros((), bool)
@@ -179,21 +183,21 @@ def _packed(env: Environment, episode: EpisodeState, outcome: StepOutcome) -> Ar
 
 
 def _step_batch(step, start_batch, mode, packed, actions, signals, key):
-    """A step of each environment; ended episodes are reset as `mode` says.
+    """A step of each environment. Episodes that have ended are reset as `mode` says.
 
     **Returns:** the packed arrays, the packed arrays before the resets, the signals and
-    a key.
+    the next key.
     """
     ended = (packed[:, TERMINATED] + packed[:, TRUNCATED]) > 0
     last = jax.vmap(step)(packed, actions.astype(packed.dtype), signals)
     if mode == "Disabled":
-        # What has ended rests until it is reset.
+        # An episode that has ended does not change until it is reset.
         packed = jnp.where(ended[:, None], packed.at[:, REWARD].set(0), last)
         return packed, packed, signals, key
     if mode == "SameStep":
         ended = (last[:, TERMINATED] + last[:, TRUNCATED]) > 0
 
-    # A few resets at a time, because most steps end few episodes.
+    # Reset a few episodes at a time, because most steps end only a few.
     count = len(packed)
     few = min(count, max(16, count // 16))
 
@@ -202,7 +206,7 @@ def _step_batch(step, start_batch, mode, packed, actions, signals, key):
         which = jnp.flatnonzero(ended, size=few, fill_value=count)
         use, key = jr.split(key)
         first, drawn = start_batch(jr.split(use, few), None)
-        if mode == "SameStep":  # the reward and the flags are those of the old episode
+        if mode == "SameStep":  # keep the reward and the flags of the old episode
             outcome = slice(REWARD, STEP)
             first = first.at[:, outcome].set(last[which, outcome])
         put = lambda new, old: old.at[which].set(new, mode="drop")

@@ -1,4 +1,4 @@
-"""The tasks under Gymnasium's own `make`."""
+"""Registration of the tasks with Gymnasium, and functions that make them."""
 
 import inspect
 from typing import Any
@@ -17,8 +17,8 @@ from ._vector_env import GymnasiumVectorEnv
 
 
 _FUNCTIONS = {n: getattr(p, n) for p in (lung, environments) for n in dir(p)}
-# The name of a task, whether its actions are whole numbers, and Gymnasium's threshold
-# of the mean return from which it counts as solved.
+# The name of a task, whether its actions are whole numbers, and the mean return from
+# which Gymnasium counts it as solved.
 _IDS = {
     "Acrobot-v1": ("acrobot", True, -100.0),
     "AcrobotContinuous-v1": ("acrobot", False),
@@ -34,7 +34,7 @@ _OTHERS = {*environments.registered()} & {*_FUNCTIONS} - {n for n, *_ in _IDS.va
 _IDS |= {f"{n.title().replace('_', '')}-v1": (n, False) for n in sorted(_OTHERS)}
 
 
-# Tasks whose plants are drawn at random, unless one is given.
+# Tasks whose plant is random, and the arguments that set it or its key.
 _DRAWN = {"lds": ("A", "B", "system", "key"), "neural": ("system", "key")}
 
 
@@ -52,22 +52,24 @@ def make(
     backend: str = "jax",
     **kwargs: Any,
 ) -> GymnasiumEnv:
-    """The task of that name as a `gymnasium.Env`.
+    """Make a task by name as a `gymnasium.Env`.
 
-    `gymnasium.make("delucax/Pendulum-v1", length=1.2)` makes it too, once
-    `delucax.interop.gymnasium` has been imported. There `max_episode_steps`, of
-    Gymnasium, ends the episodes: the horizon of the task by default.
+    After the import of `delucax.interop.gymnasium`, you can also make it with
+    `gymnasium.make("delucax/Pendulum-v1", length=1.2)`. There Gymnasium's
+    `max_episode_steps` ends the episodes. By default it is the horizon of the task.
 
     **Arguments:**
 
-    - `task`: a name that [`delucax.make`][] knows.
-    - `discrete`, `render_mode`, `backend`: of
+    - `task`: the name of a task, as in [`delucax.make`][].
+    - `discrete`, `render_mode`, `backend`: arguments of
         [`delucax.interop.gymnasium.GymnasiumEnv`][].
-    - `**kwargs`: passed to the task. The random plants of `lds` and `neural` are drawn
-        with the fixed key `jax.random.key(0)` unless a `key` or a plant is given; so
-        does `gymnasium.make`.
+    - `**kwargs`: arguments of the task. The random plants of `lds` and `neural` are
+        drawn with the fixed key `jax.random.key(0)` unless you give a `key` or a plant,
+        also in `gymnasium.make`.
 
     **Returns:** a [`delucax.interop.gymnasium.GymnasiumEnv`][].
+
+    **Raises:** `ValueError` if an argument is wrong.
 
     !!! example
 
@@ -76,7 +78,12 @@ def make(
         import gymnasium
 
         env = gymnasium.make("delucax/Pendulum-v1", length=1.2)
-        env.reset(seed=0)
+        observation, info = env.reset(seed=0)
+        observation.shape
+        ```
+
+        ```text
+        (3,)
         ```
     """
     options: Any = dict(discrete=discrete, render_mode=render_mode, backend=backend)
@@ -84,11 +91,11 @@ def make(
 
 
 def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
-    """The entry point of all ids, whose episodes Gymnasium's time limit ends.
+    """The entry point of all ids. The time limit of Gymnasium ends the episodes.
 
-    Tasks that need a fixed length end at their own horizon instead: those with an
-    explicit horizon, with disturbances or noise, which are drawn for all of it, or with
-    an explicit cost that has a final cost.
+    Some tasks end at their own horizon instead: tasks with an explicit horizon; tasks
+    with disturbances or noise, because these are drawn for the whole horizon; and tasks
+    with an explicit cost that has a final cost.
     """
     options = "discrete", "render_mode", "backend"
     own = {name: kwargs.pop(name) for name in options if name in kwargs}
@@ -109,25 +116,25 @@ def make_vector(
     max_episode_steps: int | None = None,
     **kwargs: Any,
 ) -> GymnasiumVectorEnv:
-    """Many of the task of that name as one `gymnasium.vector.VectorEnv`.
+    """Make many copies of a task by name as one `gymnasium.vector.VectorEnv`.
 
     `gymnasium.make_vec("delucax/Pendulum-v1", num_envs=1024,
-    vectorization_mode="vector_entry_point")` calls it.
+    vectorization_mode="vector_entry_point")` calls this function.
 
     **Arguments:**
 
-    - `task`: a name that [`delucax.make`][] knows.
-    - `num_envs`: how many.
-    - `discrete`, `autoreset_mode`: of
+    - `task`: the name of a task, as in [`delucax.make`][].
+    - `num_envs`: the number of copies; 1 by default.
+    - `discrete`, `autoreset_mode`: arguments of
         [`delucax.interop.gymnasium.GymnasiumVectorEnv`][].
-    - `max_episode_steps`: steps an episode, if it is below the `horizon` that is given;
-        that of the task by default.
-    - `**kwargs`: passed to the task.
+    - `max_episode_steps`: the number of steps in an episode. If a `horizon` is given
+        too, the smaller number counts. By default it is the horizon of the task.
+    - `**kwargs`: arguments of the task.
 
     **Returns:** a [`delucax.interop.gymnasium.GymnasiumVectorEnv`][].
 
-    **Raises:** `ValueError` on a wrong argument, a `render_mode` among them: pictures
-    are of one environment.
+    **Raises:** `ValueError` if an argument is wrong, or if there is a `render_mode`:
+    only a single environment can be rendered.
 
     !!! example
 
@@ -135,16 +142,21 @@ def make_vector(
         from delucax.interop.gymnasium import make_vector
 
         envs = make_vector("pendulum", 16)
-        envs.reset(seed=0)
+        observations, infos = envs.reset(seed=0)
+        observations.shape
+        ```
+
+        ```text
+        (16, 3)
         ```
     """
     where = "make_vector"
     if kwargs.pop("render_mode", None) is not None:
         raise ValueError(
-            f"{where}: render_mode must be left out, for pictures are of one "
-            'environment (`gymnasium.make`, or `vectorization_mode="sync"`).'
+            f"{where}: render_mode must be left out, because only a single environment "
+            'can be rendered (`gymnasium.make`, or `vectorization_mode="sync"`).'
         )
-    if max_episode_steps not in (None, -1):  # -1 is Gymnasium's word for none
+    if max_episode_steps not in (None, -1):  # Gymnasium's -1 means no limit
         steps = check_count(max_episode_steps, "max_episode_steps", where)
         kwargs["horizon"] = min(steps, kwargs.get("horizon", steps))
     num_envs = check_count(num_envs, "num_envs", where)
@@ -160,7 +172,7 @@ for _name, (_task, _discrete, *_threshold) in _IDS.items():
         vector_entry_point=f"{__package__}:make_vector",
         max_episode_steps=_arguments["horizon"].default,
         reward_threshold=_threshold[0] if _threshold else None,
-        # Orders are checked by the environment itself.
+        # The environment itself raises if `step` is called before `reset`.
         order_enforce=False,
         kwargs={"task": _task, "discrete": _discrete},
     )

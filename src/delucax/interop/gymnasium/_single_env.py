@@ -1,4 +1,4 @@
-"""One environment with Gymnasium's interface."""
+"""A single environment with Gymnasium's interface."""
 
 import functools
 import operator
@@ -22,32 +22,33 @@ RENDER_MODES = ("rgb_array", "human")
 class GymnasiumEnv(gymnasium.Env):
     """A [`delucax.Environment`][] as a `gymnasium.Env`.
 
-    The observation is what `encode` makes of the environment's, in float32; the reward
-    is minus the cost, with the final cost in the last step. `terminated` is the
-    environment's; `truncated` is true at its horizon. Controls beyond the bounds are
-    clipped; without bounds, the action space ends at 1000. One step is one call of one
-    compiled function.
+    The observation is `encode` of the observation of the environment, in float32. The
+    reward is minus the cost. The last step adds minus the final cost. `terminated` is
+    the condition of the environment, and `truncated` is true at its horizon. Controls
+    outside the bounds are clipped; a control without bounds has the action space from
+    -1000 to 1000. Each step is one call of one compiled function.
 
     **Arguments:**
 
     - `env`: the environment.
     - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
-        default they are if there is such a table.
-    - `render_mode`: `"rgb_array"`, `"human"`, or none (default).
-    - `truncate`: whether episodes are truncated at the horizon, True by default. False
-        leaves that to a wrapper, such as Gymnasium's `TimeLimit`, where nothing is
-        drawn for the whole episode; no final cost is charged at its limit.
-    - `backend`: `"jax"` (default), or `"c"`: a step is then a call of C, which is
-        exported and compiled when the environment is made, and kept on disk. It needs a
-        C compiler. Resets are those of JAX.
+        default they are if the environment has such a table.
+    - `render_mode`: `"rgb_array"`, `"human"`, or `None` (default).
+    - `truncate`: whether episodes are truncated at the horizon, True by default. With
+        False, a wrapper such as Gymnasium's `TimeLimit` may end them, and no final cost
+        is charged there. An environment with disturbances or sensor noise needs True.
+    - `backend`: `"jax"` (default) or `"c"`. With `"c"`, a step is a call of C, which is
+        exported and compiled when you make the environment, and kept on disk. This
+        needs a C compiler. Resets still run in JAX.
 
     `reset(seed=..., options={"state": x})` starts at the state `x`.
 
-    **Raises:** `ValueError` on a wrong argument; for `backend="c"`, on an environment
-    that [`delucax.export.c`][] refuses, and where there is no compiler. `step` raises
-    `gymnasium.error.ResetNeeded` before `reset` and after the end,
-    `gymnasium.error.InvalidAction` on an action of the wrong shape or kind, not finite,
-    or not in the table; and `RuntimeError` if the simulation fails.
+    **Raises:** `ValueError` if an argument is wrong; with `backend="c"`, also if
+    [`delucax.export.c`][] cannot export the environment, or no compiler is found.
+    `step` raises `gymnasium.error.ResetNeeded` before the first `reset` and after the
+    end of an episode. It raises `gymnasium.error.InvalidAction` if the action has the
+    wrong shape or type, is not finite, or is not in the table; and `RuntimeError` if
+    the simulation fails.
 
     !!! example
 
@@ -58,6 +59,11 @@ class GymnasiumEnv(gymnasium.Env):
         env = GymnasiumEnv(dlx.make("pendulum", length=1.2))
         observation, info = env.reset(seed=0)
         observation, reward, terminated, truncated, info = env.step([0.5])
+        terminated, truncated
+        ```
+
+        ```text
+        (False, False)
         ```
     """
 
@@ -78,8 +84,8 @@ class GymnasiumEnv(gymnasium.Env):
         check_choice(backend, programs.BACKENDS, "backend", where)
         if not check_bool(truncate, "truncate", where) and has_signals(env):
             raise ValueError(
-                f"{where}: truncate must be True where there are disturbances or "
-                "sensor noise, which are drawn up to the horizon, got False."
+                f"{where}: truncate must be True if there are disturbances or sensor "
+                "noise, because these are drawn up to the horizon, got False."
             )
         self.environment = env
         self.discrete = has_discrete_actions(env, discrete, where)
@@ -97,7 +103,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._picture: Any = None
 
     def _compile(self) -> tuple[programs.Program, Any]:
-        """The program, and what makes a step in given memory."""
+        """The compiled functions, and a function that allocates the memory of steps."""
         given = self.environment, self.discrete, self.truncate
         program = programs.program(*given)
         if self.backend == "jax":
@@ -108,7 +114,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     @property
     def state(self) -> np.ndarray:
-        """The state, shape `(state_size,)`."""
+        """The current state, shape `(state_size,)`."""
         if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: there is no state before reset().")
         return self._buffer[self._program.states].copy()
@@ -116,11 +122,12 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode.
+        """Start an episode.
 
         **Arguments:**
 
-        - `seed`: of all that is random from now on; by default it goes on as it was.
+        - `seed`: the seed of all that is random from now on. By default the random
+            numbers continue.
         - `options`: `{"state": x}` starts at the state `x`.
 
         **Returns:** the observation, and an empty dictionary.
@@ -141,10 +148,10 @@ class GymnasiumEnv(gymnasium.Env):
         return packed[self._program.observation].astype(np.float32), {}
 
     def _allocate(self, dtype: Any) -> None:
-        """Make the arrays that steps are taken in."""
+        """Allocate the arrays of steps."""
         size, actions = self._program.size, self.action_space.shape or (1,)
-        # The packed array with the action after it, and the packed array of the next
-        # step, with views of their parts.
+        # One array holds the packed array and the action, another the packed array
+        # after the step. The other attributes are views of their parts.
         self._step_in_place, self._buffer, self._after = self._stepper(
             size + actions[0], dtype
         )
@@ -155,7 +162,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._observation = view.copy if view.dtype == single else copy
 
     def __getstate__(self):
-        """The attributes to copy: all but compiled functions and views."""
+        """The attributes to copy: all except compiled functions and views."""
         views = "_program _stepper _packed _action _after _outcome _observation"
         drop = {*views.split(), "_step_in_place", "_advance"}
         state = {k: v for k, v in self.__dict__.items() if k not in drop}
@@ -172,12 +179,12 @@ class GymnasiumEnv(gymnasium.Env):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step.
 
-        **Arguments:** `action`: in the action space.
+        **Arguments:** `action`: an action in the action space.
 
-        **Returns:** observation, reward, terminated, truncated, and an empty
-        dictionary.
+        **Returns:** the observation, the reward, `terminated`, `truncated`, and an
+        empty dictionary.
         """
-        # Hot path: the overhead of Python is as large as the arithmetic.
+        # Here the overhead of Python costs as much as the arithmetic.
         if self._ended:
             what = "not begun" if self._buffer is None else "ended"
             raise ResetNeeded(
@@ -185,7 +192,7 @@ class GymnasiumEnv(gymnasium.Env):
             )
         try:
             control = self._read(action)
-        except (TypeError, ValueError):  # not an integer; ragged
+        except (TypeError, ValueError):  # not an integer, or ragged
             self._invalid_action(action)
         if self.discrete:
             is_valid = 0 <= control < self._count
@@ -210,8 +217,8 @@ class GymnasiumEnv(gymnasium.Env):
         if self.discrete:
             raise InvalidAction(
                 f"GymnasiumEnv: action must be a whole number from 0 to "
-                f"{self._count - 1}, got {shortened(action)}; discrete=False takes the "
-                "control itself."
+                f"{self._count - 1}, got {shortened(action)}; to pass the control "
+                "itself, use discrete=False."
             )
         raise InvalidAction(
             f"GymnasiumEnv: action must be numbers of shape {self._shape}, got "
@@ -219,7 +226,7 @@ class GymnasiumEnv(gymnasium.Env):
         )
 
     def _fail(self, action: Any) -> NoReturn:
-        """Raise after a failed step. An invalid action leaves the episode unchanged."""
+        """Raise after a failed step. A non-finite action does not end the episode."""
         if not np.all(np.isfinite(action)):
             raise InvalidAction(f"GymnasiumEnv: action must be finite, got {action}.")
         self._ended = True
@@ -230,14 +237,15 @@ class GymnasiumEnv(gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | None:
-        """The plant as a picture, shape `(height, width, 3)`, or in a window.
+        """Draw the plant as a picture, or in a window.
 
-        **Returns:** the picture in the mode `"rgb_array"`, else none.
+        **Returns:** in the mode `"rgb_array"` the picture, shape `(height, width, 3)`,
+        else `None`.
         """
         if self.render_mode is None:
             gymnasium.logger.warn(
-                "GymnasiumEnv: render() needs a render_mode, 'rgb_array' or 'human', "
-                "given when the environment is made."
+                "GymnasiumEnv: render() needs a render_mode, 'rgb_array' or 'human'. "
+                "Give it when you make the environment."
             )
             return None
         if self._buffer is None:

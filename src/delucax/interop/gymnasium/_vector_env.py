@@ -24,29 +24,30 @@ from . import _program as programs
 class GymnasiumVectorEnv(VectorEnv):
     """Many copies of a [`delucax.Environment`][] as one `gymnasium.vector.VectorEnv`.
 
-    A step of all of them, with the resets of those that have ended, is one call of one
-    compiled function. Observations, rewards and ends are those of
-    [`delucax.interop.gymnasium.GymnasiumEnv`][].
+    A step of all copies, with the resets of those that have ended, is one call of one
+    compiled function. Observations, rewards and ends are the same as in
+    [`delucax.interop.gymnasium.GymnasiumEnv`][], which can also render.
 
     **Arguments:**
 
     - `env`: the environment.
-    - `num_envs`: how many.
-    - `autoreset_mode`: `AutoresetMode.NEXT_STEP` (default: the step after the end
-        resets, whatever its action), `SAME_STEP` (the observation is of the next
-        episode already, the last one is in `info["final_obs"]`) or `DISABLED` (what has
-        ended rests until `reset`).
-    - `discrete`: whether actions are whole numbers, indices into `env.actions`; by
-        default they are if there is such a table.
+    - `num_envs`: the number of copies.
+    - `autoreset_mode`: when an episode that has ended is reset.
+        `AutoresetMode.NEXT_STEP` (default): in the next step, which ignores its action.
+        `SAME_STEP`: at once. The step returns the first observation of the next
+        episode, and the last observation of the old one in `info["final_obs"]`.
+        `DISABLED`: not before you call `reset`.
+    - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
+        default they are if the environment has such a table.
 
-    `reset(options={"state": x})` starts all at the state `x`, or each at its own if `x`
-    has shape `(num_envs, state_size)`; with `options={"reset_mask": mask}` only some
-    are reset. Only [`delucax.interop.gymnasium.GymnasiumEnv`][] renders.
+    `reset(options={"state": x})` starts all copies at the state `x`, or each at its own
+    state if `x` has shape `(num_envs, state_size)`. `options={"reset_mask": mask}`
+    resets only some copies.
 
-    **Raises:** `ValueError` on a wrong argument. `step` raises
-    `gymnasium.error.ResetNeeded` before `reset`, `gymnasium.error.InvalidAction` on
-    actions of the wrong shape or kind, not finite, or not in the table; and
-    `RuntimeError` if a simulation fails.
+    **Raises:** `ValueError` if an argument is wrong. `step` raises
+    `gymnasium.error.ResetNeeded` before the first `reset`,
+    `gymnasium.error.InvalidAction` if actions have the wrong shape or type, are not
+    finite, or are not in the table, and `RuntimeError` if a simulation fails.
 
     !!! example
 
@@ -58,6 +59,11 @@ class GymnasiumVectorEnv(VectorEnv):
         envs = GymnasiumVectorEnv(dlx.make("pendulum"), 16)
         observations, infos = envs.reset(seed=0)
         observations, rewards, *_ = envs.step(np.zeros((16, 1), np.float32))
+        observations.shape, rewards.shape
+        ```
+
+        ```text
+        ((16, 3), (16,))
         ```
     """
 
@@ -91,7 +97,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
     @property
     def states(self) -> np.ndarray:
-        """The states, shape `(num_envs, state_size)`."""
+        """The current states, shape `(num_envs, state_size)`."""
         if self._packed is None:
             raise ResetNeeded("GymnasiumVectorEnv: there is no state before reset().")
         return np.array(self._packed)[:, self._program.states]
@@ -102,15 +108,17 @@ class GymnasiumVectorEnv(VectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode in each.
+        """Start an episode in each copy.
 
         **Arguments:**
 
-        - `seed`: of all that is random from now on; by default it goes on as it was. A
-            list has one for each, which starts as
-            [`delucax.interop.gymnasium.GymnasiumEnv`][] with it does.
-        - `options`: `{"state": x}`, the state that all start at, or one for each;
-            `{"reset_mask": mask}`, shape `(num_envs,)`, which are reset.
+        - `seed`: the seed of all that is random from now on. By default the random
+            numbers continue. A list holds one seed, or `None`, for each copy. A copy
+            then starts at the same state as a
+            [`delucax.interop.gymnasium.GymnasiumEnv`][] with that seed.
+        - `options`: `{"state": x}`: the first state, one for all copies or one for
+            each. `{"reset_mask": mask}`: which copies are reset, booleans of shape
+            `(num_envs,)`.
 
         **Returns:** the observations, and an empty dictionary.
         """
@@ -127,7 +135,9 @@ class GymnasiumVectorEnv(VectorEnv):
                     f"{mask.dtype} of shape {mask.shape}."
                 )
             if self._packed is None:
-                raise ResetNeeded(f"{where}: reset all before some with reset_mask.")
+                raise ResetNeeded(
+                    f"{where}: call reset() without reset_mask first, to start all."
+                )
             select = functools.partial(jax.vmap(jnp.where), mask)
             current = self._packed, self._signals
             packed, signals = jax.tree.map(select, (packed, signals), current)
@@ -135,15 +145,16 @@ class GymnasiumVectorEnv(VectorEnv):
         return self._observations(np.asarray(packed)), {}
 
     def _start_keys(self, seed: Any) -> PRNGKey:
-        """The keys of this reset; sets `_key`, the key of later automatic resets."""
+        """The keys of this reset. Sets `_key`, the key of later automatic resets."""
         own: dict[int, int] = {}
         if isinstance(seed, Sequence | np.ndarray):
             integer = lambda one: isinstance(one, int | np.integer) and one >= 0
             valid = [one is None or integer(one) for one in seed]
             if len(valid) != self.num_envs or not all(valid):
                 raise ValueError(
-                    f"GymnasiumVectorEnv: seed must be {self.num_envs} whole numbers "
-                    f"from 0, one for each, or one for all, got {shortened(seed)}."
+                    f"GymnasiumVectorEnv: seed must be one whole number from 0, or "
+                    f"{self.num_envs} of them, one for each copy, got "
+                    f"{shortened(seed)}."
                 )
             own = {i: int(one) for i, one in enumerate(seed) if one is not None}
             mixed = np.random.SeedSequence(list(own.values())).generate_state(1)[0]
@@ -156,11 +167,12 @@ class GymnasiumVectorEnv(VectorEnv):
         return keys
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step of each.
+        """One step of each copy.
 
-        **Arguments:** `actions`: in the action space.
+        **Arguments:** `actions`: actions in the action space, one for each copy.
 
-        **Returns:** observations, rewards, terminations, truncations, and a dictionary.
+        **Returns:** the observations, rewards, terminations and truncations, and a
+        dictionary.
         """
         if self._packed is None:
             raise ResetNeeded("GymnasiumVectorEnv: call reset() before step().")
@@ -173,9 +185,9 @@ class GymnasiumVectorEnv(VectorEnv):
             which = np.flatnonzero(packed[:, programs.FAILED])[:5].tolist()
             self._packed = None
             raise RuntimeError(
-                f"GymnasiumVectorEnv: the simulation of {which} failed: the state or "
-                "the reward is not finite, or the solver did not converge. Call "
-                "reset()."
+                f"GymnasiumVectorEnv: the simulation of copies {which} failed: the "
+                "state or the reward is not finite, or the solver did not converge. "
+                "Call reset()."
             )
         terminations = packed[:, programs.TERMINATED] > 0
         truncations = packed[:, programs.TRUNCATED] > 0
@@ -195,7 +207,7 @@ class GymnasiumVectorEnv(VectorEnv):
         return packed[:, self._program.observation].astype(np.float32)
 
     def _as_actions(self, actions: Any) -> np.ndarray:
-        """The actions as an array for the compiled step; raises if they are invalid."""
+        """The actions as an array for the compiled step. Raises if they are invalid."""
         where, space = "GymnasiumVectorEnv", self.single_action_space
         try:
             actions = np.asarray(actions)
@@ -226,11 +238,11 @@ class GymnasiumVectorEnv(VectorEnv):
 def dones_and_infos(
     step: tuple[Any, Any, Any, Any, dict[str, Any]],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-    """A step of a `GymnasiumVectorEnv` that resets in the same step, as
-    `(observations, rewards, dones, infos)`.
+    """The result of a step in the mode `SAME_STEP`, in the form
+    `(observations, rewards, dones, infos)` of Stable-Baselines3.
 
-    The infos of what has ended hold the last observation of the episode and whether it
-    was cut off by its time limit, after which the value of that observation counts.
+    The info of an episode that has ended holds its last observation, and whether the
+    time limit ended it. In that case learners add the value of the last observation.
     """
     observations, rewards, terminations, truncations, info = step
     dones = terminations | truncations

@@ -1,4 +1,4 @@
-"""Environments in gymnax's protocol, both ways. Needs no extra: gymnax is not used."""
+"""Conversion to and from gymnax's protocol. Needs no extra: gymnax is not imported."""
 
 from ._from_gymnax import from_gymnax as from_gymnax, GymnaxDynamics as GymnaxDynamics
 from ._to_gymnax import (

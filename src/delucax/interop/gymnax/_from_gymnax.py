@@ -29,8 +29,9 @@ from .._episode import reads_first_argument
 class _Layout:
     """The layout of several arrays in one vector of floats.
 
-    Whole numbers and booleans are floats there (exact up to 2^24 in float32). The 32
-    bits of an unsigned number, such as a word of a random key, are two of 16.
+    Integers and booleans become floats, which are exact up to 2^24 in float32. An
+    unsigned number of 32 bits, such as a word of a random key, becomes two floats of 16
+    bits each.
     """
 
     shapes: tuple[tuple[int, ...], ...]
@@ -42,7 +43,7 @@ class _Layout:
         return self.shapes[i] + (2,) * (self.dtypes[i] == jnp.uint32)
 
     def ravel(self, arrays: Sequence[Any]) -> State:
-        """The vector of some arrays."""
+        """The vector that holds these arrays."""
         parts = []
         for array, dtype in zip(arrays, self.dtypes, strict=True):
             if dtype == jnp.uint32:
@@ -51,7 +52,7 @@ class _Layout:
         return jnp.concatenate(parts)
 
     def unravel(self, x: State) -> list[Array]:
-        """The arrays in a vector."""
+        """The arrays that a vector holds."""
         shapes = [self.stored_shape(i) for i in range(len(self.shapes))]
         parts = jnp.split(x, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         arrays = []
@@ -76,21 +77,22 @@ def _check_protocol(env: Any, where: str) -> None:
 
 
 class GymnaxDynamics(AbstractDynamics):
-    """A step of an environment in gymnax's protocol; see
-    [`delucax.interop.gymnax.from_gymnax`][], which makes it.
+    """The step of an environment in gymnax's protocol, as dynamics.
+    [`delucax.interop.gymnax.from_gymnax`][] makes it.
 
-    The state is the environment's as a vector: the entries of its leaves, whole numbers
-    and booleans as floats (exact up to 2^24 in float32); four numbers for a random key
-    if steps draw; and whether the episode is over. `w` is added to it.
+    The state is a vector. It holds the entries of all leaves of the state of the
+    environment; if steps draw random numbers, four numbers for a random key; and at the
+    end 1 if the episode is over, else 0. Integers and booleans are floats, which are
+    exact up to 2^24 in float32. The disturbance `w` is added to the next state.
 
-    Differentiable as far as the environment is; the derivative by what is a whole
-    number is 0.
+    The step is differentiable if the step of the environment is. Derivatives with
+    respect to integers are 0.
 
     **Arguments:**
 
     - `env`: the environment.
     - `params`: its parameters.
-    - `dt`: the time of a step, 1 by default.
+    - `dt`: the duration of a step, 1 by default.
 
     **Raises:** `ValueError` if the environment does not implement the protocol, or `dt`
     is not positive.
@@ -105,6 +107,10 @@ class GymnaxDynamics(AbstractDynamics):
         env = to_gymnax(dlx.make("pendulum"))
         dynamics = GymnaxDynamics(env, env.default_params)
         dynamics(0.0, jnp.array([0.5, 0.0, 0.0, 0.0]), jnp.ones(1))
+        ```
+
+        ```text
+        OUTDYN
         ```
     """
 
@@ -123,7 +129,7 @@ class GymnaxDynamics(AbstractDynamics):
         where = "from_gymnax"
         _check_protocol(env, where)
         if getattr(env, "supports_transition_gradients", False):
-            env = env.with_transition_gradients()  # else gymnax cuts them
+            env = env.with_transition_gradients()  # by default gymnax stops them
         check_step(dt, where)
         as_array = lambda x: as_float_array(x) if isinstance(x, float) else x
         self.env, self.params, self.dt = env, jax.tree.map(as_array, params), dt
@@ -143,9 +149,9 @@ class GymnaxDynamics(AbstractDynamics):
         for path, leaf in leaves:
             if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
                 raise ValueError(
-                    f"{where}: the state holds a typed key, "
-                    f"{jax.tree_util.keystr(path)}, where a raw one "
-                    "(`jax.random.PRNGKey`) is expected."
+                    f"{where}: keys in the state must be raw ones "
+                    "(`jax.random.PRNGKey`), got a typed key, "
+                    f"{jax.tree_util.keystr(path)}."
                 )
         action = jnp.zeros(self.action_shape, int if self.discrete else float)
         step = lambda key, *args: env.step_env(key, *args, params)
@@ -164,15 +170,15 @@ class GymnaxDynamics(AbstractDynamics):
         )
 
     def ravel(self, state: Any, key: PRNGKey | None = None) -> State:
-        """The vector of a state, such as `x0` of `delucax.rollout`.
+        """The vector of a state, for example for `x0` of [`delucax.rollout`][].
 
         **Arguments:**
 
-        - `state`: of the environment.
-        - `key`: what the steps of the episode draw from, if they draw;
-            `jax.random.key(0)` by default.
+        - `state`: a state of the environment.
+        - `key`: the random key of the steps, if they draw; `jax.random.key(0)` by
+            default.
 
-        **Returns:** shape `(state_size,)`.
+        **Returns:** the vector, shape `(state_size,)`.
         """
         words = jr.bits(jr.key(0) if key is None else key, (2,), jnp.uint32)
         return self._ravel(state, words, False)
@@ -190,9 +196,9 @@ class GymnaxDynamics(AbstractDynamics):
         return self.layout.ravel([*leaves, *[words] * self.draws, done])
 
     def unravel(self, x: State) -> Any:
-        """The state that a vector holds.
+        """The state of the environment that a vector holds.
 
-        **Arguments:** `x`: shape `(state_size,)`.
+        **Arguments:** `x`: the vector, shape `(state_size,)`.
 
         **Returns:** a state of the environment.
         """
@@ -202,9 +208,10 @@ class GymnaxDynamics(AbstractDynamics):
     def transition(self, x: State, u: Control) -> tuple[State, Scalar]:
         """One step.
 
-        **Arguments:** `x`: state. `u`: control.
+        **Arguments:** `x`: state, shape `(state_size,)`. `u`: control, shape
+            `(control_size,)`.
 
-        **Returns:** the next state, and the reward.
+        **Returns:** the next state, and the reward, a scalar.
         """
         *leaves, _ = self.layout.unravel(x)
         key, words = jr.key(0), None
@@ -243,7 +250,7 @@ class _Start(eqx.Module):
 
 
 class _Observation(eqx.Module):
-    """gymnax's own observation as a vector."""
+    """The observation of the environment as a vector."""
 
     dynamics: GymnaxDynamics
 
@@ -268,38 +275,42 @@ def _is_done(t: RealScalar, x: State) -> Array:
 def from_gymnax(
     env: Any, params: Any = None, *, dt: Any = 1.0, **environment: Any
 ) -> Environment:
-    """An environment in gymnax's protocol as a [`delucax.Environment`][].
+    """Convert an environment in gymnax's protocol to a [`delucax.Environment`][].
 
-    Anything with `reset_env`, `step_env`, `action_space` and either `observe` or
-    `get_obs` will do, of gymnax before 1.0 and since, if `jax.jit` takes it.
-    Controllers are given the whole state as a vector, see
-    [`delucax.interop.gymnax.GymnaxDynamics`][], named after the leaves of the state;
-    `encode` makes of it what gymnax's users observe. The cost is minus the reward; a
-    step that is done terminates. Integer actions go through the table of `actions`; a
-    number between two of them is rounded.
+    `env` may be any object with `reset_env`, `step_env`, `action_space`, and `observe`
+    or `get_obs`, if these run under `jax.jit`. Environments of gymnax before and after
+    1.0 are examples.
 
-    The random key of `step_env` is drawn at the start of an episode, from the key of
-    the rollout, and is carried in the state if a step uses it at all.
+    Controllers observe the whole state as a vector, as in
+    [`delucax.interop.gymnax.GymnaxDynamics`][]. The names of its entries come from the
+    leaves of the state. `encode` returns the observation of the environment. The cost
+    is minus the reward, and a step that is done terminates the episode. Integer actions
+    are in the table `actions`; other numbers are rounded.
 
-    The reward may depend on the next state, so that `step_env` is evaluated twice, for
-    the dynamics and for the cost. Both hold the parameters: to change them, or to
-    differentiate with respect to them, make the environment anew. Gradients pass where
-    the environment lets them: of gymnax 1.0, `with_transition_gradients` is used where
-    there is one; before, and elsewhere, gymnax's own environments stop them.
+    If a step uses the random key of `step_env`, the state carries it. It is drawn at
+    the start of an episode from the key of the rollout.
+
+    The reward may depend on the next state, so `step_env` is evaluated twice: for the
+    dynamics and for the cost. Both hold the parameters. To change the parameters, or to
+    differentiate with respect to them, convert the environment again.
+
+    Gradients pass if the environment passes them. The environments of gymnax stop
+    gradients by default. If an environment of gymnax 1.0 has
+    `with_transition_gradients`, it is used.
 
     **Arguments:**
 
     - `env`: the environment.
     - `params`: its parameters; `env.default_params` by default.
-    - `dt`: the time of a step, 1 by default; the protocol has none.
+    - `dt`: the duration of a step, 1 by default. The protocol has none.
     - `**environment`: other arguments of [`delucax.Environment`][], such as `encode`,
         or `horizon`, which is `params.max_steps_in_episode` by default.
 
     **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` if the environment does not implement the protocol, if its
-    action space is neither a box nor discrete, if a state changes its shape in a step,
-    or without a horizon or an observation.
+    action space is neither a box nor discrete, if the state changes its shape in a
+    step, or if there is no horizon or no observation.
 
     !!! example
 
@@ -313,6 +324,10 @@ def from_gymnax(
         controller = dlx.controllers.Zero(env.control_size)
         dlx.rollout(env, controller, key=jax.random.key(0)).total_cost
         ```
+
+        ```text
+        OUTROLL
+        ```
     """
     where = "from_gymnax"
     if params is None:
@@ -323,12 +338,12 @@ def from_gymnax(
     unknown = horizon is None or isinstance(horizon, Tracer)
     if unknown and "horizon" not in environment:
         raise ValueError(
-            f"{where}: horizon must be given, for params has no max_steps_in_episode "
-            "that is known."
+            f"{where}: horizon must be given, because params has no "
+            "max_steps_in_episode, or it is traced."
         )
     if "encode" not in environment and _observer(env) is None:
         raise ValueError(
-            f"{where}: encode must be given, for {type(env).__name__} has neither "
+            f"{where}: encode must be given, because {type(env).__name__} has neither "
             "observe nor get_obs."
         )
     dynamics = GymnaxDynamics(env, params, dt)

@@ -27,17 +27,28 @@ from .._spaces import (
 class GymnaxParams(eqx.Module):
     """The numbers of an environment, as the `params` of gymnax's protocol.
 
-    **Arguments:** `environment`: the environment.
+    **Arguments:**
+
+    - `environment`: the environment, a [`delucax.Environment`][].
+
+    **Raises:** `ValueError` if `environment` is not an environment.
 
     !!! example
 
         ```python
         import delucax as dlx
+        import jax
+        import jax.numpy as jnp
         from delucax.interop.gymnax import GymnaxParams, to_gymnax
 
-        env = to_gymnax(dlx.make("pendulum"))
+        env, key = to_gymnax(dlx.make("pendulum")), jax.random.key(0)
         longer = GymnaxParams(dlx.make("pendulum", length=1.2))
-        env.action_space(longer)
+        observation, state = env.reset(key, longer)
+        env.step_env(key, state, jnp.ones(1), longer)[2]
+        ```
+
+        ```text
+        OUTPARAMS
         ```
     """
 
@@ -50,37 +61,38 @@ class GymnaxParams(eqx.Module):
 
     @property
     def environment(self) -> Environment:
-        """The environment."""
+        """The environment with these numbers."""
         return eqx.combine(self.arrays, self.static)
 
     @property
     def max_steps_in_episode(self) -> int:
-        """The horizon."""
+        """The horizon of the environment."""
         return self.environment.horizon
 
 
 Params: TypeAlias = GymnaxParams | None
-"""`default_params` by default."""
+"""The parameters of a call; `None` means `default_params`."""
 
 
 class GymnaxEnv:
-    """A [`delucax.Environment`][] in gymnax's protocol; see
-    [`delucax.interop.gymnax.to_gymnax`][].
+    """A [`delucax.Environment`][] in gymnax's protocol.
+    [`delucax.interop.gymnax.to_gymnax`][] makes one.
 
-    It holds no arrays that JAX sees, has a hash, and equals another if all numbers do.
+    It is hashable, so it can be a static argument of `jax.jit`. Two are equal if all
+    their numbers are equal.
 
     **Arguments:**
 
-    - `env`: the environment, whose numbers are the `default_params`.
+    - `env`: the environment. Its numbers are the `default_params`.
     - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
-        default they are if there is such a table.
-    - `separate_ends`: whether `step` returns `terminated` and `truncated`, as gymnax
-        does from 1.0 on, in place of `done`; by default as
-        [`delucax.interop.gymnax.to_gymnax`][] says.
+        default they are if the environment has such a table.
+    - `separate_ends`: whether `step` returns `terminated` and `truncated`, as in gymnax
+        1.0, in place of `done`. [`delucax.interop.gymnax.to_gymnax`][] describes the
+        default.
 
-    **Raises:** `ValueError` on a wrong argument; in a step, on an action of the wrong
-    size or kind, or one that is not in the table. Traced actions are truncated to whole
-    numbers and clamped to the table.
+    **Raises:** `ValueError` if an argument is wrong, or `env` is being traced. A step
+    raises it if the action has the wrong size or type, or is not in the table. Traced
+    actions are truncated to whole numbers and clamped to the table.
 
     !!! example
 
@@ -91,6 +103,11 @@ class GymnaxEnv:
 
         env = GymnaxEnv(dlx.make("cartpole"))
         observation, state = env.reset(jax.random.key(0))
+        observation.shape
+        ```
+
+        ```text
+        (4,)
         ```
     """
 
@@ -112,7 +129,7 @@ class GymnaxEnv:
             )
         self.discrete = has_discrete_actions(env, discrete, where)
         if separate_ends is None:
-            # rejax, which imports any gymnax, expects `done`.
+            # rejax expects `done`, with every version of gymnax that it imports.
             theirs = sys.modules.get("gymnax.environments.environment")
             since_1 = hasattr(getattr(theirs, "Environment", None), "is_truncated")
             separate_ends = since_1 and "rejax" not in sys.modules
@@ -128,7 +145,7 @@ class GymnaxEnv:
 
     @property
     def default_params(self) -> GymnaxParams:
-        """The numbers of the environment that it was made of."""
+        """The numbers of the environment that this one was made from."""
         return GymnaxParams(self._made.env)
 
     @property
@@ -139,42 +156,47 @@ class GymnaxEnv:
 
     @property
     def num_actions(self) -> int:
-        """The number of actions; of controls if they are not whole numbers."""
+        """The number of actions, or of controls if actions are not whole numbers."""
         env: Any = self._made.env
         return len(env.actions) if self.discrete else env.control_size
 
     @functools.partial(jax.jit, static_argnames=("self",))
     def reset(self, key: PRNGKey, params: Params = None) -> tuple[Array, EpisodeState]:
-        """Begin an episode, the one of `delucax.rollout` with the same key.
+        """Start an episode: the same one as [`delucax.rollout`][] with this key.
 
         **Arguments:**
 
         - `key`: a random key.
-        - `params`: `default_params` by default.
+        - `params`: the numbers of the environment; `default_params` by default.
 
-        **Returns:** the observation, and the state of the episode: a module with the
-        state of the environment, `state`, the steps since it began, `time`, and the
-        disturbances and the noise of the whole episode, `signals`.
+        **Returns:** the observation, and the state of the episode. That is a module
+        with the state of the environment (`state`), the number of steps since the start
+        (`time`), and the disturbances and the noise of the whole episode (`signals`).
         """
         return self.reset_env(key, params)
 
     def step(
         self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
-        """One step; at the end of the episode, the first state of the next.
+        """One step. If it ends the episode, it also starts the next one.
 
         **Arguments:**
 
-        - `key`: a random key, of the next episode.
-        - `state`: of the episode.
-        - `action`: in the action space; a control beyond the bounds is clipped.
-        - `params`: `default_params` by default.
+        - `key`: a random key for the start of the next episode.
+        - `state`: the state of the episode.
+        - `action`: an action in the action space. Controls outside the bounds are
+            clipped.
+        - `params`: the numbers of the environment; `default_params` by default.
 
-        **Returns:** observation, state, reward, done and a dictionary; `terminated` and
-        `truncated` in place of `done` with `separate_ends`. The dictionary has these
-        two, `"final_observation"` (before the reset), `"discount"` (0 if terminated)
-        and `"failed"` (whether the solver did not converge, or the action or the next
-        state is not finite: compiled code raises nothing, and NaN goes on as NaN).
+        **Returns:** the observation, state, reward, `done` and a dictionary; with
+        `separate_ends`, `terminated` and `truncated` in place of `done`. The dictionary
+        holds
+
+        - `"terminated"` and `"truncated"`;
+        - `"final_observation"`: the observation before the reset;
+        - `"discount"`: 0 if terminated, else 1;
+        - `"failed"`: whether the solver did not converge, or the action or the next
+            state is not finite. Compiled code cannot raise an error.
         """
         self._check_action(action)
         return self._step(key, state, action, params)
@@ -187,7 +209,7 @@ class GymnaxEnv:
         as_now = lambda new, now: jnp.asarray(new, now.dtype)
         here = (last, after)
         reset = lambda: jax.tree.map(as_now, self.reset_env(key, params), here)
-        # One of the two where nothing is batched: a reset may draw a whole episode.
+        # Without `vmap` only one branch runs: a reset may draw a whole episode.
         done = terminated | truncated
         observation, after = jax.lax.cond(done, reset, lambda: here)
         info["final_observation"] = last
@@ -197,11 +219,13 @@ class GymnaxEnv:
     def reset_env(
         self, key: PRNGKey, params: Params = None
     ) -> tuple[Array, EpisodeState]:
-        """`reset`, not compiled.
+        """As `reset`, but not compiled.
 
-        **Arguments:** `key`, `params`: of `reset`.
+        **Arguments:** `key`, `params`: as in `reset`.
 
-        **Returns:** as `reset` does.
+        **Returns:** what `reset` returns.
+
+        **Raises:** `ValueError` if `key` is not one random key.
         """
         check_key(key, "GymnaxEnv.reset")
         state = episodes.begin(self._environment(params), key)
@@ -210,12 +234,12 @@ class GymnaxEnv:
     def step_env(
         self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
-        """One step, without a reset and not compiled.
+        """One step without a reset. It is not compiled.
 
-        **Arguments:** `key`: not used. `state`, `action`, `params`: of `step`.
+        **Arguments:** `key`: not used. `state`, `action`, `params`: as in `step`.
 
-        **Returns:** observation, state, reward, done (`terminated` alone with
-        `separate_ends`) and a dictionary.
+        **Returns:** the observation, state, reward, `done` and a dictionary. With
+        `separate_ends`, `terminated` takes the place of `done`.
         """
         env, given = self._environment(params), self._check_action(action)
         if self.discrete:
@@ -238,16 +262,16 @@ class GymnaxEnv:
     ) -> Array:
         """The observation of a state.
 
-        **Arguments:** `state`, `params`: of `step`. `key`: not used.
+        **Arguments:** `state`, `params`: as in `step`. `key`: not used.
 
-        **Returns:** the observation.
+        **Returns:** the observation, shape `(feature_size,)`.
         """
         return episodes.observe(self._environment(params), state)
 
     def is_terminal(self, state: EpisodeState, params: Params = None) -> Array:
-        """Whether the episode ends at a state, by itself or at the horizon.
+        """Whether the episode ends at a state, by termination or at the horizon.
 
-        **Arguments:** `state`, `params`: of `step`.
+        **Arguments:** `state`, `params`: as in `step`.
 
         **Returns:** a boolean.
         """
@@ -258,22 +282,25 @@ class GymnaxEnv:
         return env.terminated(episodes.time_of(env, state), state.state) | truncated
 
     def action_space(self, params: Params = None) -> Any:
-        """The actions.
+        """The space of actions.
 
-        **Arguments:** `params`: `default_params` by default.
+        **Arguments:** `params`: the numbers of the environment; `default_params` by
+            default.
 
-        **Returns:** a space with `shape` and `dtype`, `low` and `high` or `n`, and
-        `sample(key)` and `contains(x)`: gymnax's own where gymnax is in use.
+        **Returns:** a space with `shape`, `dtype`, `sample(key)` and `contains(x)`, and
+        either `low` and `high`, or `n`. It is a space of gymnax if gymnax has been
+        imported.
         """
         ends = action_ends(self._environment(params))
         return gymnax_space(self.num_actions if self.discrete else ends)
 
     def observation_space(self, params: Params = None) -> Any:
-        """The observations.
+        """The space of observations.
 
-        **Arguments:** `params`: `default_params` by default.
+        **Arguments:** `params`: the numbers of the environment; `default_params` by
+            default.
 
-        **Returns:** a space as of `action_space`.
+        **Returns:** a space like that of `action_space`.
         """
         return gymnax_space(observation_ends(self._environment(params)))
 
@@ -303,34 +330,35 @@ class GymnaxEnv:
 def to_gymnax(
     env: Environment, *, discrete: bool | None = None, separate_ends: bool | None = None
 ) -> GymnaxEnv:
-    """An environment in gymnax's protocol, without gymnax.
+    """Convert an environment to gymnax's protocol. This does not need gymnax.
 
-    What trains on gymnax's environments (rejax, PureJaxRL, ...) trains on it. The
-    observation is what `encode` makes of the environment's; the reward is minus the
-    cost, with the final cost in the last step; the episode is truncated at the horizon,
-    and `step` then begins the next. Gradients pass through a step, not through a reset.
+    Libraries that train on environments of gymnax, such as rejax and PureJaxRL, can
+    train on the result. The observation is `encode` of the observation of the
+    environment. The reward is minus the cost. The last step adds minus the final cost.
+    The horizon truncates an episode, and `step` then starts the next one. Gradients
+    pass through a step, but not through a reset.
 
-    All numbers are in `params`, [`delucax.interop.gymnax.GymnaxParams`][], so that
-    `jax.vmap` over params runs many plants at once.
+    The numbers of the environment are in `params`, a
+    [`delucax.interop.gymnax.GymnaxParams`][]. Use `jax.vmap` over `params` to run many
+    plants at once.
 
-    The disturbances and the sensor noise of an episode are drawn for the whole horizon
-    when it is reset, from the key of the reset, and are carried in its state. Under
-    `jax.vmap` a `step` computes a reset for each environment, whether its episode ends
-    or not, and so draws them; `step_env` draws nothing.
+    A reset draws the disturbances and the sensor noise of a whole episode from its key,
+    and the state carries them. Under `jax.vmap`, each `step` computes a reset for every
+    environment, whether its episode ends or not. If drawing is slow, use `step_env`,
+    which draws nothing.
 
     **Arguments:**
 
     - `env`: the environment.
     - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
-        default they are if there is such a table.
-    - `separate_ends`: whether `step` returns `terminated` and `truncated`, as gymnax
-        does from 1.0 on, in place of `done`, which rejax and PureJaxRL want. By default
-        it does where gymnax 1.0 or later has been imported, whose wrappers want it, and
-        rejax has not.
+        default they are if the environment has such a table.
+    - `separate_ends`: whether `step` returns `terminated` and `truncated`, as in gymnax
+        1.0, in place of `done`, which rejax and PureJaxRL expect. By default it does if
+        gymnax 1.0 or later has been imported and rejax has not.
 
     **Returns:** a [`delucax.interop.gymnax.GymnaxEnv`][].
 
-    **Raises:** `ValueError` on a wrong argument, or if `env` is being traced.
+    **Raises:** `ValueError` if an argument is wrong, or if `env` is being traced.
 
     !!! example
 
@@ -346,6 +374,11 @@ def to_gymnax(
         observation, state, reward, done, info = env.step(
             key, state, jnp.zeros(1), params
         )
+        observation.shape, done
+        ```
+
+        ```text
+        OUTTO
         ```
     """
     return GymnaxEnv(env, discrete=discrete, separate_ends=separate_ends)

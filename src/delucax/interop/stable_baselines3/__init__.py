@@ -1,4 +1,4 @@
-"""The tasks as a vectorised environment of Stable-Baselines3. Needs the extra
+"""Environments as a vectorised environment of Stable-Baselines3. Needs the extra
 `delucax[sb3]`."""
 
 from ..._extras import extra as _extra

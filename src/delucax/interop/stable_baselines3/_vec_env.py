@@ -15,21 +15,21 @@ from ..gymnasium._vector_env import dones_and_infos
 class SB3VecEnv(VecEnv):
     """Many copies of a [`delucax.Environment`][] as one `VecEnv` of Stable-Baselines3.
 
-    Its algorithms take it as it is. A step of all copies, with the resets of those that
-    have ended, is one call of one compiled function. Put
-    `stable_baselines3.common.vec_env.VecMonitor` around it for the returns of episodes
-    in the logs.
+    Pass it to the algorithms of Stable-Baselines3. A step of all copies, with the
+    resets of those that have ended, is one call of one compiled function. To see the
+    returns of episodes in the logs, wrap it in
+    `stable_baselines3.common.vec_env.VecMonitor`.
 
     **Arguments:**
 
     - `env`: the environment.
-    - `num_envs`: how many.
-    - `discrete`: whether actions are whole numbers, indices into `env.actions`; by
-        default they are if there is such a table.
+    - `num_envs`: the number of copies.
+    - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
+        default they are if the environment has such a table.
 
-    `seed` and `set_options({"state": x})` hold for the next `reset`.
+    `seed` and `set_options({"state": x})` apply to the next `reset`.
 
-    **Raises:** `ValueError` on a wrong argument; when stepped, as
+    **Raises:** `ValueError` if an argument is wrong. A step raises the errors of
     [`delucax.interop.gymnasium.GymnasiumVectorEnv`][].
 
     !!! example
@@ -55,7 +55,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(vector.num_envs, *spaces)
 
     def reset(self) -> np.ndarray:
-        """Begin an episode in each.
+        """Start an episode in each copy.
 
         **Returns:** the observations.
         """
@@ -68,7 +68,7 @@ class SB3VecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for `step_wait`.
+        """Store the actions for `step_wait`.
 
         **Arguments:** `actions`: one for each copy.
         """
@@ -77,56 +77,58 @@ class SB3VecEnv(VecEnv):
     def step_wait(
         self,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """One step of each.
+        """One step of each copy.
 
-        **Returns:** observations, rewards, whether each has ended, and a dictionary for
-        each.
+        **Returns:** the observations, the rewards, whether each episode has ended, and
+        a list with a dictionary for each copy.
         """
         return dones_and_infos(self.vector.step(self._actions))
 
     def close(self) -> None:
-        """Nothing is left to close."""
+        """Does nothing: there is nothing to close."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute, the same for all copies.
+        """An attribute, which is the same for all copies.
 
-        **Arguments:** `attr_name`: its name. `indices`: of which copies.
+        **Arguments:** `attr_name`: the name of the attribute. `indices`: the indices of
+            the copies; all by default.
 
-        **Returns:** a list with an entry for each.
+        **Returns:** a list with the attribute for each of these copies.
         """
         return [getattr(self.vector, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Copies have no attributes of their own.
+        """Always raises: copies have no attributes of their own.
 
-        **Arguments:** `attr_name`, `value`, `indices`: of no use.
+        **Arguments:** `attr_name`, `value`, `indices`: not used.
 
         **Raises:** `ValueError` always.
         """
         raise ValueError(
-            f"SB3VecEnv: {attr_name} cannot be set, as the copies are one program; "
-            "make another from a changed environment (`delucax.replace`)."
+            f"SB3VecEnv: {attr_name} cannot be set, because the copies are one "
+            "program; make another from a changed environment (`delucax.replace`)."
         )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **kwargs: Any
     ) -> list[Any]:
-        """Copies have no methods of their own.
+        """Always raises: copies have no methods of their own.
 
-        **Arguments:** `method_name`, `method_args`, `indices`, `kwargs`: of no use.
+        **Arguments:** `method_name`, `method_args`, `indices`, `kwargs`: not used.
 
         **Raises:** `ValueError` always.
         """
         raise ValueError(
-            f"SB3VecEnv: {method_name} cannot be called on a copy, as the copies are "
-            "one program."
+            f"SB3VecEnv: {method_name} cannot be called on a copy, because the copies "
+            "are one program."
         )
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> Sequence[bool]:
-        """No copy is wrapped.
+        """Whether copies are wrapped: never.
 
-        **Arguments:** `wrapper_class`: of no use. `indices`: of which copies.
+        **Arguments:** `wrapper_class`: not used. `indices`: the indices of the copies;
+            all by default.
 
-        **Returns:** a list of `False`.
+        **Returns:** a list with `False` for each of these copies.
         """
         return [False for _ in self._get_indices(indices)]
