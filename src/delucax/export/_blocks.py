@@ -72,7 +72,7 @@ class Block:
 
 
 def eliminate_dead_code(block: Block) -> None:
-    """Remove the nodes that no result depends on, and what loops carry unused."""
+    """Remove the nodes that no result needs, and the unused values that loops carry."""
     _keep(block, set(), True)
 
 
@@ -139,7 +139,7 @@ def _live(node: Node, needed: set[Var]) -> set[int]:
 
 
 def _narrow(node: Node, live: set[int], needed: set[Var]) -> None:
-    """Remove what a loop carries, reads or stacks unused."""
+    """Remove the unused values that a loop carries, reads or stacks."""
     body, count = node.blocks[-1], _carried(node)
     ins = [
         k

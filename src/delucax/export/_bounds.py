@@ -18,7 +18,7 @@ class Definitions:
     def __init__(self, block: Block):
         self.made: dict[Var, Node] = {}
         self.carried: dict[Var, tuple[Atom, Atom]] = {}
-        """For each value that a loop carries: the first one, and the next one."""
+        """For each value carried by a loop: its start, and the value after a round."""
         self._add(block)
 
     def _add(self, block: Block) -> None:
@@ -153,7 +153,7 @@ class Bound(NamedTuple):
             (b,) = node.ins
         first = later = b
         if not isinstance(b, Const) and b in self.body.params:
-            # The step is carried too, such as a flag that is set in the first round.
+            # The loop carries the step, for example a flag that the first round sets.
             j = self.body.params.index(b)
             first, later = self.starts[j], self.body.outs[j]
         pair = [a.value for a in (first, later) if isinstance(a, Const)]

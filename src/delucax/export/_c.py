@@ -35,7 +35,7 @@ def c(
     The files are `NAME.h` and `NAME.c` in `directory`. They are C99 and need no library
     except the standard `math.h`. The program uses the stack only: it allocates no
     memory. It has no recursion, and no variable that outlives a call. Every loop has a
-    bound. All that does not depend on the inputs, such as weights, becomes a constant.
+    bound. Whatever does not depend on the inputs, such as weights, becomes a constant.
 
     A controller becomes three functions, which do what its `init`, `__call__` and
     `applied` do: `NAME_init(state)`, `NAME_step(state, t, y, u)` and
@@ -49,9 +49,9 @@ def c(
     arrays as pointers to their entries in row-major order. It always writes its
     outputs, and returns the same flags. Arrays that it closes over become constants.
 
-    A plant becomes such a function: a system its vector field, and dynamics their step.
-    The inputs are `(t, x, u)`, and `w` if the disturbance enters the equations of the
-    plant.
+    A plant is exported as a function: the vector field of a system, or the step of
+    dynamics. The inputs are `(t, x, u)`. The disturbance `w` is an input too if it
+    enters the equations, or if it holds the Brownian increments of a step.
 
     **Arguments:**
 
@@ -65,14 +65,14 @@ def c(
         differ from the precision of JAX in this process.
     - `example`: for a function, a tuple of its inputs: arrays, numbers,
         `jax.ShapeDtypeStruct`, or pytrees of them. Only their shapes and types count.
-        For a controller, an observation; you need it only if its size cannot be found
-        out from the controller.
+        For a controller, an observation; you need it only if the controller does not
+        fix the size of the observation.
     - `fallback`: the control of a step that fails, shape `(m,)`. By default it is the
         control of the last step that succeeded, or zeros before the first.
     - `key`: a random key, for a controller that draws random numbers, such as
         [`delucax.controllers.BPC`][]. The state in C holds the two words of the key. C
-        draws the numbers that JAX would draw after `init(key=key)`, and the same ones
-        after each start.
+        draws the numbers that JAX would draw after `init(key=key)`, and the same
+        numbers again after each `NAME_init`.
     - `plant`: a plant whose names and units are written into the header of a
         controller. By default it is a plant that the controller holds.
     - `max_iterations`: the most rounds of a loop for which no bound is found. A loop
@@ -82,8 +82,8 @@ def c(
 
     **Raises:** `ValueError` if something cannot be written in C, such as eigenvalues,
     calls of Python, or random draws of a function; the message names the line of your
-    code. Also if `name` is not an identifier, or `directory` cannot be written to. No
-    file changes then.
+    code. It is also raised if `name` is not an identifier, or `directory` cannot be
+    written to. After an error no file has changed.
 
     !!! example
 

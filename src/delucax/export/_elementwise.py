@@ -143,7 +143,7 @@ def _written(
         if "({u})" in template and not (limits.min <= low and high <= limits.max):
             low, high = -math.inf, math.inf
         elif "({u})" in template:
-            # It cannot overflow, so the casts to and from unsigned are not needed.
+            # The result cannot overflow, so it needs no casts to unsigned and back.
             template = template.replace("({t})", "").replace("({u})", "")[1:-1]
     if "@" in template:
         for name in _routines_in(template):

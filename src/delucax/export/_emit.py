@@ -262,7 +262,7 @@ class Writer:
             self.assign(variable, expr)
 
     def put_all(self, places: Sequence[Value], values: Sequence[Value]) -> None:
-        """Set several arrays at once. A value may read a place that is set."""
+        """Set several arrays at once. All values are read before a place changes."""
         pairs = [
             (p, v)
             for p, v in zip(places, values, strict=True)

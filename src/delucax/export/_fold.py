@@ -124,8 +124,8 @@ FOLDS: dict[str, Callable[..., Any]] = {
 
 
 def folded(op: str, values: list[Any], params: Any, dtypes: list[Any]) -> Any:
-    """The results of an operation on NumPy arrays, or `None` if NumPy cannot compute
-    it here."""
+    """The results of an operation on NumPy arrays, or `None` if the operation is not
+    in `FOLDS`."""
     if op not in FOLDS:
         return None
     with np.errstate(all="ignore"):

@@ -37,8 +37,8 @@ def load(
     **Returns:** a [`delucax.export.LoadedController`][] for a controller, or a
     [`delucax.export.LoadedFunction`][] for a function or a plant.
 
-    **Raises:** `ValueError` if the folder holds no export, or several and no `name` is
-    given; if no compiler is found; or if it fails, with its message.
+    **Raises:** `ValueError` if the folder holds no export, or holds several and `name`
+    is not given; if no compiler is found; or if the compiler fails, with its message.
 
     !!! example
 

@@ -33,9 +33,9 @@ class LoadedController(AbstractController):
     """A controller in C. [`delucax.export.load`][] returns one.
 
     Use it like any other controller. [`delucax.rollout`][] takes it, also under `jit`
-    and `vmap`; Python then calls the C at each step. If you call it with NumPy arrays,
-    JAX is not used, and it returns NumPy arrays. It computes in the precision of the
-    export. It has no derivative.
+    and `vmap`; Python then calls the C at each step. With NumPy arrays, it calls the C
+    directly and returns NumPy arrays. It computes in the precision of the export. It
+    has no derivative.
 
     If a number is not finite, the control is the `fallback` of
     [`delucax.export.c`][]: by default the last good control. A rollout records each
@@ -283,7 +283,8 @@ class LoadedFunction:
 
         **Arguments:** `*arrays`: the arrays to read, then the arrays to write the
             results to. They are contiguous NumPy arrays with the types of the C, and
-            must not overlap. Numbers are arrays of shape `()`.
+            must not overlap. A number is an array of shape `()`; an input of this kind
+            is read once, when you bind.
 
         **Returns:** a function without arguments, which returns the flag. It holds
         Python's global interpreter lock while it runs.

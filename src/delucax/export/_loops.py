@@ -136,7 +136,7 @@ def cond(e, node, which):
 
 
 def error(e, node):
-    """Note that an error was raised. The program goes on, and the flag reports it."""
+    """Record that an error was raised. The program goes on, and the flag reports it."""
     e.assign(e.failure(), literal(True, bool))
     fill = lambda out: np.nan if out.dtype.kind == "f" else 0
     return [

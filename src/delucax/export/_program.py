@@ -53,7 +53,7 @@ class Program(Writer):
             buffer.holders += 1
 
     def release(self, atom: Atom) -> None:
-        """Note that one use of the atom is written."""
+        """Record that one use of the atom has been written."""
         if not isinstance(atom, Var):
             return
         atom.remaining -= 1

@@ -171,8 +171,8 @@ static void cholesky_S(int n, const T *a, T *l) {
   }
 }""",
     "triangular": """
-/* Solves A X = B in place, for a lower or upper triangular A. If unit, its diagonal is
-   1. The strides of rows and columns are (ar, ac) in A, and (br, bc) in B. */
+/* Solves A X = B in place. A is lower or upper triangular, with ones on the diagonal if
+   unit. The strides of rows and columns are (ar, ac) in A, and (br, bc) in B. */
 static void triangular_S(int n, int m, const T *a, int ar, int ac, int lower, int unit,
                          T *b, int br, int bc) {
   for (int r = 0; r < n; ++r) {
@@ -320,7 +320,8 @@ def _word(text: str, old: str, new: str) -> str:
 
 def _power(exponent: int, dtype: np.dtype) -> str:
     lines, left, have = [], exponent, False
-    # XLA wraps integers around, as unsigned ones do. `1u *` keeps short ones unsigned.
+    # Integers of XLA wrap around, so compute in unsigned ones. Without `1u *`, C would
+    # promote short ones to int.
     wraps = dtype.kind in "iu"
     kind, one = ("U", "1u * ") if wraps else ("T", "")
     while left:

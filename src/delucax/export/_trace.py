@@ -107,7 +107,7 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
         closed = jax.make_jaxpr(functools.partial(impl, **params))(*_shapes(ins))
         return _inlined(closed, ins, block, where)
     if not getattr(impl, "__module__", "functools").startswith(("jax", "functools")):
-        # The operation is made of others: `impl` is traced. It is ours or a library's.
+        # `impl`, here or in another library, uses other operations: trace it.
         impl = functools.partial(impl, **params)
         flat = lambda *args: jax.tree.leaves(impl(*args))
         closed = jax.make_jaxpr(flat)(*_shapes(ins))
@@ -116,8 +116,8 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
 
 
 def _drawn(eqn: Any, ins: Any, keys: Any, known: Any, block: Block, where: str):
-    """The outputs of an equation on keys; `known` are their forms if the inputs are
-    known."""
+    """The outputs of an equation on keys. `known` holds their shapes and types if all
+    inputs are known, else `None`."""
     op = eqn.primitive.name
     for kind in keys:
         if not is_ours(kind):
@@ -169,7 +169,7 @@ def _is_error(callback: Any) -> bool:
 
 
 def _failed(outs: Any, block: Block, where: str) -> Sequence[Atom]:
-    """The outputs of a node that notes an error at run time, in place of raising it.
+    """The outputs of a node that records an error at run time, in place of raising it.
     They are NaN, or zero if the type has no NaN."""
     kinds = tuple((shape, str(dtype)) for shape, dtype in outs)
     return _node("error", [], outs, dict(kinds=kinds), block, where)
@@ -226,7 +226,7 @@ def _name(atom: Atom) -> Any:
 
 
 def _unchanged(op: str, ins: list[Atom], outs: Any, params: Any) -> Atom | None:
-    """The input that an operation returns unchanged; `None` if it changes it."""
+    """The input that an operation returns unchanged, or `None`."""
     (shape, dtype), *more = outs
     if more or not ins:
         return None

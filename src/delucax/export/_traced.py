@@ -108,7 +108,7 @@ def _first_state(controller: AbstractController, dtype: np.dtype, key: Any) -> A
             raise
         raise Unsupported(
             f"export.c: {type(controller).__name__} cannot be exported without key=, "
-            f"because it draws random numbers; give jax.random.key(0), say ({error})"
+            f"such as jax.random.key(0), because it draws random numbers ({error})"
         ) from error
     for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array)):
         if is_key(leaf.dtype) and not is_ours(leaf.dtype):

@@ -1,8 +1,8 @@
 """The step of an environment in C, in memory that is allocated once.
 
 The function in C is the same function of the packed array that JAX compiles. Each
-process traces the environment and writes the C again, because only the C says what the
-environment does. The compiled library is kept on disk.
+process traces the environment and writes the C once. The compiled library is kept on
+disk, under a hash of the C.
 """
 
 import functools

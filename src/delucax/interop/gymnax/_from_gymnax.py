@@ -284,8 +284,8 @@ def from_gymnax(
     Controllers observe the whole state as a vector, as in
     [`delucax.interop.gymnax.GymnaxDynamics`][]. The names of its entries come from the
     leaves of the state. `encode` returns the observation of the environment. The cost
-    is minus the reward, and a step that is done terminates the episode. Integer actions
-    are in the table `actions`; other numbers are rounded.
+    is minus the reward, and a step that is done terminates the episode. A discrete
+    action space becomes the table `actions`; a control between two actions is rounded.
 
     If a step uses the random key of `step_env`, the state carries it. It is drawn at
     the start of an episode from the key of the rollout.
@@ -294,9 +294,8 @@ def from_gymnax(
     dynamics and for the cost. Both hold the parameters. To change the parameters, or to
     differentiate with respect to them, convert the environment again.
 
-    Gradients pass if the environment passes them. The environments of gymnax stop
-    gradients by default. If an environment of gymnax 1.0 has
-    `with_transition_gradients`, it is used.
+    Gradients pass if the environment passes them. Environments of gymnax stop them. In
+    gymnax 1.0 some have a method `with_transition_gradients`, which is then used.
 
     **Arguments:**
 
