@@ -50,7 +50,8 @@ def read_linear(
         ```
 
         ```text
-        OUT
+        Array([[0.9, 0.1],
+               [0. , 0.8]], dtype=float32)
         ```
     """
     where = "read_linear"
@@ -132,7 +133,7 @@ def to_control(
         ```
 
         ```text
-        OUTPOLES
+        array([ 3.873, -3.873])
         ```
     """
     where = "to_control"

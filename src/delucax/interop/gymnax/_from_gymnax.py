@@ -110,7 +110,7 @@ class GymnaxDynamics(AbstractDynamics):
         ```
 
         ```text
-        OUTDYN
+        Array([0.5255, 0.5096, 1., 0.], dtype=float32)
         ```
     """
 
@@ -325,7 +325,7 @@ def from_gymnax(
         ```
 
         ```text
-        OUTROLL
+        Array(1652., dtype=float32)
         ```
     """
     where = "from_gymnax"

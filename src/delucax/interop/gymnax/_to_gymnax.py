@@ -48,7 +48,7 @@ class GymnaxParams(eqx.Module):
         ```
 
         ```text
-        OUTPARAMS
+        Array(-4.667, dtype=float32)
         ```
     """
 
@@ -378,7 +378,7 @@ def to_gymnax(
         ```
 
         ```text
-        OUTTO
+        ((3,), Array(False, dtype=bool))
         ```
     """
     return GymnaxEnv(env, discrete=discrete, separate_ends=separate_ends)
