@@ -338,8 +338,11 @@ def test_vector_starts_with_a_seed_or_a_state_each():
 @pytest.mark.parametrize(
     "call, match",
     [
-        (lambda e: e.reset(seed=[1, 2, 3]), "seed must be 2 whole numbers from 0"),
-        (lambda e: e.reset(seed=[1, -2]), "seed must be 2 whole numbers from 0"),
+        (
+            lambda e: e.reset(seed=[1, 2, 3]),
+            "seed must be one whole number from 0, or 2",
+        ),
+        (lambda e: e.reset(seed=[1, -2]), "seed must be one whole number from 0, or 2"),
         (lambda e: e.reset(options=[1, 2]), "options must be a dictionary"),
         (lambda e: e.reset(options={"state": "up"}), r"state must have.*got 'up'"),
         (
