@@ -1,4 +1,4 @@
-"""A policy and an estimate of its cost to go, and what their losses share."""
+"""A policy with a critic, and the base class of the losses that train it."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -28,20 +28,24 @@ from ._steps import AbstractSurrogate
 
 
 class ActorCritic(eqx.Module):
-    """A policy with an estimate of its discounted cost to go,
+    r"""A policy, and a critic that estimates its discounted cost to go.
 
-    `V(t, y) = shift + scale * critic(t, y)`.
+    $$V(t, y) = a + b\, c(t, y)$$
+
+    Here $c$ is the output of the critic. [`delucax.training.PPO`][] and
+    [`delucax.training.SHAC`][] train such a model.
 
     **Arguments:**
 
-    - `policy`: a controller; for [`delucax.training.PPO`][] one that draws, as
+    - `policy`: a controller. For PPO it must draw its controls at random, as
         [`delucax.controllers.Gaussian`][] and [`delucax.controllers.Categorical`][] do.
-    - `critic`: a controller without a memory whose one output is the estimate, such as
-        a [`delucax.controllers.MLP`][].
-    - `shift`, `scale`: 0 and 1 by default; training sets them, so that the network's
-        own output has mean 0 and standard deviation 1.
+    - `critic`: a controller without a memory and with one output, such as a
+        [`delucax.controllers.MLP`][].
+    - `shift`, `scale`: $a$ and $b$, 0 and 1 by default. Training sets them, so that the
+        targets of the critic's own output have mean 0 and standard deviation 1.
 
     **Raises:** `ValueError` if one is not a controller, or the critic has a memory.
+    When it is called, if the critic has more than one output.
 
     !!! example
 
@@ -56,6 +60,8 @@ class ActorCritic(eqx.Module):
         model = dlx.training.ActorCritic(policy, critic)
         model.value(0.0, env.reset(critic_key))
         ```
+
+@@OUT ActorCritic
     """
 
     policy: AbstractController
@@ -77,7 +83,7 @@ class ActorCritic(eqx.Module):
     def value(self, t: RealScalar, y: Array) -> Array:
         """The estimated cost to go.
 
-        **Arguments:** `t`: time. `y`: an observation, a vector.
+        **Arguments:** `t`: time, a scalar. `y`: an observation, shape `(p,)`.
 
         **Returns:** a scalar.
         """
@@ -86,7 +92,7 @@ class ActorCritic(eqx.Module):
     def raw(self, t: RealScalar, y: Array) -> Array:
         """The output of the critic, before shift and scale.
 
-        **Arguments:** `t`: time. `y`: an observation, a vector.
+        **Arguments:** `t`: time, a scalar. `y`: an observation, shape `(p,)`.
 
         **Returns:** a scalar.
         """
@@ -107,23 +113,24 @@ def actor_critic(
     actions: Any = None,
     key: PRNGKey,
 ) -> ActorCritic:
-    """Two fully connected networks made to fit an environment: policy and critic.
+    """A policy and a critic for an environment: two fully connected networks.
 
-    Both are given `environment.encode(y)`, standardised by what training sees. The last
-    layers begin a hundred times smaller than usual: that of the policy near the middle
-    of the bounds, and that of the critic flat, because the gradient of an untrained
-    critic is misleading.
+    The input of both networks is `environment.encode(y)`, standardised with the
+    statistics that training collects. The last layers start with weights a hundred
+    times smaller than usual. So the policy starts near the middle of the bounds, and
+    the critic starts nearly constant, because the gradient of an untrained critic is
+    misleading.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `width`: units in a hidden layer, 64 by default.
     - `depth`: hidden layers, 2 by default.
-    - `head`: `"gaussian"` (default), `"deterministic"` (for
+    - `head`: the kind of policy: `"gaussian"` (default), `"deterministic"` (for
         [`delucax.training.SHAC`][]), or `"categorical"`.
-    - `actions`: the table of a categorical head, shape `(actions, m)`; that of the
-        environment by default.
-    - `key`: a random key, for the first weights.
+    - `actions`: the table of actions of a categorical head, shape `(actions, m)`; the
+        `actions` of the environment by default.
+    - `key`: a random key, for the initial weights.
 
     **Returns:** a [`delucax.training.ActorCritic`][].
 
@@ -144,6 +151,8 @@ def actor_critic(
             env, model.policy, key=jax.random.key(1), horizon=10, x0=[0.1, 0.0]
         ).total_cost
         ```
+
+@@OUT actor_critic
     """
     where = "actor_critic"
     check_instance(environment, Environment, "environment", where)
@@ -157,7 +166,8 @@ def actor_critic(
         table = environment.actions if actions is None else actions
         if table is None:
             raise ValueError(
-                f"{where}: a categorical head must have a table of actions, got none."
+                f"{where}: a categorical head must have a table of actions, got none. "
+                "Pass actions, or give the environment a table."
             )
         base = MLP(size, len(table), **sizes, features=features, key=policy_key)
         policy: Any = Categorical(base, table)
@@ -175,7 +185,7 @@ def actor_critic(
 
 
 class Episodes(NamedTuple):
-    """A batch of episodes; a field that a loss does not use is `None`."""
+    """A batch of episodes. A field that a loss does not use is `None`."""
 
     times: Float[Array, "*batch steps"]
     observations: Float[Array, "*batch steps p"]
@@ -186,16 +196,17 @@ class Episodes(NamedTuple):
     continues: Any
     """False for the last step of an episode."""
     following: Any
-    """The cost to go after each step: V there, or the final cost of its episode."""
+    """The cost to go after each step: the critic's estimate, or at the end the final
+    cost."""
     advantages: Float[Array, "*batch steps"]
     total_cost: Any
     targets: Float[Array, "*batch steps"]
-    """The regression targets of V."""
+    """The regression targets of the critic."""
     log_prob: Any = None
 
 
 class AbstractActorCriticLoss(AbstractSurrogate):
-    """A loss of an [`delucax.training.ActorCritic`][] on fresh episodes."""
+    """A loss of an [`delucax.training.ActorCritic`][], from episodes of its policy."""
 
     environment: eqx.AbstractVar[Environment]
     batch: eqx.AbstractVar[int]
@@ -225,9 +236,9 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def _episodes(
         self, model: ActorCritic, key: PRNGKey, truncate: int | None = None
     ) -> Episodes:
-        """A batch of episodes from fresh starts.
+        """A batch of episodes from newly drawn initial states.
 
-        The gradient is cut before every `truncate`-th step.
+        Backpropagation through time is cut every `truncate` steps.
         """
         one = lambda key: self._episode(model, key, truncate)
         return jax.vmap(one)(jr.split(key, self.batch))
@@ -235,9 +246,9 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def _value_errors(
         self, model: ActorCritic, runs: Episodes
     ) -> Float[Array, "*batch steps"]:
-        """The errors of the critic's raw output."""
-        # In the scale of the network's own output, so that the learning rate does not
-        # depend on that of the cost.
+        """The errors of the critic's own output, before shift and scale."""
+        # Before the scale, so that the learning rate does not depend on the scale of
+        # the cost.
         raw = jax.vmap(jax.vmap(model.raw))(runs.times, runs.observations)
         return raw - (runs.targets - model.shift) / model.scale
 
@@ -247,24 +258,25 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         options: Any = dict(horizon=horizon, truncate=truncate, keep=keep, throw=False)
         run: Any = rollout(env, model.policy, key=key, **options)
         costs = nan_if_failed(run, run.costs)
-        # The observations recorded by a truncated rollout have lost their derivatives
-        # at the cuts, where V is asked for. So the states are observed again, with the
-        # noise that they had.
+        # A truncated rollout records observations without derivatives at the cuts, and
+        # that is where V is evaluated. So we observe the states again, and add the same
+        # noise.
         observed = jax.vmap(env.dynamics.observe)(run.times, run.states)
         noise = lax.stop_gradient(run.observations - observed[:-1])
         observed = observed + jnp.concatenate([noise, jnp.zeros_like(noise[:1])])
         values = jax.vmap(model.value)(run.times, observed)
         following, values = values[1:], values[:-1]
-        # After termination only the final cost remains; after truncation V stands in.
+        # After termination only the final cost follows. After truncation V estimates
+        # the rest.
         if not self.bootstrap:
             following = following.at[-1].set(run.final_cost)
         following = jnp.where(run.terminated, run.final_cost, following)
         steps = jnp.arange(horizon)
         continues = ~run.terminated & (self.bootstrap | (steps < horizon - 1))
         valid = steps < run.length
-        # Generalised advantage estimation (Schulman et al., 2016), in cost:
-        # A_k = delta_k + discount decay A_{k+1}, from the temporal-difference errors
-        # delta_k = c_k + discount V_{k+1} - V_k.
+        # Generalised advantage estimation (Schulman et al., 2016) with costs:
+        # A_k = delta_k + discount decay A_{k+1}, where delta_k is the
+        # temporal-difference error c_k + discount V_{k+1} - V_k.
         errors = costs + self.discount * following - values
         errors = jnp.where(valid, errors, 0)
 
@@ -277,7 +289,7 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         _, advantages = lax.scan(backward, zero, (errors, continues), reverse=True)
         record = run.times[:-1], run.observations, run.controls, costs
         record = *record, valid, continues, following
-        # A + V is the return of TD(lambda), the regression target of V.
+        # A + V is the return of TD(lambda), the regression target of the critic.
         return Episodes(*record, advantages, run.total_cost, advantages + values)
 
 
@@ -295,14 +307,14 @@ class Moments(NamedTuple):
         return Moments(jnp.zeros((), like.dtype), zero, zero)
 
     def joined(self, values: Array, valid: Array) -> "Moments":
-        """The moments with more rows, those that are `valid`."""
+        """The moments after more vectors: the rows of `values` that are `valid`."""
         known = valid.reshape(-1, *(1,) * (values.ndim - 1))
         n = jnp.sum(valid).astype(self.count.dtype)
         mean = jnp.sum(jnp.where(known, values, 0), 0) / jnp.maximum(n, 1)
         squares = jnp.sum(jnp.where(known, (values - mean) ** 2, 0), 0)
         total = jnp.maximum(self.count + n, 1)
-        # Chan, Golub and LeVeque's rule for two samples, 1983: no small difference of
-        # large sums of squares is taken.
+        # The update of Chan, Golub and LeVeque, 1983. It never subtracts two large sums
+        # of squares.
         gap = mean - self.mean
         return Moments(
             self.count + n,
@@ -312,15 +324,16 @@ class Moments(NamedTuple):
 
     @property
     def std(self) -> Array:
-        """The standard deviation, 1 where it is negligible."""
+        """The standard deviations, 1 for an entry that is nearly constant."""
         variance = self.squares / jnp.maximum(self.count, 1)
-        # A feature that does not move is left as it is, and not blown up.
+        # A division by a tiny deviation would only amplify rounding.
         some = variance > 1e-8
         return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 1)
 
 
 class Statistics(NamedTuple):
-    """The moments of the features of each `Standardise` of a model, and of targets."""
+    """The moments of the features of each `Standardise` in a model, and of the
+    regression targets of its critic."""
 
     features: list[Moments]
     targets: Moments
@@ -332,7 +345,7 @@ class Statistics(NamedTuple):
         return Statistics(features, Moments.empty(jnp.zeros((), dtype)))
 
     def updated(self, model: ActorCritic, runs: Episodes) -> "Statistics":
-        """The statistics with the valid observations and targets of more episodes."""
+        """The statistics after more episodes."""
         rows = runs.observations.reshape(-1, runs.observations.shape[-1])
         valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
         parts = zip(parts_of(model, Standardise), self.features, strict=True)
@@ -340,7 +353,7 @@ class Statistics(NamedTuple):
         return Statistics(features, self.targets.joined(targets, valid))
 
     def applied_to(self, model: ActorCritic) -> ActorCritic:
-        """The model, standardised by these moments."""
+        """The model with these moments in its `Standardise` parts, shift and scale."""
 
         def places(model):
             each = [(part.mean, part.std) for part in parts_of(model, Standardise)]

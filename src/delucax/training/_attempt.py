@@ -1,4 +1,4 @@
-"""What a search for a policy tries."""
+"""The trainings that `synthesise` tries."""
 
 from typing import NamedTuple
 
@@ -8,10 +8,14 @@ from .._controller import AbstractController
 
 
 class Attempt(NamedTuple):
-    """One training that was tried.
+    """One training that [`delucax.training.synthesise`][] tried.
 
-    **Attributes:** `structure` of the policy; `method`; `cost`, the mean over the
-    starts on which policies are chosen; `seconds`, with compilation.
+    **Attributes:**
+
+    - `structure`: the structure of the policy, as in [`delucax.training.Synthesis`][].
+    - `method`: the training method, such as `"gradient"` or `"evolution"`.
+    - `cost`: the mean cost over the initial states on which policies are chosen.
+    - `seconds`: the time it took, with compilation.
 
     !!! example
 
@@ -20,6 +24,10 @@ class Attempt(NamedTuple):
 
         attempt = dlx.training.Attempt("network", "evolution", 12.5, 3.0)
         attempt.method, attempt.cost
+        ```
+
+        ```text
+        ('evolution', 12.5)
         ```
     """
 
@@ -30,7 +38,7 @@ class Attempt(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A policy that one method trains, and its costs, `None` before the training."""
+    """A policy, the method that trains it, and its costs (`None` before training)."""
 
     structure: str
     method: str

@@ -1,4 +1,4 @@
-"""Losses from rollouts: expected cost, score-function cost, worst case."""
+"""The costs of rollouts as losses, and the worst case over disturbances."""
 
 from typing import Any, NamedTuple
 
@@ -34,7 +34,9 @@ from ..simulation import rollout, Trajectory
 
 
 class _ExpectedCost(eqx.Module):
-    """A loss; a module rather than a closure, so that the plant is not a constant."""
+    """The loss that `expected_cost` makes."""
+
+    # A module, because a closure would compile the plant in as a constant.
 
     environment: Environment
     gradient_decay: float | Array
@@ -73,32 +75,34 @@ def expected_cost(
     truncate: int | None = None,
     ranges: dict[str, Any] | None = None,
 ) -> Any:
-    """The loss of a controller: its mean total cost over fresh starts.
+    r"""A loss for policy training: the mean total cost of a controller over random
+    episodes.
 
-    `loss(controller, key) = 1/B sum_i J(controller; x0_i, w_i)`, the starts,
-    disturbances and noise drawn anew with each key. A rollout that diverges, or whose
-    solver fails, makes the loss NaN or infinite, which [`delucax.training.fit`][]
-    reports with its step.
+    $$\ell(\theta, \text{key}) = \frac{1}{B} \sum_{i=1}^{B} J(\theta; x_0^i, w^i)$$
+
+    Initial states, disturbances and noise are drawn from the key. If a rollout diverges
+    or its solver fails, the loss is NaN or infinite; [`delucax.training.fit`][] then
+    reports the step.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `batch`: the number B of rollouts, all at once under `jax.vmap`.
-    - `horizon`: steps per rollout; the environment's own by default.
-    - `checkpoint`: what the gradient stores, as in [`delucax.rollout`][]; `"step"` by
-        default.
-    - `gradient_decay`: damping of the gradient through time, as in
-        [`delucax.rollout`][]; 1, the true gradient, by default.
-    - `truncate`: steps after which the gradient is cut, as in [`delucax.rollout`][];
-        never by default.
-    - `ranges`: of parameters, as in [`delucax.randomise`][]: each rollout draws a plant
-        of its own. None by default.
+    - `batch`: $B$, the number of rollouts. They run together under `jax.vmap`.
+    - `horizon`: steps per rollout; the `horizon` of the environment by default.
+    - `checkpoint`: what the gradient stores: `"step"` (default), `"sqrt"` or `None`, as
+        in [`delucax.rollout`][].
+    - `gradient_decay`: the damping of the gradient through time, as in
+        [`delucax.rollout`][]. 1 by default, which is the true gradient.
+    - `truncate`: the gradient is cut every `truncate` steps, as in
+        [`delucax.rollout`][]; never by default.
+    - `ranges`: ranges of parameters, as in [`delucax.randomise`][]. Each rollout then
+        draws its own plant. None by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar.
 
     **Raises:** `ValueError` if `batch`, `horizon` or `truncate` is below 1,
-    `environment` is not an environment, `checkpoint` is none of the above, or
-    `gradient_decay` is not a finite number.
+    `environment` is not an environment, `checkpoint` is none of the above,
+    `gradient_decay` is not a finite number, or `ranges` are not valid.
 
     !!! example
 
@@ -116,14 +120,16 @@ def expected_cost(
             steps=10,
             key=jax.random.key(0),
         )
-        fitted.model.K, fitted.history.loss
+        fitted.history.loss[-1] < fitted.history.loss[0]
         ```
+
+@@OUT expected_cost
     """
     where = "expected_cost"
     check_instance(environment, Environment, "environment", where)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
     decay = as_number(gradient_decay, "gradient_decay", where)
-    # A number 1 is known to leave the gradient alone, and compiles nothing.
+    # The Python number 1 needs no code in the compiled program; an array does.
     is_one = isinstance(gradient_decay, int | float) and gradient_decay == 1
     decay = 1.0 if is_one else as_float_array(decay)
     horizon = environment.horizon if horizon is None else horizon
@@ -150,10 +156,10 @@ class _ScoredCost(eqx.Module):
         options: Any = dict(horizon=self.horizon, keep=keep, throw=False)
         run: Any = rollout(self.environment, controller, key=key, **options)
 
-        # What was drawn depends on the weights, but the score is that of the weights
-        # for a draw held fixed. So the controller is run again on what it was given:
-        # its memory may depend on the weights, and keeps its gradient; the
-        # observations, the controls and the costs do not.
+        # The score is the gradient of the log-probability with the drawn controls held
+        # fixed. So we run the controller again on the recorded observations, controls
+        # and costs without their gradients. Its memory may depend on the weights, and
+        # keeps its gradient.
         def act(t, y, state, applied, valid):
             u, after = controller(t, y, state)
             log_prob = controller.log_prob(t, y, state, lax.stop_gradient(u))
@@ -168,23 +174,28 @@ class _ScoredCost(eqx.Module):
 
 
 def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
-    """The loss of a controller that draws: one episode's cost, and its log-probability.
+    r"""A loss for stochastic policies: the cost of an episode, and the log-probability
+    of its controls.
 
-    `loss(controller, key) = (J, {"log_prob": sum_k log p(u_k | t_k, y_k, s_k)})`, with
-    the observations and the drawn controls held fixed in the log-probability. The
-    episode is that of `delucax.rollout(environment, controller, key=key)`. It is what
-    [`delucax.training.LikelihoodRatio`][] asks for; the other estimators take it too.
+    `loss(controller, key)` returns `(J, {"log_prob": L})`: the total cost $J$ of
+    `delucax.rollout(environment, controller, key=key)`, and
+
+    $$L(\theta) = \sum_k \log p_\theta(u_k \mid t_k, y_k, s_k)$$
+
+    Here $s_k$ is the memory of the controller. The observations and the drawn controls
+    are held fixed in $L$. [`delucax.training.LikelihoodRatio`][] needs such a loss; the
+    other estimators accept it too.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `horizon`: steps; the environment's own by default.
+    - `horizon`: steps of the episode; the `horizon` of the environment by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar and a dictionary. The
     controller must be a [`delucax.AbstractStochasticPolicy`][].
 
     **Raises:** `ValueError` if `horizon` is below 1 or `environment` is not an
-    environment; when it is called, if the controller does not draw its controls.
+    environment. When the loss is called, if the controller is not a stochastic policy.
 
     !!! example
 
@@ -212,6 +223,11 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
         estimator = dlx.training.LikelihoodRatio(samples=32)
         key = jax.random.key(0)
         value, gradient = eqx.filter_jit(estimator)(loss, Dithered(), key)
+        gradient.gain.shape
+        ```
+
+        ```text
+        ()
         ```
     """
     where = "scored_cost"
@@ -221,14 +237,14 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
 
 
 def nan_if_failed(trajectory: Trajectory, costs: Array) -> Array:
-    """Costs of a run, NaN where it failed: those of a failed solve may look finite."""
-    # Costs that are not finite show it already, and stay as they are.
+    """The costs of a rollout, or NaN if it failed, because they may look finite."""
+    # A total cost that is not finite already shows the failure, so its costs stay.
     kept = ~trajectory.failed | ~jnp.isfinite(trajectory.total_cost)
     return jnp.where(kept, costs, jnp.nan)
 
 
 class _Attack(NamedTuple):
-    """The worst disturbances of a search, see `worst_case`."""
+    """The worst disturbances that `worst_case` found."""
 
     w: Float[Array, "horizon disturbances"]
     total_cost: Array
@@ -246,38 +262,40 @@ def worst_case(
     iterations: int = 20,
     starts: int = 8,
 ) -> _Attack:
-    r"""Worst-case bounded disturbances of a closed loop, by local search,
+    r"""The worst bounded disturbances of a closed loop, found by a local search.
 
-    `max over w of the total cost, with |w_t| <= bound for each t`.
+    $$\max_{w} \; J(w) \quad \text{subject to} \quad \lVert w_k \rVert \le r
+    \text{ for each } k$$
 
-    At each iteration the cost is taken to be linear in the disturbances,
-    `w_t <- bound g_t / |g_t|`, `g_t` being the derivative of the total cost with
-    respect to `w_t`. Where the cost is convex in the disturbances, as with linear
-    dynamics and feedback and a convex cost, no iteration makes it less; the best one is
-    returned in any case. The search starts several times at once, every other time from
-    a constant push and else from noise, and the best end is returned.
+    $J$ is the total cost of the rollout. Each iteration maximises the linear model of
+    the cost at the present disturbances, with $g_k = \partial J / \partial w_k$:
+
+    $$w_k \leftarrow r\, \frac{g_k}{\lVert g_k \rVert}$$
+
+    If the cost is convex in the disturbances, an iteration never lowers it. This is so
+    for a linear plant, linear feedback and a convex cost. The search runs from several
+    starts at once; every other start is constant over time, the others are noise. It
+    returns the best disturbances of all iterations and starts.
 
     **Arguments:**
 
-    - `environment`: the environment; its own disturbance is not used.
-    - `controller`: the controller under attack. The attack accounts for the adaptation
-        of a learner.
-    - `key`: a random key, for the start of the search, of the rollout and of the
-        controller.
-    - `bound`: of the Euclidean norm of each `w_t`, a positive number.
-    - `x0`: the first state; drawn by the environment by default.
-    - `horizon`: steps; the environment's own by default.
-    - `iterations`: 20 by default.
-    - `starts`: 8 by default.
+    - `environment`: the environment. Its own disturbance is not used.
+    - `controller`: the controller. If it adapts, the gradient includes its adaptation.
+    - `key`: a random key, for the starts of the search, the rollout and the controller.
+    - `bound`: $r$, the bound on the Euclidean norm of each $w_k$, a positive number.
+    - `x0`: the initial state, shape `(n,)`; drawn by the environment by default.
+    - `horizon`: steps of the rollout; the `horizon` of the environment by default.
+    - `iterations`: the number of iterations, 20 by default.
+    - `starts`: the number of starts, 8 by default.
 
-    **Returns:** a named tuple: `w`, shape `(horizon, k)`, for `rollout(..., w=w)`;
-    `total_cost`, what they cost; and `costs`, the total cost at each iteration from
-    the start that led to them, shape `(iterations + 1,)`.
+    **Returns:** a named tuple. `w`, shape `(horizon, k)`, are the disturbances, to use
+    in `rollout(..., w=w)`. `total_cost` is their total cost. `costs`, shape
+    `(iterations + 1,)`, is the total cost at each iteration of the best start.
 
-    **Raises:** `ValueError` on an argument of the wrong kind, shape or range, or if the
+    **Raises:** `ValueError` if an argument has the wrong type, shape or range, or the
     environment takes no disturbance.
 
-    Source: Frank and Wolfe, 1956 (for a maximum of a convex function).
+    Source: Frank and Wolfe, 1956, applied to the maximum of a convex function.
 
     !!! example
 
@@ -290,8 +308,10 @@ def worst_case(
         env = dlx.make("lds", A=A, B=B, horizon=100)
         lqr = dlx.controllers.LQR(env.dynamics, jnp.eye(2), jnp.eye(1))
         attack = dlx.training.worst_case(env, lqr, key=jax.random.key(0), bound=1.0)
-        attack.total_cost, attack.w
+        attack.w.shape, attack.total_cost
         ```
+
+@@OUT worst_case
     """
     where = "worst_case"
     check_instance(environment, Environment, "environment", where)
@@ -323,8 +343,8 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
         moved = (norm > 0) & jnp.isfinite(norm)
         return jnp.where(moved, bound * g / jnp.where(moved, norm, 1), old)
 
-    # One iteration of Frank and Wolfe: the maximum over the balls of the cost's linear
-    # model lies on the spheres, along the gradient.
+    # An iteration of Frank and Wolfe: the linear model of the cost is largest on the
+    # spheres, in the direction of the gradient.
     def step(carry, _):
         w, best, most = carry
         cost, g = jax.value_and_grad(total)(w)

@@ -1,4 +1,4 @@
-"""Costs of the episodes that the search for a policy looks at."""
+"""The costs of episodes, as the search of `synthesise` compares them."""
 
 from typing import Any
 
@@ -16,21 +16,20 @@ from ..planning import ILQR
 from ..simulation import rollout
 
 
-# Costs count by their logarithm from this multiple of the usual one on.
+# Costs grow like their logarithm above this multiple of the usual cost.
 _FAR = 20.0
 _QUIETLY: Any = dict(keep=(), throw=False)
 
 
 def tamed(costs: Array, usual: Any) -> Array:
-    """Costs of which those far above the usual one count by their logarithm, and those
-    that are not finite as the largest number.
+    """Costs, compressed: those far above the usual cost grow like their logarithm only.
 
-    Otherwise the one episode in a hundred in which a plant runs away, to a cost of a
-    million, outweighs all others.
+    Without this, a single episode in which the plant runs away, at a cost of a million,
+    would outweigh all others. A cost that is not finite becomes the largest number.
     """
     far = _FAR * usual
     costs = jnp.nan_to_num(jnp.where(jnp.isnan(costs), jnp.inf, costs))
-    # The ratio of the largest number to a small cost overflows.
+    # The ratio overflows if a cost is the largest number and the usual cost is small.
     ratio = jnp.nan_to_num(jnp.abs(costs) / far)
     return jnp.sign(costs) * far * jnp.log1p(ratio)
 
@@ -52,7 +51,7 @@ class TamedCost(eqx.Module):
 def on_plants(
     environment: Environment, ranges: dict[str, Any] | None, keys: Array, of: Any
 ) -> Any:
-    """`of(plant, key)` for each key, the plant being drawn as by `expected_cost`."""
+    """`of(plant, key)` for each key, with plants drawn as in `expected_cost`."""
 
     def one(key):
         if ranges is None:
@@ -65,12 +64,14 @@ def on_plants(
 
 @eqx.filter_jit
 def costs_of(environment, ranges, policy, keys):
+    """The total cost of a policy in each episode."""
     of = lambda plant, key: rollout(plant, policy, key=key, **_QUIETLY).total_cost
     return on_plants(environment, ranges, keys, of)
 
 
 @eqx.filter_jit
 def costs_of_mpc(environment, ranges, lqr, keys):
+    """The total cost of MPC in each episode, for the plant of that episode."""
     def of(plant, key):
         mpc = local_mpc(plant, lqr, throw=False)
         return rollout(plant, mpc, key=key, **_QUIETLY).total_cost
@@ -80,8 +81,11 @@ def costs_of_mpc(environment, ranges, lqr, keys):
 
 @eqx.filter_jit
 def costs_of_plan(environment, ranges, policy, keys):
-    """Of the best plan with known disturbances that starts from the policy's controls,
-    or of these."""
+    """The total cost in each episode of a plan that knows the disturbances.
+
+    The planner starts from the controls of the policy. If the plan costs more than the
+    policy, the cost of the policy counts.
+    """
 
     def of(plant, key):
         keep = ("states", "controls", "disturbances")
@@ -97,7 +101,7 @@ def costs_of_plan(environment, ranges, policy, keys):
 
 @eqx.filter_jit
 def first_steps(environment, keys):
-    """First states, their cost without control, and the states after one step under
+    """Initial states, their stage costs without control, and the next states under
     several controls."""
     m, bounds = environment.control_size, environment.control_bounds
     controls = jnp.concatenate([jnp.zeros((1, m)), jr.normal(keys[0], (15, m))])

@@ -1,4 +1,4 @@
-"""Search over weights without a derivative: natural evolution strategies."""
+"""Training without derivatives: natural evolution strategies."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,14 +25,15 @@ _SPREAD = "log_std"
 
 
 class _Search(eqx.Module):
-    """A normal distribution of models: its mean, and a deviation for each weight."""
+    """A normal distribution of models: the mean model, and a log standard deviation for
+    each weight."""
 
     mean: PyTree
     log_std: Array = weight()
 
 
 class _OfMean(eqx.Module):
-    """The loss of a model, as one of a distribution of models."""
+    """The loss of the mean model of a `_Search`."""
 
     loss: Callable[..., Any]
 
@@ -41,7 +42,7 @@ class _OfMean(eqx.Module):
 
 
 class _NaturalGradient(eqx.Module):
-    """The natural gradient of the expected rank, an estimator for `fit`."""
+    """An estimator for `fit`: the natural gradient of the expected utility."""
 
     population: int = eqx.field(static=True)
 
@@ -56,12 +57,13 @@ class _NaturalGradient(eqx.Module):
         std = jnp.exp(log_std)
 
         def cost_of(e):
-            # All members see the same starts, so that they differ by their weights.
+            # All models of a generation get the same key, so that only their weights
+            # make a difference.
             value = loss(as_tree(mean + std * e) | {_SPREAD: log_std}, loss_key)
             return cost_and_metrics(value, _WHERE)[0]
 
         costs = jax.vmap(cost_of)(noise)
-        # A member that diverges comes last.
+        # A model that diverges ranks last.
         order = jnp.argsort(jnp.where(jnp.isnan(costs), jnp.inf, costs))
         utility = jnp.zeros(2 * half, mean.dtype).at[order].set(_utilities(2 * half))
         rate = (3 + np.log(size)) / (5 * np.sqrt(size))
@@ -71,7 +73,7 @@ class _NaturalGradient(eqx.Module):
 
 
 def _utilities(count: int) -> Array:
-    """What the ranks count, from the best to the worst; their sum is zero."""
+    """The utilities of the ranks, from the best to the worst. They sum to zero."""
     shares = np.maximum(0, np.log(count / 2 + 1) - np.log(np.arange(count) + 1))
     return jnp.asarray(shares / shares.sum() - 1 / count)
 
@@ -90,38 +92,41 @@ def evolve(
     callbacks: Sequence[Callable[[int, dict[str, float]], Any]] = (),
     throw: bool = True,
 ) -> Fitted:
-    r"""Train a model by the ranks of a loss, without its derivative: separable natural
-    evolution strategies.
+    r"""Train a model without derivatives of the loss: separable natural evolution
+    strategies.
 
-    Weights are drawn from a normal distribution, `mean + std * e_i`, in pairs `+-e_i`.
-    With `v_i` the utility of a draw by its rank,
+    Each generation draws weights $\mu + \sigma \odot e_i$ from a normal distribution,
+    with $e_i \sim \mathcal{N}(0, I)$ in pairs of opposite sign. The losses are ranked,
+    and each draw gets a utility $v_i$ by its rank. For $d$ weights:
 
-    `mean <- mean + std sum_i v_i e_i`,
-    `log std <- log std + rate / 2 sum_i v_i (e_i^2 - 1)`,
+    $$\mu \leftarrow \mu + \sigma \odot \sum_i v_i e_i, \qquad
+    \log \sigma \leftarrow \log \sigma + \frac{\eta}{2} \sum_i v_i (e_i^2 - 1),
+    \qquad \eta = \frac{3 + \log d}{5 \sqrt{d}}$$
 
-    `rate = (3 + log d) / (5 sqrt(d))` for d weights. As only the order of the losses
-    counts, it works where the loss is flat almost everywhere or jumps, such as the
-    reward at the end of an episode. It is best for up to some hundred weights.
+    Only the order of the losses counts. So it also works if the loss jumps or is flat
+    almost everywhere, such as a reward at the end of an episode. It works best for up
+    to a few hundred weights.
 
     **Arguments:**
 
-    - `loss`: `loss(model, key)` to a scalar, such as that of
-        [`delucax.training.expected_cost`][]. A generation shares its key.
-    - `model`: a controller or any pytree.
+    - `loss`: a function `loss(model, key)` to a scalar;
+        [`delucax.training.expected_cost`][] makes one. All models of a generation get
+        the same key.
+    - `model`: a controller or any other pytree; the initial $\mu$.
     - `steps`: the number of generations, at least 1.
     - `key`: a random key.
-    - `population`: models in a generation, an even number; 64 by default.
-    - `sigma`: the first standard deviation of each weight, 1 by default.
-    - `trainable`: the path of what moves, such as `"correction"`; the fields marked
-        [`delucax.weight`][] by default.
-    - `block`, `progress`, `callbacks`, `throw`: as in [`delucax.training.fit`][];
-        generations in a block are 50 by default.
+    - `population`: models in a generation, an even number of at least 4; 64 by default.
+    - `sigma`: the initial $\sigma$, one positive number for all weights; 1 by default.
+    - `trainable`: the path of the part to train, such as `"correction"`; the fields
+        marked [`delucax.weight`][] by default.
+    - `block`, `progress`, `callbacks`, `throw`: as in [`delucax.training.fit`][], with
+        blocks of 50 generations by default.
 
-    **Returns:** a [`delucax.training.Fitted`][] whose model is the mean. Its history
-        has the least loss of each generation.
+    **Returns:** a [`delucax.training.Fitted`][]. Its model is the mean $\mu$; its
+    history has the smallest loss of each generation.
 
-    **Raises:** `ValueError` on an argument of the wrong kind, `RuntimeError` as `throw`
-    says if no model of a generation has a finite loss.
+    **Raises:** `ValueError` if an argument has the wrong type or range. `RuntimeError`
+    if no model of a generation has a finite loss, unless `throw` is false.
 
     Source: Wierstra, Schaul, Glasmachers, Sun, Peters and Schmidhuber, 2014.
 
@@ -136,6 +141,11 @@ def evolve(
         loss = dlx.training.expected_cost(env, batch=2)
         key = jax.random.key(1)
         fitted = dlx.training.evolve(loss, policy, 5, key=key, population=16)
+        fitted.history.loss.shape
+        ```
+
+        ```text
+        (5,)
         ```
     """
     population = check_count(population, "population", _WHERE, least=4)
@@ -153,6 +163,6 @@ def evolve(
     options |= dict(callbacks=callbacks, gradient=estimator)
     if trainable is not None:
         options["trainable"] = (f"mean.{trainable}", _SPREAD)
-    # The estimator gives whole steps.
+    # The estimator returns whole steps, so the learning rate is 1.
     fitted = fit(_OfMean(loss), search, optax.sgd(1.0), steps, **options)
     return Fitted(fitted.model.mean, fitted.history, fitted.result)

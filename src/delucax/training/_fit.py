@@ -26,7 +26,7 @@ from ._trainable import partition_trainable
 
 
 with warnings.catch_warnings():
-    # In a notebook without ipywidgets it warns, and draws its bar as text all the same.
+    # Without ipywidgets, tqdm warns in a notebook, but the text bar still works.
     warnings.simplefilter("ignore")
     from tqdm.auto import tqdm
 
@@ -35,14 +35,16 @@ _WHERE = "fit"
 
 
 class Fitted(eqx.Module):
-    """The result of `fit`.
+    """The result of [`delucax.training.fit`][].
 
     **Attributes:**
 
-    - `model`: the trained model. If training diverged, the model as it was before the
-        step that failed.
-    - `history`: the record, a [`delucax.training.History`][].
-    - `result`: success, or `RESULTS.diverged`; one of `delucax.RESULTS`.
+    - `model`: the trained model. If training diverged, the model before the step that
+        failed.
+    - `history`: the losses and other numbers of each step, a
+        [`delucax.training.History`][].
+    - `result`: the status, `RESULTS.successful` or `RESULTS.diverged` of
+        `delucax.RESULTS`.
 
     !!! example
 
@@ -59,8 +61,10 @@ class Fitted(eqx.Module):
             steps=100,
             key=jax.random.key(0),
         )
-        fitted.model.K, fitted.history.loss[-1], fitted.result
+        fitted.model.K.round(1), fitted.result
         ```
+
+@@OUT Fitted
     """
 
     model: PyTree
@@ -88,67 +92,74 @@ def fit(
     checkpoint_every: int | None = None,
     throw: bool = True,
 ) -> Fitted:
-    """Train a model: one loop for policies, identification and learned simulators.
+    r"""Train a model with a loss and an Optax optimiser.
 
-    At step k, with `key_k = fold_in(key, k)`: take the loss and its gradient with
-    respect to the trainable values, update them with the optimiser. Constrained values
-    are optimised in the unconstrained space, `z = unconstrain(value)`, and the model
-    gets `constrain(z)`, so that no step leaves the valid set.
+    Use it to train policies and to fit any other model, such as a learned simulator.
+    Each step $k$ evaluates the loss with the key `jax.random.fold_in(key, k)`, its
+    gradient with respect to the trainable values, and the update of the optimiser.
+    A value with a constraint is optimised as $z = \mathrm{unconstrain}(v)$, and the
+    model gets $v = \mathrm{constrain}(z)$, so every step stays in the valid set.
 
-    The steps run in compiled blocks, as one loop on the device. The result does not
-    depend on the size of the block, and a run that was cut off and resumed from its
-    checkpoint, on the same kind of machine, ends with the same bits. A second call with
-    the same loss function, an optimiser made in the same way, such as a new
-    `optax.adam(1e-3)`, and the same kind of model does not compile again. Not for use
-    under `jit` or `vmap`; but a batch of keys trains a batch of models, all at once and
-    each as if it were alone.
+    The steps run in compiled blocks. The result does not depend on the size of a block.
+    A run that resumes from its checkpoint, on the same kind of machine, gives the same
+    bits as a run without interruption. A second call does not compile again if the loss
+    is the same function, the optimiser is made in the same way, such as a new
+    `optax.adam(1e-3)`, and the model has the same structure and shapes.
+
+    You cannot call `fit` under `jax.jit` or `jax.vmap`. To train an ensemble, pass a
+    batch of keys and a batch of models: all are trained at once, independently of each
+    other.
 
     **Arguments:**
 
-    - `loss`: `loss(model, key)`, or `loss(model, batch, key)` where there is `data`; to
-        a scalar, or to a scalar and a dictionary of scalar metrics. If it is a module
-        (as that of [`delucax.training.expected_cost`][] is), a change of its arrays
-        does not compile again. Or a [`delucax.training.AbstractSurrogate`][], such as
-        [`delucax.training.PPO`][], which has a memory.
-    - `model`: any pytree: a controller, an environment, a network, or several. With a
-        batch of keys every array has the axis of the batch in front, as
-        `eqx.filter_vmap(make)(keys)` gives it.
-    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. It sees a dictionary
-        from the path of each trainable leaf to its unconstrained value.
+    - `loss`: a function `loss(model, key)`, or `loss(model, batch, key)` with `data`.
+        It returns a scalar, or a scalar and a dictionary of scalar metrics. If it is a
+        module, as [`delucax.training.expected_cost`][] returns, its arrays can change
+        without a new compilation. Or an [`delucax.training.AbstractSurrogate`][], a
+        loss with a memory, such as [`delucax.training.PPO`][].
+    - `model`: any pytree: a controller, an environment, a network, or several of them.
+        With a batch of keys, every array has a leading axis over the seeds, as
+        `eqx.filter_vmap(make)(keys)` returns it.
+    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. Its parameters are a
+        dictionary from the path of each trainable leaf to its unconstrained value.
     - `steps`: the number of steps, at least 1.
-    - `key`: a random key; or a batch of them, shape `(seeds,)`.
+    - `key`: a random key, or a batch of keys, shape `(seeds,)`.
     - `data`: a pytree of arrays with a common leading axis; none by default.
-    - `batch_size`: rows in a batch, drawn without replacement; each pass over the data
-        has a new order, and leaves out the rows that do not fill a batch. All rows at
-        every step by default.
-    - `trainable`: what moves. The fields marked [`delucax.weight`][] by default; else a
-        path such as `"dynamics.system.length"`, several paths, a dictionary from path
-        to a constraint ([`delucax.positive`][], [`delucax.bounded`][], or `None` for
-        that of the field), a function of a leaf such as `equinox.is_inexact_array`, or
-        booleans in the structure of the model.
-    - `gradient`: the estimator, [`delucax.training.analytic`][] by default; or
-        [`delucax.training.EvolutionStrategies`][],
+    - `batch_size`: the number of rows of `data` in a batch, all rows by default. Rows
+        are drawn without replacement. Each pass over the data has a new order, and
+        skips the last rows if they do not fill a batch.
+    - `trainable`: which leaves to train; the fields marked [`delucax.weight`][] by
+        default. Pass a path such as `"dynamics.system.length"`; several paths; a
+        dictionary from paths to constraints ([`delucax.positive`][],
+        [`delucax.bounded`][], or `None` for the constraint of the field); a function of
+        a leaf such as `equinox.is_inexact_array`; or booleans in the structure of the
+        model.
+    - `gradient`: the gradient estimator, [`delucax.training.analytic`][] by default.
+        Others are [`delucax.training.EvolutionStrategies`][],
         [`delucax.training.LikelihoodRatio`][], or any function
         `gradient(loss, values, key)` to `(value, gradient)`.
-    - `block`: steps in one call to the device, at most 1000; 100 by default. The bar
-        moves, callbacks are called and checkpoints are written after each.
-    - `progress`: whether to show a bar with the loss; true by default.
-    - `callbacks`: functions `(step, metrics)` called after each block, with the number
-        of steps done and a dictionary of the last step's numbers (their mean over a
-        batch), for example to log them to TensorBoard; none by default.
-    - `checkpoint`: the path of a file to write the run to; none by default. If it is
-        there, the run goes on from it.
+    - `block`: steps in one call to the device, at most 1000; 100 by default. The
+        progress bar, the callbacks and the checkpoints are updated after each block.
+    - `progress`: whether to show a progress bar with the loss; true by default.
+    - `callbacks`: functions `callback(step, metrics)`, called after each block; none by
+        default. `step` is the number of steps done, `metrics` a dictionary of the last
+        step's numbers, averaged over the seeds. Use them to log to TensorBoard, for
+        example.
+    - `checkpoint`: the path of a file for checkpoints; none by default. If the file
+        exists, the run resumes from it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
-        blocks by default. The end of the run is always written.
-    - `throw`: raise if the loss, its gradient or an update is NaN or infinite
-        (default); if false, stop there and set `fitted.result`. In a batch only the
-        seed that failed is frozen.
+        blocks by default. A checkpoint is always written at the end of the run.
+    - `throw`: whether to raise if the loss, its gradient or an update is NaN or
+        infinite; true by default. If false, training stops before that step, and
+        `fitted.result` says so. In a batch only the seed that failed stops.
 
-    **Returns:** a [`delucax.training.Fitted`][]; of a batch, every array of the model,
-    every column of the history but `step` and `seconds`, and the result have its axis.
+    **Returns:** a [`delucax.training.Fitted`][]. With a batch of keys, the arrays of
+    the model, the result, and the columns of the history except `step` and `seconds`
+    have an axis over the seeds.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, if nothing is
-    trainable, or if the checkpoint is of another run; `RuntimeError` as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong type or shape, nothing is
+    trainable, or the checkpoint is of another run. `RuntimeError` if training diverges,
+    unless `throw` is false.
 
     !!! example
 
@@ -177,8 +188,10 @@ def fit(
             batch_size=32,
             trainable={"length": dlx.positive},
         )
-        fitted.model.length
+        fitted.model.length.round(2)
         ```
+
+@@OUT fit
     """
     check_function(loss, "loss", _WHERE)
     if not isinstance(optimiser, optax.GradientTransformation):
@@ -194,8 +207,8 @@ def fit(
     size, batch_size = _checked_data(data, batch_size)
     if isinstance(loss, AbstractSurrogate) and data is not None:
         raise ValueError(
-            f"{_WHERE}: data must be None where the loss is a surrogate, which makes "
-            "its own."
+            f"{_WHERE}: data must be None if the loss is a surrogate, because it makes "
+            "its own data."
         )
     if not isinstance(callbacks, tuple | list) or not all(map(callable, callbacks)):
         raise ValueError(
@@ -210,8 +223,8 @@ def fit(
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((model, key, data))):
         raise ValueError(
             f"{_WHERE}: model, key and data must hold values; fit cannot be called "
-            "under jax.jit, jax.vmap or jax.grad. Train an ensemble with a batch of "
-            "keys."
+            "under jax.jit, jax.vmap or jax.grad. To train an ensemble, pass a batch "
+            "of keys."
         )
     assembly, values = partition_trainable(model, trainable, _WHERE)
     own = Optimiser(optimiser)
@@ -231,7 +244,9 @@ def fit(
             state = State(*arrays, order=state.order, fault=state.fault)
             blocks = [history]
     elif checkpoint_every is not None:
-        raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
+        raise ValueError(
+            f"{_WHERE}: checkpoint_every needs checkpoint, the path of a file."
+        )
     every = 10 * block if checkpoint_every is None else checkpoint_every
     every = check_count(every, "checkpoint_every", _WHERE)
 
@@ -278,7 +293,7 @@ def _outcomes(fault: Array) -> Result:
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
-    """The message of a failure."""
+    """The error message of a run that diverged."""
     remedy = "Pass throw=False to get the model as it was before that step."
     if faults.ndim:
         seed = int(np.argmax(faults > 0))
@@ -295,8 +310,8 @@ def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
 
 
 def _checked_seeds(key: Any, model: PyTree) -> int | None:
-    """The number of seeds in a batch of keys, which each array of the model must have
-    an axis of in front; `None` for one key."""
+    """The number of seeds in a batch of keys, or `None` for one key. With a batch,
+    checks that each array of the model has a leading axis over the seeds."""
     typed = eqx.is_array(key) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     raw = eqx.is_array(key) and key.dtype == jnp.uint32 and key.shape[1:] == (2,)
     if not (typed and key.ndim == 1 or raw and key.ndim == 2):
@@ -307,17 +322,17 @@ def _checked_seeds(key: Any, model: PyTree) -> int | None:
         if leaf.shape[:1] != (seeds,):
             raise ValueError(
                 f"{_WHERE}: each array of model must have the axis of the {seeds} keys "
-                "in front, as equinox.filter_vmap(make)(keys) gives it, got one of "
-                f"shape {leaf.shape}."
+                "in front, as equinox.filter_vmap(make)(keys) returns it, got an array "
+                f"of shape {leaf.shape}."
             )
     return seeds
 
 
 def _checked_data(data: PyTree, batch_size: Any) -> tuple[int | None, int | None]:
-    """`(number of rows, batch size)`."""
+    """The number of rows of the data, and the checked batch size."""
     if data is None:
         if batch_size is not None:
-            raise ValueError(f"{_WHERE}: batch_size needs data.")
+            raise ValueError(f"{_WHERE}: batch_size needs data, got none.")
         return None, None
     leaves = jax.tree.leaves(data)
     shapes = [jnp.shape(leaf) for leaf in leaves]
@@ -335,7 +350,7 @@ def _checked_data(data: PyTree, batch_size: Any) -> tuple[int | None, int | None
 
 
 def _as_jax(tree: PyTree) -> PyTree:
-    """NumPy arrays as JAX ones: they would be static under `jit`."""
+    """The tree with its NumPy arrays as JAX arrays."""
     as_jax = lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf
     return jax.tree.map(as_jax, tree)
 

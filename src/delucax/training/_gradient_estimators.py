@@ -1,4 +1,4 @@
-"""Estimators of the gradient of a loss, and what a loss returns."""
+"""Estimators of the gradient of a loss."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,28 +20,30 @@ from ._trainable import weights_of
 def analytic(
     loss: Callable[..., Any], model: PyTree, key: PRNGKey
 ) -> tuple[Any, PyTree]:
-    """The gradient by automatic differentiation through the loss.
+    r"""The gradient of a loss by automatic differentiation.
 
-    `g = d loss(theta, key) / d theta`, exact for the key that is drawn; its mean over
-    keys is the gradient of the expected loss wherever the two may be exchanged.
+    $$g = \frac{\partial \ell(\theta, \text{key})}{\partial \theta}$$
 
-    Like every estimator it is called as `estimator(loss, model, key)`. The gradient is
-    with respect to the leaves of the model marked `weight()`; or, where none is marked,
-    to every floating-point array. [`delucax.training.fit`][] hands it the trainable
-    (unconstrained) values alone.
+    The gradient is exact for the given key. Its mean over keys is the gradient of the
+    expected loss, if derivative and expectation can be exchanged.
+
+    All estimators are called as `estimator(loss, model, key)`. The gradient is with
+    respect to the leaves of the model marked [`delucax.weight`][]. If none is marked,
+    it is with respect to all floating-point arrays. [`delucax.training.fit`][] passes
+    the trainable, unconstrained values as `model`.
 
     **Arguments:**
 
-    - `loss`: `loss(model, key)` to a scalar, or to a scalar and a dictionary of scalar
-        metrics.
+    - `loss`: a function `loss(model, key)` to a scalar, or to a scalar and a dictionary
+        of scalar metrics.
     - `model`: a pytree with weights.
-    - `key`: a random key, passed to the loss.
+    - `key`: a random key, for the loss.
 
-    **Returns:** `(value, gradient)`: what the loss returned, and a pytree like the
-    model with `None` in the place of what is not a weight.
+    **Returns:** `(value, gradient)`: the output of the loss, and a pytree like the
+    model, with `None` for each leaf that is not a weight.
 
-    **Raises:** `ValueError` if the loss is not a floating-point scalar, or `key` is no
-    random key.
+    **Raises:** `ValueError` if the loss does not return a floating-point scalar, or
+    `key` is not a random key.
 
     !!! example
 
@@ -58,6 +60,8 @@ def analytic(
         value, gradient = estimator(loss, controller, jax.random.key(0))
         gradient.K
         ```
+
+@@OUT analytic
     """
     check_key(key, "analytic")
 
@@ -71,7 +75,7 @@ def analytic(
 def gradient_of_weights(
     loss: Callable[[PyTree], tuple[Array, Any]], model: PyTree
 ) -> tuple[Any, PyTree]:
-    """The auxiliary value of `loss(model)`, and the gradient of its scalar."""
+    """The second output of `loss(model)`, and the gradient of the first."""
     weights, rest = weights_of(model)
     of = lambda weights: loss(eqx.combine(weights, rest))
     (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)
@@ -79,27 +83,29 @@ def gradient_of_weights(
 
 
 class ClippedSamples(eqx.Module):
-    r"""The mean of the gradients of several draws, with those that are far longer than
-    the middle one shortened.
+    r"""The mean gradient of several samples, after clipping the norm of each of them.
 
-    Over the n samples whose cost and gradient `g_i` are finite,
+    Over the $n$ samples whose cost and gradient $g_i$ are finite:
 
-    `g = 1 / n sum_i min(1, c / |g_i|) g_i`, `c = factor * median of |g_i|`
-    (of those that are not zero, if most are).
+    $$g = \frac{1}{n} \sum_{i=1}^{n} \min\left(1, \frac{c}{\lVert g_i \rVert}\right)
+    g_i, \qquad c = a\, \operatorname{median}_i \lVert g_i \rVert$$
 
-    A plant that runs away in one episode of thirty has a gradient that is larger than
-    all others together, and points nowhere; or it is not finite, which would end the
-    training. Called as every estimator is, see [`delucax.training.analytic`][], with a
-    loss of a single episode.
+    If the median is zero, it is taken over the gradients that are not zero.
+
+    Use it if the plant runs away in a few episodes. The gradient of such an episode can
+    be larger than all others together without a useful direction, or it is not finite
+    and would end the training. Call it like every estimator, see
+    [`delucax.training.analytic`][], with the loss of a single episode.
 
     **Arguments:**
 
-    - `samples`: gradients in one estimate, 32 by default.
-    - `factor`: 5 by default. A small one is biased towards what most episodes need.
+    - `samples`: the number of gradients in one estimate, 32 by default.
+    - `factor`: $a$, 5 by default. A small factor biases the estimate towards the
+        typical episode.
 
-    **Returns:** from a call, `(value, gradient)`: the mean of what the loss returned
-    for these samples, and a pytree like the model with `None` in the place of what is
-    not a weight. Both are NaN if there is no such sample.
+    **Returns:** a call returns `(value, gradient)`: the mean output of the loss over
+    the finite samples, and a pytree like the model, with `None` for each leaf that is
+    not a weight. Both are NaN if no sample is finite.
 
     **Raises:** `ValueError` if `samples` is below 1, or `factor` is not positive.
 
@@ -121,6 +127,8 @@ class ClippedSamples(eqx.Module):
         value, gradient = estimator(loss, controller, jax.random.key(0))
         gradient.K
         ```
+
+@@OUT ClippedSamples
     """
 
     samples: int = eqx.field(static=True, default=32)
@@ -142,7 +150,8 @@ class ClippedSamples(eqx.Module):
         costs = values[0] if isinstance(values, tuple | list) else values
         norms = jax.vmap(optax.tree.norm)(gradients)
         counts = jnp.isfinite(costs) & jnp.isfinite(norms)
-        # Where most are zero, such as those of episodes that have ended, of the rest.
+        # Most gradients can be zero, if most episodes end at once. Then the median is
+        # that of the others.
         middle = lambda kept: jnp.nanmedian(jnp.where(kept, norms, jnp.nan))
         usual = middle(counts)
         most = self.factor * jnp.where(usual > 0, usual, middle(counts & (norms > 0)))
@@ -159,36 +168,40 @@ class ClippedSamples(eqx.Module):
 
 
 class EvolutionStrategies(eqx.Module):
-    r"""The gradient of the loss smoothed by Gaussian noise on the weights.
+    r"""A gradient without derivatives of the loss: finite differences along random
+    directions.
 
-    Antithetic, over `n = samples / 2` directions `e_i ~ N(0, I)`, a key for each:
+    Antithetic, with $n$ = `samples / 2` directions $e_i \sim \mathcal{N}(0, I)$ and a
+    key for each:
 
-    `g = 1 / (2 n sigma) sum_i (loss(theta + sigma e_i) - loss(theta - sigma e_i)) e_i`,
+    $$g = \frac{1}{2 n \sigma} \sum_{i=1}^{n}
+    \bigl(\ell(\theta + \sigma e_i) - \ell(\theta - \sigma e_i)\bigr)\, e_i$$
 
-    or one-sided, over `n = samples` directions and one key:
+    One-sided, with $n$ = `samples` directions and one key for all:
 
-    `g = 1 / (n sigma) sum_i (loss(theta + sigma e_i) - loss(theta)) e_i`.
+    $$g = \frac{1}{n \sigma} \sum_{i=1}^{n}
+    \bigl(\ell(\theta + \sigma e_i) - \ell(\theta)\bigr)\, e_i$$
 
-    Both are unbiased for the gradient of `E[loss(theta + sigma e)]`, which is that of
-    the expected loss itself where the loss is quadratic, and differs by order
-    `sigma^2` elsewhere. Only values are taken, all at once under `jax.vmap`: the loss
-    need not be differentiable. Called as every estimator is, see
-    [`delucax.training.analytic`][].
+    Both are unbiased for the gradient of the smoothed loss
+    $\mathbb{E}[\ell(\theta + \sigma e)]$. For a quadratic loss, this is the gradient of
+    the loss itself; in general it differs by an order of $\sigma^2$. The loss need not
+    be differentiable. All its values are computed at once under `jax.vmap`. Call it
+    like every estimator, see [`delucax.training.analytic`][].
 
     **Arguments:**
 
-    - `sigma`: the standard deviation of the noise, positive; in the unconstrained
-        values of what has a constraint when used by [`delucax.training.fit`][].
+    - `sigma`: $\sigma$, the standard deviation of the noise, positive.
+        [`delucax.training.fit`][] adds the noise to the unconstrained values.
     - `samples`: the number of perturbed losses in one estimate; even if antithetic.
-    - `antithetic`: whether each direction is tried both ways (default), which cancels
-        the loss itself and every even term.
+    - `antithetic`: whether to perturb along $e_i$ and $-e_i$; true by default. This
+        cancels the loss itself and all even terms of its expansion.
 
-    **Returns:** from a call, `(value, gradient)`: what the loss returned for the
-    unperturbed weights, and a pytree like the model with `None` in the place of what is
+    **Returns:** a call returns `(value, gradient)`: the output of the loss for the
+    unperturbed weights, and a pytree like the model, with `None` for each leaf that is
     not a weight.
 
-    **Raises:** `ValueError` if `sigma` is not positive, or if `samples` is below 1, or
-    odd and antithetic.
+    **Raises:** `ValueError` if `sigma` is not positive, `samples` is below 1, or
+    `samples` is odd with `antithetic`.
 
     Source: Salimans, Ho, Chen, Sidor and Sutskever, 2017; Nesterov and Spokoiny, 2017
     (one-sided).
@@ -207,6 +220,11 @@ class EvolutionStrategies(eqx.Module):
         estimator = dlx.training.EvolutionStrategies(sigma=0.1, samples=16)
         key = jax.random.key(0)
         value, gradient = eqx.filter_jit(estimator)(loss, controller, key)
+        gradient.K.shape
+        ```
+
+        ```text
+        (1, 2)
         ```
     """
 
@@ -222,7 +240,8 @@ class EvolutionStrategies(eqx.Module):
         check_count(self.samples, "samples", where)
         if self.antithetic and self.samples % 2:
             raise ValueError(
-                f"{where}: samples must be even when antithetic, got {self.samples}."
+                f"{where}: samples must be even when antithetic is true, got "
+                f"{self.samples}."
             )
 
     def __call__(
@@ -234,17 +253,17 @@ class EvolutionStrategies(eqx.Module):
         loss_key, noise_key, pair_key = jr.split(key, 3)
         draw = lambda key, shape, dtype: jr.normal(key, (n, *shape), dtype)
         noise = optax.tree.random_like(noise_key, weights, draw)
-        # The unperturbed weights come first, so that the loss is traced once.
+        # The unperturbed weights are the first of the batch, so the loss is traced only
+        # once. Then come theta + sigma e_1, ..., and if antithetic theta - sigma e_1,
+        # ...
         sides = 2 if self.antithetic else 1
-        # theta, theta + sigma e_1, ..., and if antithetic theta - sigma e_1, ...
         ones, every = jnp.ones(n), jnp.arange(n)
         signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
         directions = jnp.concatenate([jnp.zeros(1, int), *[every] * sides])
-        # One-sided, all share one key: the noise of the loss is common, and cancels in
-        # the difference from the unperturbed one.
+        # The two losses of a difference share a key, so that their noise cancels. If
+        # one-sided, all losses are compared with the same one, so all share its key.
         keys = None
         if self.antithetic:
-            # Both of a pair share a key, so that the noise of the loss cancels.
             pairs = jr.split(pair_key, n)
             keys = jnp.concatenate([loss_key[None], pairs, pairs])
 
@@ -268,33 +287,37 @@ class EvolutionStrategies(eqx.Module):
 
 
 class LikelihoodRatio(eqx.Module):
-    r"""The gradient of an expected cost from the probability of what was drawn.
+    r"""The gradient of an expected cost from the log-probability of random draws, as in
+    REINFORCE.
 
-    `g = 1/n sum_i (c_i - b_i) d log p(u_i; theta) / d theta`,
+    $$g = \frac{1}{n} \sum_{i=1}^{n} (c_i - b_i)\,
+    \frac{\partial \log p_\theta(u_i)}{\partial \theta}$$
 
-    with `b_i` the mean of the other samples' costs, or 0. It is unbiased for the
-    gradient of `E[c]`, since `E[d log p] = 0` and `b_i` does not depend on `u_i`. Only
-    the log-probability is differentiated, never the cost or the plant.
+    The baseline $b_i$ is the mean cost of the other samples, or 0. The estimate is
+    unbiased for the gradient of $\mathbb{E}[c]$, because the score has mean zero and
+    $b_i$ does not depend on $u_i$. Only the log-probability is differentiated, never
+    the cost or the plant.
 
-    The loss returns `(cost, {"log_prob": ...})` for one draw, and the same loss serves
-    the other estimators, which leave the log-probability alone. Two things are asked of
-    it: the log-probability is that of what was drawn with the draw itself held fixed
-    (`jax.lax.stop_gradient(u)`; a reparametrised draw `mean + std * e` left in cancels
-    the score), and the cost depends on the weights through the draw alone.
-    [`delucax.training.scored_cost`][] makes such a loss of an environment. Called as
-    every estimator is, see [`delucax.training.analytic`][].
+    The loss must return `(cost, {"log_prob": ...})` for one draw.
+    [`delucax.training.scored_cost`][] makes such a loss from an environment. If you
+    write one, note two rules. Compute the log-probability of
+    `jax.lax.stop_gradient(u)`, because with a draw such as `u = mean + std * e` the
+    score would cancel. And let the cost depend on the weights only through the draw.
+
+    The other estimators accept the same loss. Call it like every estimator, see
+    [`delucax.training.analytic`][].
 
     **Arguments:**
 
-    - `samples`: the number n of draws in one estimate.
-    - `baseline`: whether to subtract the mean cost of the other draws (default), which
-        lowers the variance and leaves the mean as it is.
+    - `samples`: $n$, the number of draws in one estimate.
+    - `baseline`: whether to subtract the mean cost of the other draws; true by default.
+        This lowers the variance without a bias.
 
-    **Returns:** from a call, `(value, gradient)`: the mean cost and mean metrics over
-    the draws, and a pytree like the model with `None` in the place of what is not a
+    **Returns:** a call returns `(value, gradient)`: the mean cost and the mean metrics
+    over the draws, and a pytree like the model, with `None` for each leaf that is not a
     weight.
 
-    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline; when
+    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline. When
     it is called, if the loss returns no `"log_prob"`.
 
     Source: Williams, 1992; Kool, van Hoof and Welling, 2019 (the baseline).
@@ -314,7 +337,10 @@ class LikelihoodRatio(eqx.Module):
         estimator = dlx.training.LikelihoodRatio(samples=1000)
         key = jax.random.key(0)
         value, gradient = eqx.filter_jit(estimator)(loss, jnp.asarray(0.0), key)
+        gradient
         ```
+
+@@OUT LikelihoodRatio
     """
 
     samples: int = eqx.field(static=True)
@@ -327,8 +353,8 @@ class LikelihoodRatio(eqx.Module):
         check_count(self.samples, "samples", where)
         if self.baseline and self.samples < 2:
             raise ValueError(
-                f"{where}: samples must be at least 2 with a baseline, the mean of the "
-                f"others, got {self.samples}."
+                f"{where}: samples must be at least 2 with a baseline, which is the "
+                f"mean of the other samples, got {self.samples}."
             )
 
     def __call__(
@@ -342,25 +368,25 @@ class LikelihoodRatio(eqx.Module):
             if "log_prob" not in metrics:
                 raise ValueError(
                     "LikelihoodRatio: loss must return (cost, {'log_prob': ...}), got "
-                    f"the metrics {sorted(metrics)}; delucax.training.scored_cost "
-                    "makes such a loss of an environment."
+                    f"the metrics {sorted(metrics)}. delucax.training.scored_cost "
+                    "makes such a loss from an environment."
                 )
-            # Only the score carries a gradient: that of the cost by the draw would
-            # count its dependence on the weights twice.
+            # The gradient of the cost through the draw would count the dependence on
+            # the weights twice, so only the score keeps a gradient.
             excess = costs = lax.stop_gradient(costs)
             if self.baseline:
-                # The mean of the others differs from that of all by this factor.
+                # This factor turns the mean of all samples into that of the others.
                 excess = (costs - jnp.mean(costs)) * (self.samples / (self.samples - 1))
             means = {name: jnp.mean(metric) for name, metric in metrics.items()}
             value = (jnp.mean(costs), lax.stop_gradient(means))
-            # Its gradient is the estimate; its own value means nothing.
+            # The gradient of this is the estimate. Its value has no meaning.
             return jnp.mean(excess * metrics["log_prob"]), value
 
         return gradient_of_weights(surrogate, model)
 
 
 def cost_and_metrics(value: Any, where: str) -> tuple[Array, dict[str, Array]]:
-    """The scalar and the metrics of what a loss returned, checked."""
+    """The scalar and the metrics in the output of a loss, checked."""
     is_pair = isinstance(value, tuple | list) and len(value) == 2
     cost, metrics = value if is_pair else (value, {})
     if not isinstance(metrics, dict):

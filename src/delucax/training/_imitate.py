@@ -1,4 +1,4 @@
-"""Imitation of an expert on the states that the policy itself visits."""
+"""Imitation of an expert: dataset aggregation (DAgger)."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ _WHERE = "imitate"
 
 
 class _Likeness(eqx.Module):
-    """The loss of a policy: how far its controls are from those of the expert."""
+    """The mean squared distance between the controls of a policy and of the expert."""
 
     scale: Array
 
@@ -54,37 +54,41 @@ def imitate(
     progress: bool = True,
     throw: bool = True,
 ) -> Fitted:
-    """Train a policy to act as an expert does, such as MPC: dataset aggregation.
+    r"""Train a policy to act like an expert, such as MPC, by dataset aggregation
+    (DAgger).
 
-    In the first round the expert runs the episodes. From the second on the policy runs
-    them, and the expert says what it would have done in each state, from which a policy
-    learns to return after its own mistakes. Each round trains on the states of all
-    rounds so far,
+    In the first round the expert runs the episodes. In every later round the policy
+    runs them, and the expert gives the control that it would have applied in each
+    state. So the policy learns to recover from its own mistakes. Each round trains on
+    the states of all rounds so far:
 
-    `loss = mean of |(policy(t, y) - expert(t, y)) / scale|^2`,
+    $$\ell(\theta) = \operatorname{mean}_{(t, y)} \;
+    \bigl\lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \bigr\rVert^2$$
 
-    `scale` being the standard deviation of each control of the expert.
+    Here $\pi_\theta$ is the policy, $u^*$ the expert, and $S$ the diagonal matrix of
+    the standard deviations of the expert's controls.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `expert`: any controller, with a memory or not.
+    - `expert`: any controller. It may have a memory.
     - `policy`: the controller to train. It must have no memory.
     - `key`: a random key.
-    - `rounds`: 4 by default; 1 for behavioural cloning.
-    - `episodes`: of each round, 8 by default.
-    - `steps`: of the optimiser in each round, 300 by default.
-    - `horizon`: steps per episode; the environment's own by default.
-    - `optimiser`: made anew for each round; Adam with cosine decay from 0.003 by
-        default.
+    - `rounds`: the number of rounds, 4 by default. 1 is behavioural cloning.
+    - `episodes`: episodes in each round, 8 by default.
+    - `steps`: steps of the optimiser in each round, 300 by default.
+    - `horizon`: steps per episode; the `horizon` of the environment by default.
+    - `optimiser`: an Optax optimiser, which starts anew in each round; by default Adam
+        with a cosine decay from 0.003.
     - `batch_size`: states in a batch, 256 by default.
     - `trainable`, `progress`, `throw`: as in [`delucax.training.fit`][].
 
-    **Returns:** a [`delucax.training.Fitted`][]; its history has the rounds one after
-        another.
+    **Returns:** a [`delucax.training.Fitted`][]. Its history has the steps of all
+    rounds, one round after the other.
 
-    **Raises:** `ValueError` on an argument of the wrong kind, a policy with a memory,
-    or an expert whose controls are never finite; `RuntimeError` as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong type, the policy has a memory,
+    or no control of the expert is finite. `RuntimeError` if training diverges, unless
+    `throw` is false.
 
     Source: Ross, Gordon and Bagnell, 2011 (DAgger).
 
@@ -100,6 +104,11 @@ def imitate(
         fitted = dlx.training.imitate(
             env, expert, policy, key=jax.random.key(1), rounds=2, steps=50
         )
+        len(fitted.history)
+        ```
+
+        ```text
+        100
         ```
     """
     check_instance(environment, Environment, "environment", _WHERE)
@@ -114,7 +123,7 @@ def imitate(
     if any(map(eqx.is_array, jax.tree.leaves(policy.init(key=key)))):
         raise ValueError(
             f"{_WHERE}: policy must have no memory, got a {type(policy).__name__} "
-            "whose state holds arrays. Train it by fit, on the cost."
+            "whose state holds arrays. Train it on the cost with delucax.training.fit."
         )
     if optimiser is None:
         optimiser = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
@@ -131,8 +140,8 @@ def imitate(
         *new, counts = jax.device_get(
             _watched(environment, driver, expert, keys, horizon)
         )
-        # A step that does not count may hold NaN, and so would the gradient: 0 times
-        # NaN is NaN.
+        # Steps that do not count may hold NaN. They are set to zero, because the
+        # gradient of a NaN is NaN even with a weight of zero.
         new = [*(np.where(counts > 0, r.T, 0).T for r in new), counts]
         pairs = zip(rows or new, new, strict=True)
         rows = new if rows is None else [np.concatenate(pair) for pair in pairs]
@@ -140,10 +149,12 @@ def imitate(
             controls = rows[2][rows[3] > 0]
             if not len(controls):
                 raise ValueError(
-                    f"{_WHERE}: expert must have controls that are finite."
+                    f"{_WHERE}: expert must have finite controls, got none in the "
+                    "first round."
                 )
             loss = _Likeness(jnp.asarray(np.maximum(controls.std(axis=0), 1e-6)))
-        # Repeated up to one size, so that no round compiles anew.
+        # The rows are repeated up to a fixed size, so that later rounds do not compile
+        # again.
         whole = tuple(np.resize(r, (capacity, *r.shape[1:])) for r in rows)
         fitted = fit(loss, policy, optimiser, steps, key=fit_key, data=whole, **options)
         policy, result = fitted.model, fitted.result
@@ -153,8 +164,8 @@ def imitate(
 
 @eqx.filter_jit
 def _watched(environment, driver, expert, keys, horizon):
-    """Times, observations, controls of the expert and whether they count, of all steps
-    of the episodes that `driver` runs."""
+    """All steps of the episodes that `driver` runs: times, observations, controls of
+    the expert, and 1 for the steps that count."""
 
     def episode(key):
         keep = ("observations", "controls", "costs")
@@ -173,6 +184,7 @@ def _watched(environment, driver, expert, keys, horizon):
 
 
 def _one_after_another(histories: list[History]) -> History:
+    """The histories of several runs, joined as those of a single run."""
     columns = {n: np.concatenate([h[n] for h in histories]) for n in COLUMNS}
     lengths = np.cumsum([0, *map(len, histories[:-1])])
     last = np.cumsum([0, *(h.seconds[-1] for h in histories[:-1])])

@@ -1,4 +1,4 @@
-"""Optimisers that are equal if they are made in the same way."""
+"""Optax optimisers that can be compared, so that `fit` does not compile again."""
 
 import functools
 from types import CellType, FunctionType
@@ -8,11 +8,11 @@ import optax
 
 
 class Optimiser:
-    """An Optax optimiser, which is a pair of functions.
+    """An Optax optimiser. Two of them are equal if they were made in the same way.
 
-    Each call of `optax.adam(1e-3)` makes new functions, and JAX would compile again for
-    each of them. Here two are equal if their code and all that it closes over is, so
-    that the second finds the programs of the first.
+    Each call of `optax.adam(1e-3)` makes new functions, for which JAX would compile
+    again. This class compares the code of the functions and the values in their
+    closures, so an equal optimiser uses the compiled programs of the first.
     """
 
     def __init__(self, transformation: optax.GradientTransformation):
@@ -28,9 +28,9 @@ class Optimiser:
 
 
 def _content(value: Any, *inside: Any) -> Any:
-    """What `value` consists of, to be compared; an object of another kind by its own
-    `==`, or by its identity where it has no hash."""
-    # The type as well, because 1 equals True and 1.0.
+    """What to compare of `value`: the contents of a function or container, else the
+    object itself, or its identity if it has no hash."""
+    # The type is part of it, because 1 equals True and 1.0.
     kind = type(value)
     if any(value is other for other in inside):
         return kind
@@ -57,7 +57,7 @@ def _contents(values: Any, inside: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def _held(cell: CellType) -> Any:
-    """What a function closes over; the cell itself where it has no value yet."""
+    """The value in a closure cell, or the cell itself if it is still empty."""
     try:
         return cell.cell_contents
     except ValueError:

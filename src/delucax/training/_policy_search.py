@@ -34,56 +34,60 @@ from ._structures import structures
 
 
 with warnings.catch_warnings():
-    # In a notebook without ipywidgets it warns, and draws its bar as text all the same.
+    # Without ipywidgets, tqdm warns in a notebook, but the text bar still works.
     warnings.simplefilter("ignore")
     from tqdm.auto import tqdm
 
 
-# After how many trials it is asked whether the LQR is enough.
+# After this number of trials the search checks whether the LQR is enough.
 _FIRST = 2
-# After which share of the episode a damped gradient is forgotten.
+# Time constants of the damped gradients, as shares of the episode.
 _MEMORIES = (1 / 30, 1 / 10, 1 / 4)
-# Starts on which policies are chosen, and others on which the best is compared: more
-# where each has a plant of its own.
+# The numbers of initial states: to choose a policy, to compare it, and to compare it on
+# a family of plants.
 CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
-# How many policies are chosen from at the end, and on how many times more starts.
+# The final choice is among this number of policies, on at most `_ROUNDS` times as many
+# initial states.
 _LAST, _ROUNDS = 4, 8
-# The share of the budget for training, and until when there are more starts; the rest
-# is for the comparison.
+# Training ends at the first share of the budget, the final choice at the second. The
+# rest is for the comparison.
 _TRAINING, _CHOOSING = 0.7, 0.75
-# How far a comparison may overrun it, if it takes as long as the longest step before,
-# and MPC that many times as long.
+# A comparison starts only if it is likely to end within `_OVERRUN` times the budget. It
+# is expected to take as long as the longest step so far, and MPC `_MPC` times as long.
 _OVERRUN, _MPC = 1.1, 2
-# Steps of a round, and generations of one of evolution.
+# Steps in a round of gradient training, and generations in a round of evolution.
 _STEPS, _GENERATIONS = 300, 150
-# First learning rates of a round: the second is for when nothing gains any more.
+# Initial learning rates of a round. The second one is used when no method gains.
 _RATE, _FINE_RATE = 2e-2, 2e-3
+# Gradients in a batch, and the longest rollout that is differentiated.
 _BATCH, _LONGEST = 32, 200
-# Episodes in which each member of a generation is tried.
+# Episodes in the cost of each model of a generation.
 _EVALUATIONS = 8
-# What stands for a usual cost that is not known, so large that none is far above it.
+# The usual cost before it is known, so large that no cost is far above it.
 _ANY = 1e30
-# The share of the budget that a trial and a later attempt may take, after its first
-# round, and how many times fewer and longer the trials become.
+# The shares of the budget for a trial and for a later attempt, after the first round.
+# After each pass the best 1 / `_FEWER` of the trials go on, `_FEWER` times as long.
 _TRIAL, _ATTEMPT, _FEWER = 0.01, 0.03, 3
-# Trials that cost more than the best by this share are given up.
+# A trial is dropped if it costs more than the best by this share.
 _CLOSE = 0.5
-# A gain below which a method is given up, and one that is worth a network or an
-# expert.
+# Relative gains: a method with less than the first has stopped to gain; less than the
+# second does not justify a network or an expert.
 _GAIN, _WORTH = 1e-3, 5e-3
-# How wide an evolution begins: of a network, of others, and near the best.
+# Initial standard deviations of an evolution: of a network, of other policies, and of a
+# policy that is already trained.
 _WIDE, _NARROW, _NEAR = 1.0, 0.3, 0.05
 
 
 def _is_better(other: Any, own: Any) -> bool:
-    """Whether a mean cost is so much less than another that it is worth the change."""
+    """Whether the mean cost `other` is enough below `own` to justify a change."""
     if not np.isfinite(own):
         return bool(np.isfinite(other))
     return bool(own - other > _WORTH * abs(own))
 
 
 class PolicySearch:
-    """The best policy so far of each structure, and what was tried, within a time."""
+    """A search for a policy within a time budget. It keeps the best policy of each
+    structure, and a record of all trainings."""
 
     def __init__(
         self,
@@ -99,7 +103,7 @@ class PolicySearch:
         layout = "{desc}: {bar}| {n:.0f}/{total:.0f} s{postfix}"
         options: Any = dict(desc="synthesise", bar_format=layout, disable=not progress)
         self.bar = tqdm(total=round(budget), **options)
-        # Also what an interrupt leaves before anything has been tried.
+        # If an interrupt comes before the first trial, this is the result.
         zero = Zero(environment.control_size)
         self.best = {"zero": Line("zero", "none", zero)}
         self.last: list[Line] = []
@@ -108,18 +112,18 @@ class PolicySearch:
         self.steps = min(environment.horizon, _LONGEST)
         lasting = self.steps * float(environment.dt)
         unit, times = environment.dynamics.time_unit, [lasting * m for m in _MEMORIES]
-        # The time over which a gradient is forgotten.
+        # From the name of a method to the time constant of its damped gradient.
         damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
         self.methods = damped | {"gradient": jnp.inf, "evolution": None}
         self.rate = _RATE
-        # The least median cost so far, and its size.
+        # The least median cost so far, and its absolute value.
         self.least, self.usual = np.inf, _ANY
-        # Of the first round of an attempt, which compiles, or of a comparison.
+        # The longest step so far: a first round, which compiles, or a comparison.
         self.longest = 0.0
 
     @property
     def seconds(self) -> float:
-        """The time since the beginning."""
+        """The time since the search began."""
         return time.perf_counter() - self.began
 
     @property
@@ -128,13 +132,13 @@ class PolicySearch:
         return self.seconds < _TRAINING * self.budget
 
     def may_compare(self, name: str) -> bool:
-        """Whether there is time to compare with one more controller."""
-        # MPC is a plan at each step, and compiles for longer than a training.
+        """Whether there is time for a comparison with this controller."""
+        # MPC makes a plan at each step, and takes longer to compile than a training.
         likely = self.longest * (_MPC if name == "MPC" else 1)
         return self.seconds + likely < _OVERRUN * self.budget
 
     def keys(self, count: int) -> Array:
-        """Keys of that many episodes, others for each count."""
+        """Keys for `count` episodes. Another count gives other keys."""
         return jr.split(jr.fold_in(self.key, count), count)
 
     def fresh_key(self) -> PRNGKey:
@@ -143,7 +147,7 @@ class PolicySearch:
         return jr.fold_in(self.key, CHOICE + self.draws)
 
     def run(self, width: int, depth: int) -> None:
-        """Train until the time is up or nothing gains any more."""
+        """Train until the time is up or no method gains."""
         env = self.environment
         self.enter(self.best["zero"])
         self.lqr = self.regulator()
@@ -152,12 +156,12 @@ class PolicySearch:
         family = self.ranges is not None
         made = structures(env, self.lqr, family, width, depth, self.fresh_key())
         pairs = [(name, method) for method in self.methods for name in made]
-        # These tell whether the LQR is enough.
+        # The trials that show whether the LQR is enough come first.
         first = [("LQR + memory" if family else "LQR + network", "gradient")]
         first.append(("network", "evolution"))
         pairs = sorted(pairs, key=lambda pair: pair not in first)
         lines = [Line(name, method, made[name]) for name, method in pairs]
-        # Successive halving: the better third goes on, for three times as long.
+        # Successive halving: the best third goes on, for three times as long.
         share = _TRIAL
         while (self.may_train or not self.tried) and len(lines) > 1:
             after = []
@@ -177,7 +181,7 @@ class PolicySearch:
             self.finish(lines[0], made[lines[0].structure])
 
     def regulator(self) -> LQR | None:
-        """The LQR, where there is one."""
+        """The LQR, or `None` if it does not exist for this environment."""
         if not self.environment.dynamics.observes_state:
             return None
         try:
@@ -186,8 +190,8 @@ class PolicySearch:
             return None
 
     def is_settled(self) -> bool:
-        """Whether neither training around the LQR nor a search without gradient nor a
-        plan is better than the LQR, or MPC where a plan would know the disturbances."""
+        """Whether the LQR is enough: neither the first two trials nor a plan is better.
+        With disturbances MPC replaces the plan, because a plan would know them."""
         if self.chosen()[0] != "LQR":
             return False
         keys = self.keys(CHOICE)[: len(self.comparison)]
@@ -197,7 +201,7 @@ class PolicySearch:
         return bool(np.isfinite(own)) and not _is_better(other, own)
 
     def costs_of_rival(self, name: str, policy: Any, keys: Array) -> np.ndarray:
-        """Those of MPC, or of a plan that starts from the controls of a policy."""
+        """The costs of MPC, or of a plan that starts from the controls of `policy`."""
         began = self.seconds
         given = self.environment, self.ranges
         costs = np.asarray(
@@ -205,16 +209,16 @@ class PolicySearch:
             if name == "MPC"
             else costs_of_plan(*given, policy, keys)
         )
-        # The next may take as long.
+        # The next comparison may take as long.
         self.longest = max(self.longest, self.seconds - began)
         return costs
 
     def trained(self, line: Line) -> AbstractController:
-        """The policy of a line after a round of its method."""
+        """The policy of a line after one round of training with its method."""
         env, policy, method = self.environment, line.policy, line.method
         options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
         if isinstance(policy, Residual):
-            options["trainable"] = "correction"  # the LQR stays as it is
+            options["trainable"] = "correction"  # not the LQR
         if method == "imitation":
             expert = local_mpc(env, self.lqr, throw=False)
             return imitate(env, expert, policy, **options).model
@@ -226,7 +230,7 @@ class PolicySearch:
             return evolve(loss, policy, _GENERATIONS, **options).model
         adam = optax.adam(optax.cosine_decay_schedule(self.rate, _STEPS))
         optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
-        # An array, so that all compile once.
+        # An array, so that the methods share one compiled program.
         decay = jnp.exp(-env.dt / self.methods[method])
         shape: Any = dict(batch=1, horizon=self.steps)
         loss = expected_cost(env, gradient_decay=decay, ranges=self.ranges, **shape)
@@ -234,9 +238,12 @@ class PolicySearch:
         return fit(loss, policy, optimiser, _STEPS, **options).model
 
     def finish(self, line: Line, untrained: AbstractController) -> None:
-        """Train the last line on by the method that gained most when it was last used,
-        until none gains; then more slowly, and from what imitates MPC if that is
-        better."""
+        """Refine the last policy.
+
+        Each attempt uses the method with the largest gain in its last attempt. When no
+        method gains, go on with the fine learning rate; after that, try once an
+        imitation of MPC, if MPC costs less.
+        """
         fresh = dict.fromkeys([line.method, *self.methods], np.inf)
         gains, has_imitated = fresh.copy(), False
         while self.may_train:
@@ -258,7 +265,7 @@ class PolicySearch:
                 break
 
     def expert_is_better(self, policy: AbstractController) -> bool:
-        """Whether MPC costs less, on some of the starts of the choice."""
+        """Whether MPC costs less than the policy, on a few initial states."""
         if not self.environment.dynamics.observes_state or self.ranges is not None:
             return False
         keys = self.keys(CHOICE)[:_COMPARISON]
@@ -267,8 +274,8 @@ class PolicySearch:
         return _is_better(expert, own)
 
     def attempt(self, line: Line, share: float) -> Line:
-        """The line after rounds of its method, for a share of the budget after the
-        first, which compiles."""
+        """The line after some rounds of its method. After the first round, which
+        compiles, they may take `share` of the budget."""
         began, compiled, best = self.seconds, None, line
         while compiled is None or self.seconds - compiled < share * self.budget:
             policy = self.trained(best)
@@ -276,7 +283,7 @@ class PolicySearch:
             if compiled is None:
                 compiled = self.seconds
                 self.longest = max(self.longest, compiled - began)
-            # What changes nothing diverges at once.
+            # If a round changes nothing, it diverged at its first step.
             stays = self.score(now) == self.score(best)
             best = min(best, now, key=self.score)
             if stays or not self.may_train:
@@ -291,13 +298,13 @@ class PolicySearch:
         return best
 
     def costs(self, policy: AbstractController, keys: Any = None) -> np.ndarray:
-        """The costs from starts, by default those on which policies are chosen."""
+        """The costs of a policy, by default in the episodes for choosing a policy."""
         keys = self.keys(CHOICE) if keys is None else keys
         return np.asarray(costs_of(self.environment, self.ranges, policy, keys), float)
 
     def enter(self, line: Line) -> None:
-        """Keep a line if it is the best of its structure, and its median cost if that
-        is the least."""
+        """Keep the line if it is the best of its structure, and update the usual
+        cost."""
         if line.costs is None:
             line = line._replace(costs=self.costs(line.policy))
         name = line.structure
@@ -305,26 +312,28 @@ class PolicySearch:
         self.best[name] = min(self.best.get(name, line), line, key=self.score)
         costs = self.best[name].costs
         middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
-        # With its sign: a reward, such as that for an arrival, is a large usual cost.
+        # The least is taken with its sign, so a large reward, which is a negative cost,
+        # gives a large usual cost.
         if middle != 0 and middle < self.least:
             self.least, self.usual = middle, abs(middle)
 
     def score(self, line: Line) -> float:
-        """The mean of the tamed costs, by which policies are chosen."""
+        """The mean tamed cost, the criterion for choosing policies."""
         if line.costs is None:
             return np.inf
         return float(jnp.mean(tamed(jnp.asarray(line.costs), self.usual)))
 
     def mean(self, line: Line) -> float:
-        """The mean cost, infinite where one is not finite."""
+        """The mean cost, or infinity if the cost of an episode is not finite."""
         costs = np.inf if line.costs is None else line.costs
         return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
 
     def choose(self) -> tuple[str, AbstractController]:
-        """The best of the last policies and the floor, on many more starts.
+        """The best of the last policies, zero control and the LQR, on more initial
+        states.
 
-        One start in a hundred, from which the plant runs away, is often not among the
-        first 64, and is what tells two good policies apart.
+        Good policies often differ only in a rare episode in which the plant runs away,
+        and the first 64 initial states may have none.
         """
         floor = [self.best[name] for name in ("zero", "LQR") if name in self.best]
         lines = [line for line in self.last if line.costs is not None]
@@ -344,7 +353,7 @@ class PolicySearch:
         return self.chosen()
 
     def chosen(self) -> tuple[str, AbstractController]:
-        """The best policy, or the floor where that is as good."""
+        """The best policy, or zero control or the LQR if they are about as good."""
         best = min(self.best.values(), key=self.score)
         least = self.score(best)
         for name in ("zero", "LQR"):
@@ -356,18 +365,19 @@ class PolicySearch:
 
     @property
     def comparison(self) -> Array:
-        """Keys of the episodes in which policies are compared."""
+        """The keys of the episodes for the comparison."""
         return self.keys(_COMPARISON if self.ranges is None else _PLANTS)
 
     def plants(self) -> dict[str, np.ndarray]:
-        """What is drawn for the plants of the comparison."""
+        """The parameters drawn for the plants of the comparison, by path."""
         ranges = self.ranges or {}
         of = lambda plant, key: {path: get_path(plant, path) for path in ranges}
         drawn = on_plants(self.environment, ranges, self.comparison, of)
         return {path: np.asarray(values) for path, values in drawn.items()}
 
     def compared(self, policy: AbstractController) -> dict[str, np.ndarray]:
-        """The costs of the policy and of others, from starts of their own."""
+        """The costs of the policy and of other controllers, in episodes that were used
+        for nothing else."""
         env, ranges, keys = self.environment, self.ranges, self.comparison
         floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
         laws = {"policy": policy, **floor}

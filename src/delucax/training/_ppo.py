@@ -27,7 +27,7 @@ from ._actor_critic import AbstractActorCriticLoss, ActorCritic, Episodes, Stati
 
 class _Memory(NamedTuple):
     rows: Episodes
-    """Whole episodes, or single steps, each `(rows, length, ...)`."""
+    """Whole episodes or single steps, arrays of shape `(rows, length, ...)`."""
     order: Array
     part: Array
     statistics: Statistics
@@ -35,51 +35,55 @@ class _Memory(NamedTuple):
 
 
 class PPO(AbstractActorCriticLoss):
-    r"""Proximal policy optimisation: the clipped surrogate of the likelihood ratio.
+    r"""Proximal policy optimisation (PPO), as a loss for [`delucax.training.fit`][].
 
-    Every `epochs * minibatches` steps of [`delucax.training.fit`][] the policy runs
-    `batch` fresh episodes. In between each step takes the next minibatch of
+    Every `epochs * minibatches` steps of `fit`, the policy runs `batch` new episodes.
+    Each step takes the next minibatch of them, and the gradient of
 
-    `mean max(r A, clip(r, 1 - clip, 1 + clip) A)
-    + value_weight (V - target)^2 / scale^2 - entropy_weight H`
+    $$\operatorname{mean} \; \max\bigl(\rho A, \;
+    \operatorname{clip}(\rho, 1 - \epsilon, 1 + \epsilon) A\bigr)
+    + a\, \frac{(V - \hat V)^2}{b^2} - h\, H, \qquad
+    \rho = \frac{p_\theta(u)}{p_{\theta_\text{old}}(u)}$$
 
-    with `r = p(u; theta) / p(u; theta_old)` the likelihood ratio of what was drawn, `A`
-    the generalised advantage estimate in cost (standardised over the batch),
-    `target = A + V`, and H the entropy. The plant is not differentiated. It is trained
-    as any loss is, with any optimiser; the model is a
-    [`delucax.training.ActorCritic`][] whose policy draws, and the trained controller is
-    `fitted.model.policy` (or `.policy.base`, without the noise).
+    $\rho$ is the likelihood ratio of the controls, $A$ the generalised advantage
+    estimate of the cost, standardised over the batch, $V$ the estimate of the critic,
+    $\hat V$ its target, $b$ its `scale`, and $H$ the entropy of the policy. The plant is
+    not differentiated.
 
-    Truncation at the horizon is not termination: the critic's estimate replaces the
-    cost of what would follow. On termination nothing follows but the final cost. Each
-    [`delucax.controllers.Standardise`][] of the model, and the scale of the critic, are
-    set by the batches before, so that the ratio begins at 1; one batch is
-    run before the first step for them. A policy with a memory is trained on whole
-    episodes, through its memory; one without on single steps in random order.
+    Train it like any loss, with any optimiser. The model is a
+    [`delucax.training.ActorCritic`][] with a stochastic policy. The trained controller
+    is `fitted.model.policy`, or `fitted.model.policy.base` without the noise.
 
-    `steps` of `fit` thus take
-    `batch * horizon * (1 + steps / (epochs * minibatches))` steps of the environment.
-    Metrics: `total_cost`, of the last batch, `entropy`, `kl`, `clipped` (the share of
-    ratios beyond the clip) and `value_loss`.
+    At the horizon an episode is truncated: the critic estimates the remaining cost.
+    After termination only the final cost follows. A policy with a memory is trained on
+    whole episodes, through its memory; a policy without one on single steps in random
+    order. The previous batches set the scale of the critic and each
+    [`delucax.controllers.Standardise`][] of the model. They stay fixed during a batch,
+    so that $\rho$ starts at 1. One more batch runs before the first step to set them.
+
+    In total, `fit` takes `batch * horizon * (1 + steps / (epochs * minibatches))` steps
+    of the environment. Metrics: `total_cost` of the last batch, `entropy`, `kl`,
+    `clipped` (the share of ratios outside the clip range) and `value_loss`.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `batch`: episodes in a batch.
-    - `horizon`: steps per episode; the environment's own by default.
-    - `discount`: of the cost to go, 0.99 by default.
-    - `decay`: lambda of the advantage estimate, 0.95 by default.
-    - `clip`: 0.2 by default.
+    - `horizon`: steps per episode; the `horizon` of the environment by default.
+    - `discount`: the discount factor of the cost to go, 0.99 by default.
+    - `decay`: $\lambda$ of the advantage estimate, 0.95 by default.
+    - `clip`: $\epsilon$, 0.2 by default.
     - `epochs`: passes over a batch, 4 by default.
-    - `minibatches`: in one pass, 8 by default; what does not fill the last is left out.
-    - `value_weight`: 0.5 by default.
-    - `entropy_weight`: 0 by default.
-    - `bootstrap`: whether the horizon truncates (default); if false it terminates the
-        episode, with the final cost.
+    - `minibatches`: minibatches in a pass, 8 by default. Rows that do not fill the last
+        one are skipped.
+    - `value_weight`: $a$, 0.5 by default.
+    - `entropy_weight`: $h$, 0 by default.
+    - `bootstrap`: whether the critic estimates the cost after the horizon; true by
+        default. If false, the horizon terminates the episode, with the final cost.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or range; when it is
-    trained, if the model is not an `ActorCritic`, its policy does not draw, or a
-    Gaussian policy lacks the bounds of the environment.
+    **Raises:** `ValueError` if an argument has the wrong type or range. In training, if
+    the model is not an `ActorCritic`, its policy is not stochastic, or a Gaussian
+    policy lacks the bounds of the environment.
 
     Source: Schulman, Wolski, Dhariwal, Radford and Klimov, 2017; Schulman, Moritz,
     Levine, Jordan and Abbeel, 2016 (the advantage estimate); Pardo, Tavakoli, Levdik
@@ -98,7 +102,11 @@ class PPO(AbstractActorCriticLoss):
         optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(3e-4))
         key = jax.random.key(1)
         fitted = dlx.training.fit(ppo, model, optimiser, steps=8, key=key)
-        fitted.model.policy.base, fitted.history["total_cost"]
+        fitted.history["total_cost"].shape
+        ```
+
+        ```text
+        (8,)
         ```
     """
 
@@ -127,9 +135,9 @@ class PPO(AbstractActorCriticLoss):
         unbounded = isinstance(policy, Gaussian) and policy.bounds is None
         if unbounded and self.environment.control_bounds is not None:
             raise ValueError(
-                "PPO: the policy must have the bounds of the environment, or its "
-                "log-probability is not that of what is applied: "
-                "Gaussian(..., bounds=env.control_bounds)."
+                "PPO: the policy must have the bounds of the environment, got none. "
+                "Without them, the log-probability is not that of the control that is "
+                "applied. Pass Gaussian(..., bounds=env.control_bounds)."
             )
         rows, total_cost = self._rows(model, key)
         count = rows.times.shape[0]
@@ -149,8 +157,8 @@ class PPO(AbstractActorCriticLoss):
             rows, total_cost = self._rows(standardised, run_key)
             return memory._replace(rows=rows, total_cost=total_cost)
 
-        # The statistics of a batch are used from the next batch on. Those of the batch
-        # of `init` are in the memory already.
+        # The statistics of a batch are used from the next batch on. The memory already
+        # has those of the batch that `init` ran.
         again = (part == 0) & (step > 0)
         old = memory.statistics
         updated = lambda: old.updated(model, memory.rows)
@@ -172,13 +180,13 @@ class PPO(AbstractActorCriticLoss):
         log_prob, entropy = _scores(model.policy, rows)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
         mean = lambda values: jnp.sum(jnp.where(rows.valid, values, 0) * weights)
-        # log r, and 0 for padding: its exponential could overflow, and a weight of zero
-        # would leave NaN in the gradient.
+        # The log of the ratio, but 0 for steps after the end, whose exponential could
+        # overflow: then a weight of zero still gives NaN in the gradient.
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
         ratio, advantages = jnp.exp(change), rows.advantages
         clipped = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        # The larger of the two, because these are costs: a pessimistic bound, with zero
-        # gradient once the ratio has left the clip range towards a lower cost.
+        # The larger of the two, because these are costs. This is a pessimistic bound:
+        # its gradient is zero once the ratio left the clip range towards a lower cost.
         surrogate = mean(jnp.maximum(ratio * advantages, clipped * advantages))
         value_loss = mean(self._value_errors(model, rows) ** 2)
         bonus = mean(entropy)
@@ -186,8 +194,8 @@ class PPO(AbstractActorCriticLoss):
         metrics = {
             "total_cost": memory.total_cost,
             "entropy": bonus,
-            # E[r - 1 - log r] is the divergence from the old policy, and no sample of
-            # it is negative (Schulman, 2020).
+            # The mean of r - 1 - log r estimates the divergence from the old policy, and
+            # no sample is negative (Schulman, 2020).
             "kl": mean(ratio - 1 - change),
             "clipped": mean((jnp.abs(ratio - 1) > self.clip).astype(ratio.dtype)),
             "value_loss": value_loss,
@@ -195,7 +203,7 @@ class PPO(AbstractActorCriticLoss):
         return loss.astype(rows.costs.dtype), lax.stop_gradient(metrics)
 
     def _rows(self, model: ActorCritic, key: PRNGKey) -> tuple[Episodes, Array]:
-        """The rows of a fresh batch, and its mean cost."""
+        """The rows of a new batch of episodes, and their mean total cost."""
         runs = self._episodes(model, key)
         policy: Any = model.policy
         log_prob, _ = _scores(policy, runs)
@@ -203,8 +211,8 @@ class PPO(AbstractActorCriticLoss):
         mean = jnp.sum(jnp.where(runs.valid, runs.advantages, 0)) / count
         squares = jnp.where(runs.valid, (runs.advantages - mean) ** 2, 0)
         deviation = jnp.sqrt(jnp.sum(squares) / count)
-        # To unit variance, so that the step does not depend on the scale of the cost;
-        # 1e-8 is for batches without variance.
+        # Unit variance makes the step independent of the scale of the cost. The 1e-8
+        # is for batches without variance.
         rows = runs._replace(
             advantages=(runs.advantages - mean) / (deviation + 1e-8),
             log_prob=log_prob,
@@ -212,27 +220,25 @@ class PPO(AbstractActorCriticLoss):
             following=None,
             total_cost=None,
         )
-        # Without a memory each step is a row of its own, `(batch * horizon, 1, ...)`.
+        # For a policy without a memory each step is a row: (batch * horizon, 1, ...).
         if not policy.has_memory:
             rows = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[2:]), rows)
         return jax.tree.map(lax.stop_gradient, rows), jnp.mean(runs.total_cost)
 
 
 def _scores(policy: Any, rows: Episodes) -> tuple[Array, Array]:
-    """The log-probability and the entropy at each step of rows.
-
-    With a memory, a row is an episode from its beginning.
-    """
+    """The log-probability and the entropy at each step of each row."""
 
     def score(t, y, state, u):
         log_prob, entropy = policy.log_prob(t, y, state, u), policy.entropy(t, y, state)
-        # E[-log p(u)] is the entropy: where there is no formula its draw stands for it.
+        # If the policy has no formula for its entropy E[-log p(u)], one sample
+        # estimates it.
         return log_prob, -log_prob if entropy is None else entropy
 
     def act(t, y, state, u):
         return score(t, y, state, u), policy(t, y, state)[1]
 
-    # The key does not matter: the log-probability is that of the controls given.
+    # The key does not matter, because the controls are given.
     state = initial_state(policy, jr.key(0))
 
     def of_row(*record):
