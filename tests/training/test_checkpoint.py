@@ -186,7 +186,7 @@ def test_what_is_no_checkpoint_is_refused(tmp_path, half_way):
         train(other)
     short = tmp_path / "short.ckpt"
     short.write_bytes(half_way.read_bytes()[:-200])
-    with user_error(match="must be whole, but could not be read .* is damaged"):
+    with user_error(match="Reading it failed: .* is damaged"):
         train(short)
 
 

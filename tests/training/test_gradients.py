@@ -300,7 +300,7 @@ def test_wrong_estimators_are_named():
         ("factor must be positive", lambda: ClippedSamples(factor=0.0)),
         ("sigma must be positive", lambda: EvolutionStrategies(0.0, 4)),
         (
-            "samples must be even when antithetic, got 3",
+            "samples must be even when antithetic is true, got 3",
             lambda: EvolutionStrategies(1, 3),
         ),
         ("samples must be a whole number", lambda: EvolutionStrategies(1.0, 0)),

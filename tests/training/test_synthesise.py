@@ -235,14 +235,14 @@ def test_a_cost_that_stays_infinite(monkeypatch):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (dict(initial_state=lambda key: jnp.full(2, jnp.nan)), "first state must be"),
+        (dict(initial_state=lambda key: jnp.full(2, jnp.nan)), "initial state must be"),
         (
             dict(cost=dlx.costs.Function(lambda t, x, u: jnp.log(-(x[0] ** 2)))),
-            "cost of a first state must be finite",
+            "cost of an initial state must be finite",
         ),
         (
             dict(initial_state=lambda key: jnp.full(2, 3e38)),
-            "cost of a first state must be finite",
+            "cost of an initial state must be finite",
         ),
     ],
 )

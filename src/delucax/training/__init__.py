@@ -1,4 +1,4 @@
-"""Gradient estimators, and the loop that trains on them."""
+"""Training of policies and models: the loop, losses and gradient estimators."""
 
 from . import sysid as sysid
 from ._actor_critic import actor_critic as actor_critic, ActorCritic as ActorCritic

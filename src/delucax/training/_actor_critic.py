@@ -61,7 +61,9 @@ class ActorCritic(eqx.Module):
         model.value(0.0, env.reset(critic_key))
         ```
 
-@@OUT ActorCritic
+        ```text
+        Array(0.1865, dtype=float32)
+        ```
     """
 
     policy: AbstractController
@@ -152,7 +154,9 @@ def actor_critic(
         ).total_cost
         ```
 
-@@OUT actor_critic
+        ```text
+        Array(0.6999, dtype=float32)
+        ```
     """
     where = "actor_critic"
     check_instance(environment, Environment, "environment", where)

@@ -72,6 +72,7 @@ def costs_of(environment, ranges, policy, keys):
 @eqx.filter_jit
 def costs_of_mpc(environment, ranges, lqr, keys):
     """The total cost of MPC in each episode, for the plant of that episode."""
+
     def of(plant, key):
         mpc = local_mpc(plant, lqr, throw=False)
         return rollout(plant, mpc, key=key, **_QUIETLY).total_cost

@@ -141,11 +141,7 @@ def evolve(
         loss = dlx.training.expected_cost(env, batch=2)
         key = jax.random.key(1)
         fitted = dlx.training.evolve(loss, policy, 5, key=key, population=16)
-        fitted.history.loss.shape
-        ```
-
-        ```text
-        (5,)
+        fitted.history.loss
         ```
     """
     population = check_count(population, "population", _WHERE, least=4)

@@ -64,7 +64,9 @@ class Fitted(eqx.Module):
         fitted.model.K.round(1), fitted.result
         ```
 
-@@OUT Fitted
+        ```text
+        (Array([[2., 2.]], dtype=float32), <RESULTS.successful>)
+        ```
     """
 
     model: PyTree
@@ -191,7 +193,9 @@ def fit(
         fitted.model.length.round(2)
         ```
 
-@@OUT fit
+        ```text
+        Array(1.5, dtype=float32, weak_type=True)
+        ```
     """
     check_function(loss, "loss", _WHERE)
     if not isinstance(optimiser, optax.GradientTransformation):

@@ -60,8 +60,6 @@ def analytic(
         value, gradient = estimator(loss, controller, jax.random.key(0))
         gradient.K
         ```
-
-@@OUT analytic
     """
     check_key(key, "analytic")
 
@@ -127,8 +125,6 @@ class ClippedSamples(eqx.Module):
         value, gradient = estimator(loss, controller, jax.random.key(0))
         gradient.K
         ```
-
-@@OUT ClippedSamples
     """
 
     samples: int = eqx.field(static=True, default=32)
@@ -220,11 +216,7 @@ class EvolutionStrategies(eqx.Module):
         estimator = dlx.training.EvolutionStrategies(sigma=0.1, samples=16)
         key = jax.random.key(0)
         value, gradient = eqx.filter_jit(estimator)(loss, controller, key)
-        gradient.K.shape
-        ```
-
-        ```text
-        (1, 2)
+        gradient.K
         ```
     """
 
@@ -340,7 +332,9 @@ class LikelihoodRatio(eqx.Module):
         gradient
         ```
 
-@@OUT LikelihoodRatio
+        ```text
+        Array(-1.781, dtype=float32, weak_type=True)
+        ```
     """
 
     samples: int = eqx.field(static=True)

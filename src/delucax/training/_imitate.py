@@ -104,11 +104,7 @@ def imitate(
         fitted = dlx.training.imitate(
             env, expert, policy, key=jax.random.key(1), rounds=2, steps=50
         )
-        len(fitted.history)
-        ```
-
-        ```text
-        100
+        fitted.history.loss[-1]
         ```
     """
     check_instance(environment, Environment, "environment", _WHERE)

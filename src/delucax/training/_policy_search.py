@@ -70,8 +70,8 @@ _ANY = 1e30
 _TRIAL, _ATTEMPT, _FEWER = 0.01, 0.03, 3
 # A trial is dropped if it costs more than the best by this share.
 _CLOSE = 0.5
-# Relative gains: a method with less than the first has stopped to gain; less than the
-# second does not justify a network or an expert.
+# Relative gains. Below the first, a method counts as one that does not gain. Below the
+# second, a gain does not justify a network or an expert.
 _GAIN, _WORTH = 1e-3, 5e-3
 # Initial standard deviations of an evolution: of a network, of other policies, and of a
 # policy that is already trained.

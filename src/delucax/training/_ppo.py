@@ -38,17 +38,17 @@ class PPO(AbstractActorCriticLoss):
     r"""Proximal policy optimisation (PPO), as a loss for [`delucax.training.fit`][].
 
     Every `epochs * minibatches` steps of `fit`, the policy runs `batch` new episodes.
-    Each step takes the next minibatch of them, and the gradient of
+    Each step takes the gradient of the following loss on the next minibatch of them:
 
     $$\operatorname{mean} \; \max\bigl(\rho A, \;
     \operatorname{clip}(\rho, 1 - \epsilon, 1 + \epsilon) A\bigr)
     + a\, \frac{(V - \hat V)^2}{b^2} - h\, H, \qquad
     \rho = \frac{p_\theta(u)}{p_{\theta_\text{old}}(u)}$$
 
-    $\rho$ is the likelihood ratio of the controls, $A$ the generalised advantage
-    estimate of the cost, standardised over the batch, $V$ the estimate of the critic,
-    $\hat V$ its target, $b$ its `scale`, and $H$ the entropy of the policy. The plant is
-    not differentiated.
+    $\rho$ is the likelihood ratio of the controls. $A$ is the generalised advantage
+    estimate of the cost, standardised over the batch. $V$ is the estimate of the
+    critic, $\hat V$ its target and $b$ its `scale`. $H$ is the entropy of the policy.
+    PPO does not differentiate the plant.
 
     Train it like any loss, with any optimiser. The model is a
     [`delucax.training.ActorCritic`][] with a stochastic policy. The trained controller
@@ -102,11 +102,7 @@ class PPO(AbstractActorCriticLoss):
         optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(3e-4))
         key = jax.random.key(1)
         fitted = dlx.training.fit(ppo, model, optimiser, steps=8, key=key)
-        fitted.history["total_cost"].shape
-        ```
-
-        ```text
-        (8,)
+        fitted.model.policy.base, fitted.history["total_cost"]
         ```
     """
 
@@ -194,8 +190,8 @@ class PPO(AbstractActorCriticLoss):
         metrics = {
             "total_cost": memory.total_cost,
             "entropy": bonus,
-            # The mean of r - 1 - log r estimates the divergence from the old policy, and
-            # no sample is negative (Schulman, 2020).
+            # The mean of r - 1 - log r estimates the divergence from the old policy.
+            # No sample is negative (Schulman, 2020).
             "kl": mean(ratio - 1 - change),
             "clipped": mean((jnp.abs(ratio - 1) > self.clip).astype(ratio.dtype)),
             "value_loss": value_loss,

@@ -1,4 +1,4 @@
-"""The record of a training run, and the file from which it resumes."""
+"""The history of a training run, and the file from which it resumes."""
 
 import tempfile
 from pathlib import Path
@@ -24,17 +24,18 @@ _FORMAT = "delucax.training.fit 2"
 
 
 class History(eqx.Module):
-    """The measurements of a training run, NumPy arrays with an entry per step.
+    """The history of a training run: NumPy arrays with an entry for each step.
+
+    `history["name"]` is a column or a metric, and `len(history)` the number of steps.
 
     **Attributes:**
 
-    - `step`: the step, counted from 0; its key is `jax.random.fold_in(key, step)`.
-    - `loss`: the loss before the step was taken.
-    - `gradient_norm`: the Euclidean norm of its gradient, in unconstrained values.
-    - `seconds`: the time since training began, read at the end of the step's block.
-    - `metrics`: a dictionary of what else the loss returned.
-
-    `history["name"]` is a column or a metric, and `len(history)` the number of steps.
+    - `step`: the number of the step, from 0. Its key was
+        `jax.random.fold_in(key, step)`.
+    - `loss`: the loss before the update.
+    - `gradient_norm`: the Euclidean norm of the gradient, in unconstrained values.
+    - `seconds`: the time since training began, at the end of the block of the step.
+    - `metrics`: a dictionary of the metrics that the loss returned.
 
     !!! example
 
@@ -51,7 +52,11 @@ class History(eqx.Module):
             steps=10,
             key=jax.random.key(0),
         )
-        fitted.history.loss[-1], fitted.history["largest"]
+        fitted.history.loss[:2], fitted.history["largest"][:2]
+        ```
+
+        ```text
+        (array([2.  , 1.28], dtype=float32), array([1. , 0.8], dtype=float32))
         ```
     """
 
@@ -67,9 +72,9 @@ class History(eqx.Module):
         return len(self.step)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """The column or metric of that name.
+        """The column or metric with this name.
 
-        **Raises:** `KeyError` if there is no such column.
+        **Raises:** `KeyError` if there is none.
         """
         if name not in self._columns:
             names = ", ".join(self._columns)
@@ -79,7 +84,7 @@ class History(eqx.Module):
     def to_pandas(self) -> "pandas.DataFrame":
         """A table with a row for each step.
 
-        **Returns:** a `pandas.DataFrame`, its columns those above and the metrics.
+        **Returns:** a `pandas.DataFrame` with the columns above and the metrics.
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
@@ -91,7 +96,7 @@ class History(eqx.Module):
 
 
 class Checkpoint(NamedTuple):
-    """The file of a run, and the description that identifies the run."""
+    """The checkpoint file of a run, and a description of the run to compare."""
 
     path: Path
     run: dict[str, Any]
@@ -99,9 +104,9 @@ class Checkpoint(NamedTuple):
     def resume(
         self, arrays: PyTree
     ) -> tuple[PyTree, dict[str, np.ndarray], float] | None:
-        """`(arrays, history, seconds)` as they were saved; `None` without a file.
+        """The saved `(arrays, history, seconds)`, or `None` if there is no file.
 
-        `arrays` are those at the start of the run, for their structure.
+        `arrays` are the arrays at the start of a run, for their structure.
         """
         if not self.path.exists():
             return None
@@ -112,14 +117,13 @@ class Checkpoint(NamedTuple):
         except ValueError as error:
             raise ValueError(
                 f"fit: checkpoint '{self.path}' must be a file that fit has written, "
-                "or not be there. It must be whole, but could not be read as such: "
-                f"{error}"
+                f"or must not exist yet. Reading it failed: {error}"
             ) from None
         for what in self.run | saved["run"]:
             old, new = saved["run"].get(what), self.run.get(what)
             if isinstance(old, tuple) and isinstance(new, tuple):
-                # To three digits, so that a run may resume on another machine, where
-                # the same model comes out a little different.
+                # Three digits, so that a run may resume on another machine, where the
+                # same model has slightly different numbers.
                 difference = np.abs(np.subtract(old, new))
                 same = np.all(difference <= 1e-3 * max(old[1], new[1]))
             else:
@@ -132,42 +136,42 @@ class Checkpoint(NamedTuple):
     def write(
         self, arrays: PyTree, history: dict[str, np.ndarray], seconds: float
     ) -> None:
-        """Replace the file by one of the run as it is now, whole or not at all."""
-        # The leaves alone: the classes of an optimiser's state may be local ones.
+        """Save the run. The file is replaced at once, so it is never half written."""
+        # Only the leaves, because the classes of an optimiser's state may be local.
         saved = dict(arrays=jax.tree.leaves(arrays), history=history, seconds=seconds)
         save(self.path, dict(format=_FORMAT, run=self.run, **saved))
 
     def check_replay(
         self, saved: dict[str, np.ndarray], rows: dict[str, np.ndarray]
     ) -> None:
-        """Raise unless `rows`, the first steps taken again, match those saved.
+        """Raise unless `rows`, a repetition of the first steps, match the saved steps.
 
-        A loss, a learning rate and the contents of data have no name to compare, but
-        another one shows in the first steps.
+        This detects another loss, learning rate or data, which the description of the
+        run does not hold.
         """
         columns = {"step", "seconds", *rows}
         if saved.keys() != columns:
             raise self._other_run(
-                f"its history has {', '.join(sorted(saved))}, and the loss makes "
+                f"its history has {', '.join(sorted(saved))}, but this run has "
                 f"{', '.join(sorted(columns))}"
             )
         for name in ("loss", "gradient_norm"):
             old, new = saved[name][: len(rows[name])], rows[name]
             if not np.allclose(old, new, rtol=1e-4, atol=0):
                 raise self._other_run(
-                    f"the {name} of its first steps is {old} and is {new} here, so "
-                    "that the loss, the optimiser or the data must be others"
+                    f"the {name} of its first steps is {old} there and {new} here, so "
+                    "the loss, the optimiser or the data must be different"
                 )
 
     def _other_run(self, difference: str) -> ValueError:
         return ValueError(
-            f"fit: checkpoint '{self.path}' is of another run: {difference}. Name "
-            "another file, or delete this one."
+            f"fit: checkpoint '{self.path}' is of another run: {difference}. Pass "
+            "another path, or delete this file."
         )
 
 
 def checkpoint_path(path: Any) -> Path:
-    """The path of a checkpoint, in a folder that exists and can be written to."""
+    """The checked path of a checkpoint. Makes its folder if there is none."""
     path = as_path(path, "checkpoint", "fit")
     if path.is_dir():
         raise ValueError(
@@ -194,9 +198,9 @@ def describe_run(
     memory: PyTree,
     **options: Any,
 ) -> dict[str, Any]:
-    """The description that identifies a run, by the names used in error messages.
+    """The description that identifies a run. Its names are used in error messages.
 
-    The arrays that the run starts from are compared by their fingerprints.
+    The initial arrays of the model are described by a projection and their norm.
     """
     for path, value in values.items():
         options[f"trainable {path}"] = f"{_kind(value)} {constraints.get(path, '')}"

@@ -1,4 +1,4 @@
-"""The short-horizon actor-critic."""
+"""The short-horizon actor-critic (SHAC)."""
 
 from dataclasses import KW_ONLY
 from typing import NamedTuple
@@ -24,48 +24,52 @@ class _Memory(NamedTuple):
 
 
 class SHAC(AbstractActorCriticLoss):
-    r"""The short-horizon actor-critic: the gradient through the plant over short
-    windows, with a learned cost to go at the end of each.
+    r"""The short-horizon actor-critic (SHAC), as a loss for [`delucax.training.fit`][].
 
-    `batch` fresh episodes are cut into windows of `window` steps. The loss of the actor
-    is the mean over windows of
+    Each step of `fit` runs `batch` new episodes and cuts them into windows of $m$
+    steps. The loss of the policy is the mean over windows of the cost in the window
+    and the estimated cost to go at its end:
 
-    `(sum_i discount^i c_i + discount^window V(y_window)) / (window scale)`,
+    $$\frac{1}{m\, b} \Bigl(\sum_{i=0}^{m-1} \gamma^i c_i + \gamma^m V(y_m)\Bigr)$$
 
-    differentiated through the plant, the controls and V, but not into the window
-    before: the gradient cannot explode over more than a window, and what is cut off is
-    estimated instead. The loss of the critic is the mean of `(V - target)^2 / scale^2`
-    over all steps, with the target that of `TD(lambda)`. V in either is that of a
-    target network, which follows the critic by `rate` at each step.
+    It is differentiated through the plant, the controls and $V$, but not into the
+    previous window. So the gradient cannot explode over more than a window, and $V$
+    estimates the rest. The loss of the critic is the mean over all steps of
+    $(V_\phi - \hat V)^2 / b^2$. Here $V_\phi$ is the critic, $b$ its `scale`, and
+    $\hat V$ its target, the return of TD($\lambda$). $V$ in the loss of the policy and
+    in the targets is a target network. Its weights $\phi'$ follow the weights $\phi$ of
+    the critic at each step: $\phi' \leftarrow \phi' + r\, (\phi - \phi')$.
 
-    It is trained as any loss is, one gradient per step for both; the model is a
-    [`delucax.training.ActorCritic`][] with a policy that draws or not. The trained
-    controller is `fitted.model.policy`. Each step of `fit` takes `batch * horizon`
-    steps of the environment, and every `refresh`-th as many again, which set the scale
-    of the critic and each [`delucax.controllers.Standardise`][] of the model. Metrics:
-    `total_cost` and `value_loss`.
+    Train it like any loss. One gradient per step trains both networks. The model is a
+    [`delucax.training.ActorCritic`][], whose policy may be stochastic or not. The
+    trained controller is `fitted.model.policy`. Each step of `fit` takes
+    `batch * horizon` steps of the environment. Every `refresh`-th step takes as many
+    again, to set the scale of the critic and each [`delucax.controllers.Standardise`][]
+    of the model. Metrics: `total_cost` and `value_loss`.
 
-    Horizon, termination and `bootstrap` are as in [`delucax.training.PPO`][]. The
-    windows are those of whole episodes of the present policy, and not one window per
-    step of episodes that an older policy began, so that time, disturbances and the
-    memory of the policy are consistent within an episode.
+    The horizon, termination and `bootstrap` are as in [`delucax.training.PPO`][].
+    Unlike in the paper, a step uses all windows of whole episodes, not the next window
+    of episodes that an older policy began. So time, disturbances and the memory of the
+    policy are consistent within an episode.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `batch`: episodes in a batch.
-    - `horizon`: steps per episode; the environment's own by default.
-    - `window`: steps of a window, 16 by default; the last of an episode may be shorter.
-    - `discount`: of the cost to go, 0.99 by default.
-    - `decay`: lambda of the target, 0.95 by default.
-    - `rate`: at which the target network follows, 0.2 by default; 1 for none.
-    - `value_weight`: 1 by default.
-    - `refresh`: steps between two batches that set the scales, 10 by default.
-    - `bootstrap`: whether the horizon truncates (default); if false it terminates the
-        episode, with the final cost.
+    - `horizon`: steps per episode; the `horizon` of the environment by default.
+    - `window`: $m$, steps in a window, 16 by default. The last window of an episode may
+        be shorter.
+    - `discount`: $\gamma$, the discount factor of the cost to go, 0.99 by default.
+    - `decay`: $\lambda$ of the targets, 0.95 by default.
+    - `rate`: $r$, the rate of the target network, 0.2 by default. With 1 the target
+        network equals the critic.
+    - `value_weight`: the weight of the critic's loss, 1 by default.
+    - `refresh`: steps between two updates of the scales, 10 by default.
+    - `bootstrap`: whether the critic estimates the cost after the horizon; true by
+        default. If false, the horizon terminates the episode, with the final cost.
 
-    **Raises:** `ValueError` on an argument of the wrong kind or range; when it is
-    trained, if the model is not an `ActorCritic`.
+    **Raises:** `ValueError` if an argument has the wrong type or range. In training, if
+    the model is not an `ActorCritic`.
 
     Source: Xu, Makoviychuk, Narang, Ramos, Matusik, Garg and Macklin, 2022.
 
@@ -107,7 +111,7 @@ class SHAC(AbstractActorCriticLoss):
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
         check_instance(model, ActorCritic, "model", "SHAC")
         statistics = none = Statistics.empty(model, self.environment.dt.dtype)
-        # Twice: what the targets are depends on the scale of the critic.
+        # Twice, because the targets depend on the scale of the critic.
         for one in jr.split(key):
             statistics = self._updated(none, statistics.applied_to(model), one)
         return _Memory(eqx.filter(model.critic, is_float), statistics)
@@ -132,18 +136,20 @@ class SHAC(AbstractActorCriticLoss):
         steps = jnp.arange(self.horizon)
         within = steps % self.window
         ends = (within == self.window - 1) | (steps == self.horizon - 1)
-        # What follows a window counts once, at its last step or at that of the episode.
+        # The cost to go counts once in a window: at its last step, or where the episode
+        # ends.
         bonus = jnp.where(ends | ~runs.continues, runs.following, 0)
         costs = jnp.where(runs.valid, runs.costs + self.discount * bonus, 0)
-        # The targets are data to the critic: it is not trained by moving them.
+        # The gradient of the critic's loss must not move the targets.
         error = self._value_errors(model, lax.stop_gradient(runs))
-        # Over each episode first. Discounted from the beginning of the window, not of
-        # the episode: late windows count as much as early ones.
+        # Costs are discounted from the beginning of their window, so that late windows
+        # count as much as early ones.
         actor = jnp.sum(self.discount**within * costs, axis=1)
         critic = jnp.sum(jnp.where(runs.valid, error**2, 0), axis=1)
         count = jnp.sum(runs.valid)
         value_loss = jnp.sum(critic) / count
-        # In the scale of the critic, so that one learning rate does for both.
+        # Divided by the scale of the critic, so that one learning rate suits both
+        # losses.
         actor = jnp.sum(actor) / (count * model.scale)
         metrics = {"total_cost": jnp.mean(runs.total_cost), "value_loss": value_loss}
         return actor + self.value_weight * value_loss, lax.stop_gradient(metrics)
@@ -153,8 +159,8 @@ class SHAC(AbstractActorCriticLoss):
 
 
 def _with_target(model: ActorCritic, memory: _Memory) -> ActorCritic:
-    """The model with the target network for a critic, held fixed."""
-    # The gradient of the actor goes through V by its observation, not into its weights.
+    """The model with the target network as its critic, the weights held fixed."""
+    # The gradient of the policy still passes through V to the observation.
     target = eqx.combine(lax.stop_gradient(memory.critic), model.critic)
     model = eqx.tree_at(lambda m: m.critic, model, target)
     return memory.statistics.applied_to(model)

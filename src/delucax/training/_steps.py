@@ -1,4 +1,4 @@
-"""Steps of [`delucax.training.fit`][] in compiled blocks; losses with a memory."""
+"""The compiled steps of [`delucax.training.fit`][], and losses with a memory."""
 
 import abc
 import functools
@@ -25,18 +25,19 @@ from ._trainable import Assembly, strip_weak_type
 Values = dict[str, Array]
 _WHERE = "fit"
 # Folded into the key for the order of the data and for the first memory of a surrogate.
-# They are larger than the number of any step.
+# They are larger than the number of any step, so no step uses the same key.
 _ORDER = 2**32 - 1
 _MEMORY = 2**32 - 2
 CAPACITY = 1000
-"""The most steps in a block. It is the size of the buffers whatever the block, so that
+"""The maximum number of steps in a block. The buffers always have this size, so that
 results are bitwise independent of `block`."""
 FAULTS = ("nothing", "loss", "gradient", "update")
-"""The name of the value that is not finite, by the number that a block returns."""
+"""What is not finite, by the number `State.fault`."""
 
 
 class State(NamedTuple):
-    """The state of the training loop; with an axis of seeds, if there are several."""
+    """The state of the training loop. With several seeds, arrays have a leading axis
+    over them."""
 
     values: Values
     optimiser: PyTree
@@ -48,13 +49,16 @@ class State(NamedTuple):
 
 
 class AbstractSurrogate(eqx.Module):
-    """A surrogate loss with a memory, such as that of PPO.
+    """A surrogate loss: a loss with a memory, for [`delucax.training.fit`][].
 
-    [`delucax.training.fit`][] makes the calls: `init` once; then at each step `update`,
-    which may run the model, and the loss `surrogate(model, memory, key)` of what is
-    remembered, whose gradient any estimator takes; in the end `finished`. All are pure,
-    so that the whole runs in the one loop, is `vmap`ped over seeds, and goes on from a
-    checkpoint. [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] are two.
+    `fit` calls `init` once. At each step it calls `update`, which may run the model,
+    and takes the gradient of the loss `surrogate(model, memory, key)` with any
+    estimator. At the end it calls `finished`. [`delucax.training.PPO`][] and
+    [`delucax.training.SHAC`][] are such losses.
+
+    Subclass it and write `init`, `update` and `__call__`. All must be pure functions.
+    Then training runs in the same compiled loop as with other losses, over several
+    seeds, and resumes from a checkpoint.
 
     !!! example
 
@@ -65,7 +69,7 @@ class AbstractSurrogate(eqx.Module):
         import optax
 
         class Steadied(dlx.training.AbstractSurrogate):
-            "Descend to 1, but never far from a running mean."
+            "Go to 1, but stay close to a running mean."
 
             def init(self, model, key):
                 return model.K
@@ -79,6 +83,11 @@ class AbstractSurrogate(eqx.Module):
         controller = dlx.controllers.Linear(jnp.zeros((1, 2)))
         key = jax.random.key(0)
         fitted = dlx.training.fit(Steadied(), controller, optax.adam(0.1), 10, key=key)
+        fitted.model.K.round(1)
+        ```
+
+        ```text
+        Array([[0.6, 0.6]], dtype=float32)
         ```
     """
 
@@ -95,16 +104,16 @@ class AbstractSurrogate(eqx.Module):
 
     @abc.abstractmethod
     def update(self, model: PyTree, memory: PyTree, step: Any, key: PRNGKey) -> PyTree:
-        """The memory for a step; no gradient is taken through it.
+        """The memory for a step. It is not differentiated.
 
         **Arguments:**
 
         - `model`: the model before the step.
-        - `memory`: that of the step before.
+        - `memory`: the memory of the previous step.
         - `step`: the number of the step, from 0.
         - `key`: a random key.
 
-        **Returns:** a pytree of the same structure, shapes and dtypes.
+        **Returns:** a pytree with the structure, shapes and dtypes of `memory`.
         """
 
     @abc.abstractmethod
@@ -114,16 +123,17 @@ class AbstractSurrogate(eqx.Module):
         **Arguments:**
 
         - `model`: the model.
-        - `memory`: that of the step.
+        - `memory`: the memory of the step, from `update`.
         - `key`: a random key.
 
         **Returns:** a scalar, or a scalar and a dictionary of scalar metrics.
         """
 
     def finished(self, model: PyTree, memory: PyTree) -> PyTree:
-        """The model with what was learned beside its weights; as it is by default.
+        """The model that `fit` returns. Override it to put values of the memory into
+        the model, such as statistics. By default the model is returned as it is.
 
-        **Arguments:** `model`: the model. `memory`: that of the last step.
+        **Arguments:** `model`: the model. `memory`: the memory of the last step.
 
         **Returns:** the model.
         """
@@ -131,7 +141,7 @@ class AbstractSurrogate(eqx.Module):
 
 
 class Steps(NamedTuple):
-    """The constants of a run."""
+    """The constants of a run, and its compiled steps."""
 
     loss: Callable[..., Any]
     gradient: Callable[..., Any]
@@ -153,7 +163,7 @@ class Steps(NamedTuple):
         if self.batch_size is not None:
             size = len(jax.tree.leaves(self.data)[0])
             order = np.zeros((*shape, size), np.int32), np.full(shape, -1, np.int32)
-        # Arrays of NumPy compile nothing on their way to the device.
+        # NumPy arrays move to the device without a compilation.
         order, fault = jax.device_put((order, np.zeros(shape, np.int32)))
         return State(values, state, memory, order, fault)
 
@@ -162,7 +172,7 @@ class Steps(NamedTuple):
     ) -> tuple[State, dict[str, np.ndarray]]:
         """Take the steps from `first` up to `stop`, at most `CAPACITY`.
 
-        **Returns:** the state after them, and the metrics by name, an entry per step.
+        **Returns:** the next state, and the metrics by name, with an entry per step.
         """
         span = jax.device_put((np.int32(first), np.int32(stop)))
         state, outcome = self._compiled(state, *span)
@@ -170,7 +180,7 @@ class Steps(NamedTuple):
         return state, {name: column[:count] for name, column in rows.items()}
 
     def finished(self, state: State) -> PyTree:
-        """The trained model, with what a surrogate learned beside its weights."""
+        """The trained model, after `finished` of a surrogate."""
         model = self.assembly(state.values)
         if not isinstance(self.loss, AbstractSurrogate):
             return model
@@ -185,7 +195,8 @@ class Steps(NamedTuple):
             step = lambda model, key, state: self._step(model, key, state, k)
             return _over_seeds(step, self.seeds)(self.assembly, self.key, state)
 
-        # Traced once, here: the loop needs the shapes of a row before it begins.
+        # Jitted so that it is traced only once: the shapes of a row are needed before
+        # the loop.
         step = jax.jit(step_of_all)
         empty = lambda entry: jnp.zeros((CAPACITY, *entry.shape), entry.dtype)
         rows = jax.tree.map(empty, jax.eval_shape(step, state, first)[1])
@@ -209,8 +220,8 @@ class Steps(NamedTuple):
     ) -> tuple[State, dict[str, Array]]:
         """One step of one seed."""
         values, memory, order = before.values, before.memory, before.order
-        # From the number of the step, not from the step before: the draws are the same
-        # however the steps are cut into blocks, and after a checkpoint.
+        # The key depends only on the number of the step, so the draws do not depend on
+        # the blocks or on checkpoints.
         own_key = jr.fold_in(key, k)
         arguments = () if self.data is None else (self.data,)
         if self.batch_size is not None and order is not None:
@@ -221,7 +232,7 @@ class Steps(NamedTuple):
             own_key, memory_key = jr.split(own_key)
             memory = self.loss.update(assembly(values), memory, k, memory_key)
             kind = lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf))
-            rule = "a memory of the shapes and dtypes that it was given,"
+            rule = "a memory with the shapes and dtypes of its argument,"
             rule = f"{type(self.loss).__name__}.update must return {rule}"
             _check_kept(kind, before.memory, memory, rule)
             arguments = (memory,)
@@ -233,7 +244,7 @@ class Steps(NamedTuple):
         cost, metrics = cost_and_metrics(value, _WHERE)
         rule = "gradient must return (value, gradient) with a gradient like the values"
         _check_kept(jnp.shape, values, slope, rule)
-        # A key in the state of an optimiser cannot be cast, and need not be.
+        # A random key in the state of an optimiser cannot be cast.
         cast = lambda x, old: x if x.dtype == old.dtype else x.astype(old.dtype)
         slope = jax.tree.map(cast, slope, values)
         if taken := sorted(set(metrics) & set(COLUMNS)):
@@ -241,7 +252,7 @@ class Steps(NamedTuple):
                 f"{_WHERE}: metrics must not be called {', '.join(COLUMNS)}; got "
                 f"{taken[0]!r}."
             )
-        # Line searches of Optax take the loss too.
+        # The line searches of Optax also need the loss.
         value_of = lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0]
         given: Any = dict(value=cost, grad=slope, value_fn=value_of)
         updates, after = self.optimiser.update(slope, before.optimiser, values, **given)
@@ -249,14 +260,15 @@ class Steps(NamedTuple):
         after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
-        # In the order in which one leads to the next, so that the first is the cause.
+        # A loss that is not finite spoils the gradient, and that the update. The first
+        # of them is reported.
         fault = jnp.where(_is_finite(moved), np.int32(0), np.int32(3))
         fault = jnp.where(jnp.isfinite(norm), fault, np.int32(2))
         fault = jnp.where(jnp.isfinite(cost), fault, np.int32(1))
-        # A seed that failed is frozen while the others go on.
+        # A seed that failed stops; the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
-        # The step at fault is not made: what stays is the last good state.
+        # A step that failed is not made, so the state stays the last good one.
         after_step = moved, after, memory
         stepped: Any = lax.cond(fault == 0, lambda: after_step, lambda: before[:3])
         row = {"loss": strip_weak_type(cost), "gradient_norm": norm, **metrics}
@@ -282,17 +294,17 @@ def _first_memory(loss: AbstractSurrogate, model: PyTree, key: PRNGKey) -> PyTre
 
 @eqx.filter_jit
 def _compiled_over_seeds(function: Any, seeds: int | None, *arguments: PyTree) -> Any:
-    """A call of a pytree that is a function, compiled once for all of its structure."""
+    """`function(*arguments)` over seeds, compiled. The function may be a pytree."""
     return _over_seeds(function, seeds)(*arguments)
 
 
 def _over_seeds(function: Callable[..., Any], seeds: int | None) -> Callable[..., Any]:
-    """`function` over a leading axis of every argument, or as it is for one seed."""
+    """`function`, mapped over the leading axis of its arguments if there are seeds."""
     return function if seeds is None else eqx.filter_vmap(function)
 
 
 def _check_kept(kind: Callable[[Any], Any], old: Any, new: Any, rule: str) -> None:
-    """Raise unless `new` has the structure of `old`, and leaves of its kinds."""
+    """Raise unless `new` has the structure of `old`, and leaves of the same `kind`."""
     expected, got = (jax.tree.map(kind, tree) for tree in (old, new))
     if expected != got:
         raise ValueError(f"{_WHERE}: {rule} {expected}, got {got}.")
@@ -301,13 +313,13 @@ def _check_kept(kind: Callable[[Any], Any], old: Any, new: Any, rule: str) -> No
 def _drawn_rows(
     key: PRNGKey, order: tuple[Array, Array], k: Array, batch_size: int
 ) -> tuple[Array, tuple[Array, Array]]:
-    """The rows of the batch of step `k`, and the order of the pass it is in."""
+    """The rows of the batch of step `k`, and the order of the rows in its pass."""
     rows, last_pass = order
     batches = rows.shape[0] // batch_size
     this_pass = k // batches
 
     def redrawn():
-        # From the number of the pass, not from the order before: the same after a
+        # The order depends only on the number of the pass, so it is the same after a
         # checkpoint.
         own_key = jr.fold_in(key, this_pass)
         return jr.permutation(own_key, rows.size).astype(rows.dtype)
@@ -318,7 +330,7 @@ def _drawn_rows(
 
 
 def _norm(tree: PyTree) -> Array:
-    """The Euclidean norm, in float32 at least: squares of float16 overflow at 256."""
+    """The Euclidean norm, at least in float32, because squares overflow in float16."""
     widen = lambda leaf: leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
     return optax.tree.norm(jax.tree.map(widen, tree))
 

@@ -1,4 +1,4 @@
-"""Networks that fit an environment, around an LQR where there is one."""
+"""The policies that `synthesise` trains."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from ..environments import Environment
 from ..simulation import rollout
 
 
-# Episodes of each controller that the scales are taken from.
+# Episodes of each driver, for the scales of features and controls.
 _EPISODES = 32
 
 
@@ -28,9 +28,12 @@ def structures(
     depth: int,
     key: PRNGKey,
 ) -> dict[str, AbstractController]:
-    """Policies to train, by name: a network that corrects the LQR; and a network. Of a
-    family of plants the first has a memory, also without an LQR; where the state is
-    not observed there is one with a memory alone."""
+    """Policies to train, by name.
+
+    If the state is observed: a network that corrects the LQR, if there is one, and a
+    network alone. For a family of plants the first is recurrent, and replaces the LQR
+    if there is none. If the state is not observed: a recurrent network alone.
+    """
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds
     low, high = (jnp.full(m, -jnp.inf), jnp.full(m, jnp.inf))
@@ -45,10 +48,10 @@ def structures(
         drivers.append(Constant(jnp.where(jnp.isfinite(end), end, 0)))
     visits = _visits(environment, drivers, jr.split(visits_key, _EPISODES))
     features = _standardised(environment, np.concatenate([y for y, _ in visits]))
-    # Where a control has no bounds, its range is that of the LQR, or of order one.
+    # A control without bounds gets a range from the controls of the LQR, or [-2, 2].
     reach = np.ones(m) if lqr is None else _spread(np.asarray(visits[1][1]), 1e-3)
     half = jnp.where(bounded, (high - low) / 2, 2 * reach)
-    # From a bound on one side the range goes to the other.
+    # With a bound on one side only, the range begins at that bound.
     below = jnp.where(jnp.isfinite(high), high - 2 * half, -half)
     above = jnp.where(jnp.isfinite(low), low + 2 * half, half)
     ends = (
@@ -67,7 +70,7 @@ def structures(
         return {"memory": memory(ends, plain_key)}
     made: dict[str, AbstractController] = {}
     if lqr is not None:
-        # Its correction is zero at first.
+        # The last layer starts at zero, so the policy starts as the LQR.
         make: Any = memory if is_family else network
         correction = make((-half, half), residual_key)
         last = lambda c: c.readout if is_family else c.network.layers[-1]
@@ -84,7 +87,7 @@ def structures(
 def _visits(
     environment: Environment, drivers: list[AbstractController], keys: Array
 ) -> list[tuple[Array, Array]]:
-    """Observations and controls of episodes, a row for each step, by driver."""
+    """For each driver: observations and controls of its episodes, a row per step."""
     keep = ("observations", "controls")
 
     def of(driver):
@@ -104,7 +107,7 @@ def _encoded(environment: Environment, observations: Array) -> Array:
 
 
 def _standardised(environment: Environment, observations: np.ndarray) -> Standardise:
-    """Features with the centre and the spread of those of `observations`."""
+    """Features that are standardised with the median and spread of `observations`."""
     z = np.asarray(_encoded(environment, jnp.asarray(observations)))
     centre = np.median(z[np.all(np.isfinite(z), axis=1)], axis=0)
     std = _spread(z, 1e-3)
@@ -112,8 +115,8 @@ def _standardised(environment: Environment, observations: np.ndarray) -> Standar
 
 
 def _spread(rows: np.ndarray, least: float) -> np.ndarray:
-    """The standard deviation of the middle of the rows: some episodes run away."""
+    """The standard deviation by quantiles, because some episodes run away."""
     rows = rows[np.all(np.isfinite(rows), axis=1)]
     low, high = np.quantile(rows, [0.1, 0.9], axis=0)
-    # 80% of a normal distribution are within 1.28 deviations.
+    # 80% of a normal distribution are within 1.28 standard deviations of the mean.
     return np.maximum((high - low) / 2.56, least * (1 + np.abs(low)))

@@ -1,4 +1,4 @@
-"""A policy for any environment with a model, from one call."""
+"""Policy synthesis: a trained policy for an environment, without settings."""
 
 import warnings
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -32,25 +32,26 @@ if TYPE_CHECKING:
 
 
 _WHERE = "synthesise"
-# Seconds below which not even the first programs compile.
+# In less time, in seconds, not even the first programs compile.
 _LEAST_BUDGET = 5.0
 
 
 class Synthesis(NamedTuple):
-    """The result of `synthesise`.
+    """The result of [`delucax.training.synthesise`][].
 
     **Attributes:**
 
     - `policy`: the controller that was chosen.
-    - `structure`: what it is: `"zero"`, `"LQR"`, `"network"`, `"memory"`,
-        `"LQR + network"` or `"LQR + memory"`.
-    - `costs`: from `"policy"`, `"zero"`, `"LQR"`, `"MPC"` and `"plan"` to the costs of
-        episodes from starts that were used for nothing else, the same for each; those
-        that do not apply, or that the budget leaves no time for, are left out.
-    - `tried`: a list of `Attempt`s, in the order in which they were made.
-    - `seconds`: what it took.
-    - `plants`: of a family, from each path of `ranges` to what the plants of these
-        episodes have there; empty otherwise.
+    - `structure`: its structure: `"zero"`, `"LQR"`, `"network"`, `"memory"` (a
+        recurrent network), `"LQR + network"` or `"LQR + memory"`.
+    - `costs`: a dictionary of the total costs of `"policy"`, `"zero"`, `"LQR"`, `"MPC"`
+        and `"plan"`, with an entry for each episode. All run the same episodes, which
+        were used for nothing else. Controllers that do not apply, or for which the
+        budget left no time, are missing.
+    - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings.
+    - `seconds`: the time it took.
+    - `plants`: for a family of plants, a dictionary from each path of `ranges` to its
+        value in each of these episodes; else empty.
 
     !!! example
 
@@ -62,6 +63,12 @@ class Synthesis(NamedTuple):
         zero = dlx.controllers.Zero(1)
         dlx.training.Synthesis(zero, "zero", costs, [], 5.0).to_pandas()
         ```
+
+        ```text
+                mean  median  worst
+        policy   1.5     2.0    2.0
+        zero     7.0     9.0    9.0
+        ```
     """
 
     policy: AbstractController
@@ -72,10 +79,10 @@ class Synthesis(NamedTuple):
     plants: dict[str, np.ndarray] = {}
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """A table with a row for each controller that was compared: mean, median and
-        worst cost, and of a family the plant of the median and of the worst episode.
+        """A table with a row for each controller in the comparison.
 
-        **Returns:** a `pandas.DataFrame`.
+        **Returns:** a `pandas.DataFrame` with the mean, median and worst cost. For a
+        family of plants, also the parameters in the median and in the worst episode.
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
@@ -103,54 +110,58 @@ def synthesise(
     depth: int = 1,
     progress: bool = True,
 ) -> Synthesis:
-    """A policy for an environment with a model, without settings of the task.
+    """Train a policy for an environment within a time budget, without tuning.
 
-    It tries, compares and refines:
+    The search tries several structures and training methods, refines the best of them,
+    and compares the result with known controllers:
 
-    1. The floor: no control, and the LQR of [`delucax.controllers.local_lqr`][] where
-        there is one.
-    2. Trials: a network that corrects the LQR ([`delucax.controllers.Residual`][]) and
-        a network alone. With `ranges` the one that corrects is recurrent, because it
-        can then tell the plant from what it has observed; where the state is not
-        observed, a recurrent network alone is tried. Each is trained by the gradient of
-        the rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]), by
-        that gradient damped over a quarter, a tenth and a thirtieth of these, and by
-        [`delucax.training.evolve`][], which needs no gradient. If after the first two
-        trials neither they nor a plan are better than the LQR, it ends with the LQR.
-    3. Refinement: the better third goes on for three times as long, until one is left.
-        That one is trained by the methods that still gain, then at a tenth of the
-        learning rate. Once none gains, an imitation of MPC
-        ([`delucax.training.imitate`][]) is tried, if MPC costs less.
-    4. Choice among the last four and the floor, on up to 512 starts that none was
-        trained on, by the mean cost, in which costs above 20 times the usual one count
-        by their logarithm. Where the
-        LQR, or no control, is as good to half a percent, that is returned.
+    1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][] if it
+        exists.
+    2. Trials. The structures are a network that corrects the LQR
+        ([`delucax.controllers.Residual`][]) and a network alone. With `ranges`, the
+        first is recurrent, so that it can identify the plant from past observations. If
+        the state is not observed, a recurrent network alone is tried. The training
+        methods are the gradient of a rollout of at most 200 steps
+        ([`delucax.training.ClippedSamples`][]); the same gradient, damped with a time
+        constant of a quarter, a tenth or a thirtieth of the rollout; and
+        [`delucax.training.evolve`][], which needs no gradient. If after two trials
+        neither they nor a plan are better than the LQR, the search returns the LQR.
+    3. Refinement. The best third of the trials goes on for three times as long, until
+        one is left. The search trains it with the methods that still gain, and then at
+        a tenth of the learning rate. When no method gains, it tries to imitate MPC
+        ([`delucax.training.imitate`][]), if MPC costs less.
+    4. Choice. The candidates are the last four policies and the baselines. The
+        criterion is the mean cost over up to 512 initial states that were not used for
+        training. In this mean, costs above 20 times the usual cost grow like their
+        logarithm only. If a baseline is as good to half a percent, it is returned.
+
+    An interrupt (`KeyboardInterrupt`) ends the training, and the best policy so far is
+    returned.
 
     **Arguments:**
 
-    - `environment`: the environment. Its dynamics and cost must be differentiable.
-        Where a control has no bounds, a network keeps it within two standard deviations
-        of the LQR's control around zero, or within 2 without an LQR; where it has one
-        bound, in a range of that size from it.
+    - `environment`: the environment. Its dynamics and cost must be differentiable. If a
+        control has no bounds, a network keeps it within two standard deviations of the
+        LQR's control around zero, or within 2 if there is no LQR. If it has one bound,
+        the range is as wide and begins at the bound.
     - `key`: a random key.
-    - `budget`: seconds for all of it with compilation, 75 by default, at least 5. A
-        training or comparison that has begun is finished. What is tried depends on the
-        speed of the machine, and so does the result.
-    - `ranges`: of parameters, as in [`delucax.randomise`][]: the policy is for a family
-        of plants, one of which each episode draws. The LQR is that of the nominal
-        plant; MPC and the plan know each plant. None by default.
-    - `width`, `depth`: of the networks, 32 and 1 by default.
+    - `budget`: the time for everything, with compilation, in seconds; 75 by default, at
+        least 5. A training or comparison that has begun is finished. The trials depend
+        on the speed of the machine, and so does the result.
+    - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
+        works on a family of plants: each episode draws a plant. The LQR is designed for
+        the nominal plant; MPC and the plan know each plant. None by default.
+    - `width`, `depth`: the units in a hidden layer, and the number of hidden layers of
+        the networks; 32 and 1 by default.
     - `progress`: whether to show a bar with the seconds and the cost so far; true by
         default.
 
-    An interrupt (`KeyboardInterrupt`) ends the training, and returns the best so far.
-
     **Returns:** a [`delucax.training.Synthesis`][].
 
-    **Raises:** `ValueError` on an argument of the wrong kind; if the cost of a first
-    state is not finite, no control keeps one finite over the first step, or the
-    dynamics or the cost have no derivative; all before anything is trained. A warning
-    if the cost of the policy is not finite from every start.
+    **Raises:** `ValueError`, before any training, if an argument has the wrong type,
+    the cost of an initial state is not finite, no control keeps the first step finite,
+    or the dynamics or the cost are not differentiable. Warns if the cost of the policy
+    is not finite in some episodes of the comparison.
 
     !!! example
 
@@ -191,7 +202,7 @@ def synthesise(
     if lost := np.sum(~np.isfinite(costs["policy"])):
         warnings.warn(
             f"{_WHERE}: the cost of {structure!r}, which is returned, is not finite "
-            f"from {lost} of {len(costs['policy'])} starts.",
+            f"from {lost} of {len(costs['policy'])} initial states.",
             stacklevel=2,
         )
     tried, plants = search.tried, search.plants()
@@ -201,7 +212,7 @@ def synthesise(
 def _check_environment(
     env: Environment, ranges: dict[str, Any] | None, keys: Any
 ) -> None:
-    """Raise where nothing could be trained, whatever the method."""
+    """Raise if no method could train a policy for the environment."""
     loss = expected_cost(env, batch=1, horizon=1, ranges=ranges)
     held = Constant(jnp.zeros(env.control_size))
     try:
@@ -210,14 +221,18 @@ def _check_environment(
         reason, *_ = str(error).splitlines() or [f"{type(error).__name__}."]
         raise ValueError(
             f"{_WHERE}: environment must have dynamics and a cost that JAX can "
-            f"differentiate, got: {reason} For others use delucax.training.evolve."
+            f"differentiate, got: {reason} If that is not possible, use "
+            "delucax.training.evolve."
         ) from error
     starts, costs, steps = map(np.asarray, first_steps(env, keys))
-    for what, values in (("first state", starts), ("cost of a first state", costs)):
+    checked = ("initial state", starts), ("cost of an initial state", costs)
+    for what, values in checked:
         finite = np.isfinite(values.reshape(len(keys), -1)).all(axis=1)
         if not finite.all():
             x = starts[finite.argmin()]
-            raise ValueError(f"{_WHERE}: the {what} must be finite, at x0 = {x}.")
+            raise ValueError(
+                f"{_WHERE}: the {what} must be finite, but it is not at x0 = {x}."
+            )
     kept = np.isfinite(steps).all(axis=-1).any(axis=1)
     if not kept.all():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Partition of a model into its trainable, unconstrained values and the rest."""
+"""The partition of a model into its trainable values and the rest."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,7 +18,7 @@ from .._module import AbstractConstraint, get_path, marked_leaves, path_string
 class Assembly(eqx.Module):
     """A model without its trainable leaves.
 
-    A call with the unconstrained values rebuilds the model.
+    Call it with their unconstrained values to rebuild the model.
     """
 
     leaves: list[Any]
@@ -34,7 +34,7 @@ class Assembly(eqx.Module):
         return jax.tree.unflatten(self.structure, leaves)
 
     def constrained(self, values: dict[str, Array]) -> dict[str, Array]:
-        """The values that the model gets."""
+        """The values of the model's leaves, after the constraints."""
         limits = self.constraints.items()
         return values | {path: limit.constrain(values[path]) for path, limit in limits}
 
@@ -42,7 +42,7 @@ class Assembly(eqx.Module):
 def partition_trainable(
     model: PyTree, trainable: Any, where: str
 ) -> tuple[Assembly, dict[str, Array]]:
-    """`model` as its unconstrained trainable values, by path, and all the rest."""
+    """The rest of `model`, and its unconstrained trainable values by path."""
     leaves_of = marked_leaves(model)
     entries: list[Any] = [(path_string(path), *marks) for path, *marks in leaves_of]
     given: Mapping[str, AbstractConstraint | None] = {}
@@ -76,7 +76,7 @@ def partition_trainable(
                 constraint = other
         value = strip_weak_type(leaf)
         if constraint is not None:
-            # What is known is checked also while something else is traced.
+            # A leaf with known values is checked even while other values are traced.
             with jax.ensure_compile_time_eval():
                 holds = not is_concrete(leaf) or bool(np.all(constraint.holds(leaf)))
             if not holds:
@@ -90,10 +90,11 @@ def partition_trainable(
 
 
 def weights_of(model: PyTree) -> tuple[PyTree, PyTree]:
-    """`model` as its weights and the rest, each with `None` where the other has a leaf.
+    """The weights of `model` and the rest: two pytrees like `model`, with `None` for
+    each leaf of the other one.
 
-    The weights are the leaves marked `weight()`; or, where none is marked, every
-    floating-point array.
+    The weights are the leaves marked `weight()`. If none is marked, they are all
+    floating-point arrays.
     """
     entries = list(marked_leaves(model))
     marked = [role == "weight" and is_float(leaf) for _, leaf, role, _ in entries]
@@ -109,20 +110,20 @@ def is_float(leaf: Any) -> bool:
 
 
 def strip_weak_type(leaf: Any) -> Any:
-    """An array without its weak type; anything else as it is.
+    """A floating-point array without its weak type; anything else as it is.
 
-    An optimiser returns strong types from its first step on, which would compile the
-    loop again.
+    An optimiser returns strong types after its first step, so the loop would compile
+    again.
     """
     return lax.convert_element_type(leaf, leaf.dtype) if is_float(leaf) else leaf
 
 
 def _with_weak_type(value: Array) -> Array:
-    """`value` with a weak type, so that the model sees the kind of leaf that it had."""
+    """`value` with a weak type, as the leaf of the original model."""
     like = jnp.asarray(0.0)
     if value.dtype != like.dtype:
         return value
-    # `full_like` is the one public operation that gives a traced number a weak type.
+    # `full_like` is the only public operation that gives a traced number a weak type.
     if value.ndim == 0:
         return lax.full_like(like, value)
     flat = jax.vmap(lambda v: lax.full_like(like, v))(value.ravel())
@@ -132,7 +133,7 @@ def _with_weak_type(value: Array) -> Array:
 def _as_paths(
     trainable: Any, where: str
 ) -> Mapping[str, AbstractConstraint | None] | None:
-    """From path to constraint, or `None` if `trainable` does not name paths."""
+    """A mapping from paths to constraints, or `None` if `trainable` has no paths."""
     if isinstance(trainable, str):
         return {trainable: None}
     several = isinstance(trainable, tuple | list | set | frozenset | Mapping)
@@ -169,7 +170,7 @@ def _chosen_by_path(model, entries, paths, where) -> list[bool]:
             got = f"dtype {node.dtype}" if eqx.is_array(node) else shortened(node)
             raise ValueError(
                 f"{where}: trainable: {prefix!r} must be a floating-point array, or "
-                f"hold some, got {got}. A number becomes one where its field is "
+                f"hold some, got {got}. A number becomes an array if its field is "
                 "declared with delucax.parameter() or delucax.weight()."
             )
     return [path in chosen for path, *_ in entries]
@@ -185,13 +186,14 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
             chosen = []
         if len(chosen) != len(entries):
             raise ValueError(
-                f"{where}: trainable must be a path, paths, a function of a leaf, or "
-                f"booleans in the structure of the model, got {shortened(trainable)}."
+                f"{where}: trainable must be a path, several paths, a function of a "
+                "leaf, or booleans in the structure of the model, got "
+                f"{shortened(trainable)}."
             )
     for (path, leaf, _, _), moves in zip(entries, chosen, strict=True):
         if not isinstance(moves, bool | np.bool_):
             raise ValueError(
-                f"{where}: trainable must say True or False of each leaf, got "
+                f"{where}: trainable must be True or False for each leaf, got "
                 f"{moves!r} for {path!r}."
             )
         if moves and not is_float(leaf):
