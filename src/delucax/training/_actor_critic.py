@@ -45,7 +45,7 @@ class ActorCritic(eqx.Module):
         targets of the critic's own output have mean 0 and standard deviation 1.
 
     **Raises:** `ValueError` if one is not a controller, or the critic has a memory.
-    When it is called, if the critic has more than one output.
+    `value` and `raw` raise it if the critic does not give one output.
 
     !!! example
 
@@ -200,8 +200,7 @@ class Episodes(NamedTuple):
     continues: Any
     """False for the last step of an episode."""
     following: Any
-    """The cost to go after each step: the critic's estimate, or at the end the final
-    cost."""
+    """The cost to go after each step, estimated or, at the end, the final cost."""
     advantages: Float[Array, "*batch steps"]
     total_cost: Any
     targets: Float[Array, "*batch steps"]
@@ -336,8 +335,7 @@ class Moments(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """The moments of the features of each `Standardise` in a model, and of the
-    regression targets of its critic."""
+    """The moments of the features of each `Standardise`, and of the V targets."""
 
     features: list[Moments]
     targets: Moments

@@ -75,8 +75,7 @@ def expected_cost(
     truncate: int | None = None,
     ranges: dict[str, Any] | None = None,
 ) -> Any:
-    r"""A loss for policy training: the mean total cost of a controller over random
-    episodes.
+    r"""A loss for policy training: the mean total cost over random episodes.
 
     $$\ell(\theta, \text{key}) = \frac{1}{B} \sum_{i=1}^{B} J(\theta; x_0^i, w^i)$$
 
@@ -172,8 +171,7 @@ class _ScoredCost(eqx.Module):
 
 
 def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
-    r"""A loss for stochastic policies: the cost of an episode, and the log-probability
-    of its controls.
+    r"""A loss for stochastic policies: the cost and log-probability of an episode.
 
     `loss(controller, key)` returns `(J, {"log_prob": L})`: the total cost $J$ of
     `delucax.rollout(environment, controller, key=key)`, and

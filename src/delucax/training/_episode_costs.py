@@ -102,8 +102,8 @@ def costs_of_plan(environment, ranges, policy, keys):
 
 @eqx.filter_jit
 def first_steps(environment, keys):
-    """Initial states, their stage costs without control, and the next states under
-    several controls."""
+    """Initial states, their costs without control, and the next states under several
+    controls."""
     m, bounds = environment.control_size, environment.control_bounds
     controls = jnp.concatenate([jnp.zeros((1, m)), jr.normal(keys[0], (15, m))])
     if bounds is not None:

@@ -25,8 +25,7 @@ _SPREAD = "log_std"
 
 
 class _Search(eqx.Module):
-    """A normal distribution of models: the mean model, and a log standard deviation for
-    each weight."""
+    """A normal distribution of models: the mean, and the log of each deviation."""
 
     mean: PyTree
     log_std: Array = weight()
@@ -92,8 +91,7 @@ def evolve(
     callbacks: Sequence[Callable[[int, dict[str, float]], Any]] = (),
     throw: bool = True,
 ) -> Fitted:
-    r"""Train a model without derivatives of the loss: separable natural evolution
-    strategies.
+    r"""Train a model without derivatives: separable natural evolution strategies.
 
     Each generation draws weights $\mu + \sigma \odot e_i$ from a normal distribution,
     with $e_i \sim \mathcal{N}(0, I)$ in pairs of opposite sign. The losses are ranked,

@@ -153,7 +153,8 @@ def fit(
         blocks by default. A checkpoint is always written at the end of the run.
     - `throw`: whether to raise if the loss, its gradient or an update is NaN or
         infinite; true by default. If false, training stops before that step, and
-        `fitted.result` says so. In a batch only the seed that failed stops.
+        `fitted.result` is `RESULTS.diverged`. In a batch only the seed that failed
+        stops.
 
     **Returns:** a [`delucax.training.Fitted`][]. With a batch of keys, the arrays of
     the model, the result, and the columns of the history except `step` and `seconds`
@@ -314,8 +315,7 @@ def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
 
 
 def _checked_seeds(key: Any, model: PyTree) -> int | None:
-    """The number of seeds in a batch of keys, or `None` for one key. With a batch,
-    checks that each array of the model has a leading axis over the seeds."""
+    """The number of seeds, after a check of the model's arrays; `None` for one key."""
     typed = eqx.is_array(key) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     raw = eqx.is_array(key) and key.dtype == jnp.uint32 and key.shape[1:] == (2,)
     if not (typed and key.ndim == 1 or raw and key.ndim == 2):

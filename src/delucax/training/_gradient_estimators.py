@@ -164,8 +164,7 @@ class ClippedSamples(eqx.Module):
 
 
 class EvolutionStrategies(eqx.Module):
-    r"""A gradient without derivatives of the loss: finite differences along random
-    directions.
+    r"""The gradient from differences of the loss along random directions.
 
     Antithetic, with $n$ = `samples / 2` directions $e_i \sim \mathcal{N}(0, I)$ and a
     key for each:
@@ -245,9 +244,8 @@ class EvolutionStrategies(eqx.Module):
         loss_key, noise_key, pair_key = jr.split(key, 3)
         draw = lambda key, shape, dtype: jr.normal(key, (n, *shape), dtype)
         noise = optax.tree.random_like(noise_key, weights, draw)
-        # The unperturbed weights are the first of the batch, so the loss is traced only
-        # once. Then come theta + sigma e_1, ..., and if antithetic theta - sigma e_1,
-        # ...
+        # The batch is theta, theta + sigma e_1, ... and, if antithetic, then
+        # theta - sigma e_1, ... It has theta too, so that the loss is traced only once.
         sides = 2 if self.antithetic else 1
         ones, every = jnp.ones(n), jnp.arange(n)
         signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
@@ -279,8 +277,7 @@ class EvolutionStrategies(eqx.Module):
 
 
 class LikelihoodRatio(eqx.Module):
-    r"""The gradient of an expected cost from the log-probability of random draws, as in
-    REINFORCE.
+    r"""The likelihood-ratio gradient of an expected cost, as in REINFORCE.
 
     $$g = \frac{1}{n} \sum_{i=1}^{n} (c_i - b_i)\,
     \frac{\partial \log p_\theta(u_i)}{\partial \theta}$$

@@ -54,19 +54,18 @@ def imitate(
     progress: bool = True,
     throw: bool = True,
 ) -> Fitted:
-    r"""Train a policy to act like an expert, such as MPC, by dataset aggregation
-    (DAgger).
+    r"""Train a policy to act like an expert, such as MPC, by DAgger.
 
-    In the first round the expert runs the episodes. In every later round the policy
-    runs them, and the expert gives the control that it would have applied in each
-    state. So the policy learns to recover from its own mistakes. Each round trains on
-    the states of all rounds so far:
+    DAgger stands for dataset aggregation. In the first round the expert runs the
+    episodes. In every later round the policy runs them, and the expert gives the
+    control that it would have applied in each state. So the policy learns to recover
+    from its own mistakes. Each round trains on the states of all rounds so far:
 
     $$\ell(\theta) = \operatorname{mean}_{(t, y)} \;
     \bigl\lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \bigr\rVert^2$$
 
     Here $\pi_\theta$ is the policy, $u^*$ the expert, and $S$ the diagonal matrix of
-    the standard deviations of the expert's controls.
+    the standard deviations of the expert's controls in the first round.
 
     **Arguments:**
 

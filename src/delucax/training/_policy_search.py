@@ -86,8 +86,7 @@ def _is_better(other: Any, own: Any) -> bool:
 
 
 class PolicySearch:
-    """A search for a policy within a time budget. It keeps the best policy of each
-    structure, and a record of all trainings."""
+    """A search for a policy within a time budget."""
 
     def __init__(
         self,

@@ -58,7 +58,7 @@ class PPO(AbstractActorCriticLoss):
     After termination only the final cost follows. A policy with a memory is trained on
     whole episodes, through its memory; a policy without one on single steps in random
     order. The previous batches set the scale of the critic and each
-    [`delucax.controllers.Standardise`][] of the model. They stay fixed during a batch,
+    [`delucax.controllers.Standardise`][] of the model. These stay fixed during a batch,
     so that $\rho$ starts at 1. One more batch runs before the first step to set them.
 
     In total, `fit` takes `batch * horizon * (1 + steps / (epochs * minibatches))` steps

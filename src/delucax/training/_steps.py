@@ -36,8 +36,7 @@ FAULTS = ("nothing", "loss", "gradient", "update")
 
 
 class State(NamedTuple):
-    """The state of the training loop. With several seeds, arrays have a leading axis
-    over them."""
+    """The state of the training loop, with a leading axis over several seeds."""
 
     values: Values
     optimiser: PyTree
@@ -180,7 +179,7 @@ class Steps(NamedTuple):
         return state, {name: column[:count] for name, column in rows.items()}
 
     def finished(self, state: State) -> PyTree:
-        """The trained model, after `finished` of a surrogate."""
+        """The trained model, as a surrogate's `finished` returns it."""
         model = self.assembly(state.values)
         if not isinstance(self.loss, AbstractSurrogate):
             return model
@@ -260,8 +259,8 @@ class Steps(NamedTuple):
         after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
-        # A loss that is not finite spoils the gradient, and that the update. The first
-        # of them is reported.
+        # A loss that is not finite spoils the gradient, and the gradient spoils the
+        # update. The first fault is reported, because it is the cause.
         fault = jnp.where(_is_finite(moved), np.int32(0), np.int32(3))
         fault = jnp.where(jnp.isfinite(norm), fault, np.int32(2))
         fault = jnp.where(jnp.isfinite(cost), fault, np.int32(1))

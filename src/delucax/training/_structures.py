@@ -31,8 +31,8 @@ def structures(
     """Policies to train, by name.
 
     If the state is observed: a network that corrects the LQR, if there is one, and a
-    network alone. For a family of plants the first is recurrent, and replaces the LQR
-    if there is none. If the state is not observed: a recurrent network alone.
+    network alone. For a family of plants the first network is recurrent, and without an
+    LQR it is the whole policy. If the state is not observed: a recurrent network alone.
     """
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds

@@ -66,8 +66,8 @@ class Synthesis(NamedTuple):
 
         ```text
                 mean  median  worst
-        policy   1.5     2.0    2.0
-        zero     7.0     9.0    9.0
+        policy   1.5     1.5    2.0
+        zero     7.0     7.0    9.0
         ```
     """
 
@@ -124,8 +124,8 @@ def synthesise(
         methods are the gradient of a rollout of at most 200 steps
         ([`delucax.training.ClippedSamples`][]); the same gradient, damped with a time
         constant of a quarter, a tenth or a thirtieth of the rollout; and
-        [`delucax.training.evolve`][], which needs no gradient. If after two trials
-        neither they nor a plan are better than the LQR, the search returns the LQR.
+        [`delucax.training.evolve`][], which needs no gradient. If neither the first two
+        trials nor a plan is better than the LQR, the search returns the LQR.
     3. Refinement. The best third of the trials goes on for three times as long, until
         one is left. The search trains it with the methods that still gain, and then at
         a tenth of the learning rate. When no method gains, it tries to imitate MPC
@@ -141,9 +141,9 @@ def synthesise(
     **Arguments:**
 
     - `environment`: the environment. Its dynamics and cost must be differentiable. If a
-        control has no bounds, a network keeps it within two standard deviations of the
-        LQR's control around zero, or within 2 if there is no LQR. If it has one bound,
-        the range is as wide and begins at the bound.
+        control has no bounds, the range of a network is plus and minus two standard
+        deviations of the LQR's control, or -2 to 2 if there is no LQR. If the control
+        has one bound, the range is as wide and begins at the bound.
     - `key`: a random key.
     - `budget`: the time for everything, with compilation, in seconds; 75 by default, at
         least 5. A training or comparison that has begun is finished. The trials depend

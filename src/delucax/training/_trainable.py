@@ -42,7 +42,7 @@ class Assembly(eqx.Module):
 def partition_trainable(
     model: PyTree, trainable: Any, where: str
 ) -> tuple[Assembly, dict[str, Array]]:
-    """The rest of `model`, and its unconstrained trainable values by path."""
+    """The assembly of `model`, and its unconstrained trainable values by path."""
     leaves_of = marked_leaves(model)
     entries: list[Any] = [(path_string(path), *marks) for path, *marks in leaves_of]
     given: Mapping[str, AbstractConstraint | None] = {}
@@ -119,7 +119,7 @@ def strip_weak_type(leaf: Any) -> Any:
 
 
 def _with_weak_type(value: Array) -> Array:
-    """`value` with a weak type, as the leaf of the original model."""
+    """`value` with a weak type, like the leaf of the original model."""
     like = jnp.asarray(0.0)
     if value.dtype != like.dtype:
         return value
