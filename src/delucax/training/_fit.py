@@ -131,10 +131,10 @@ def fit(
         are drawn without replacement. Each pass over the data has a new order, and
         skips the last rows if they do not fill a batch.
     - `trainable`: which leaves to train; the fields marked [`delucax.weight`][] by
-        default. Pass a path such as `"dynamics.system.length"`; several paths; a
-        dictionary from paths to constraints ([`delucax.positive`][],
-        [`delucax.bounded`][], or `None` for the constraint of the field); a function of
-        a leaf such as `equinox.is_inexact_array`; or booleans in the structure of the
+        default. Or pass one of these. A path such as `"dynamics.system.length"`, or
+        several paths. A dictionary from paths to constraints: [`delucax.positive`][],
+        [`delucax.bounded`][], or `None` for the constraint of the field. A function of
+        a leaf, such as `equinox.is_inexact_array`. Booleans in the structure of the
         model.
     - `gradient`: the gradient estimator, [`delucax.training.analytic`][] by default.
         Others are [`delucax.training.EvolutionStrategies`][],

@@ -120,12 +120,12 @@ def synthesise(
     2. Trials. The structures are a network that corrects the LQR
         ([`delucax.controllers.Residual`][]) and a network alone. With `ranges`, the
         first is recurrent, so that it can identify the plant from past observations. If
-        the state is not observed, a recurrent network alone is tried. The training
-        methods are the gradient of a rollout of at most 200 steps
-        ([`delucax.training.ClippedSamples`][]); the same gradient, damped with a time
-        constant of a quarter, a tenth or a thirtieth of the rollout; and
-        [`delucax.training.evolve`][], which needs no gradient. If neither the first two
-        trials nor a plan is better than the LQR, the search returns the LQR.
+        the state is not observed, a recurrent network alone is tried. There are three
+        kinds of training. The first is the gradient of a rollout of at most 200 steps
+        ([`delucax.training.ClippedSamples`][]). The second is the same gradient, damped
+        with a time constant of a quarter, a tenth or a thirtieth of the rollout. The
+        third is [`delucax.training.evolve`][], which needs no gradient. If neither the
+        first two trials nor a plan is better than the LQR, the search returns the LQR.
     3. Refinement. The best third of the trials goes on for three times as long, until
         one is left. The search trains it with the methods that still gain, and then at
         a tenth of the learning rate. When no method gains, it tries to imitate MPC
