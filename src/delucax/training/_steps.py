@@ -68,7 +68,7 @@ class AbstractSurrogate(eqx.Module):
         import optax
 
         class Steadied(dlx.training.AbstractSurrogate):
-            "Go to 1, but stay close to a running mean."
+            "Move the gain to 1, but keep it close to its running mean."
 
             def init(self, model, key):
                 return model.K
@@ -82,11 +82,11 @@ class AbstractSurrogate(eqx.Module):
         controller = dlx.controllers.Linear(jnp.zeros((1, 2)))
         key = jax.random.key(0)
         fitted = dlx.training.fit(Steadied(), controller, optax.adam(0.1), 10, key=key)
-        fitted.model.K.round(1)
+        fitted.model.K
         ```
 
         ```text
-        Array([[0.6, 0.6]], dtype=float32)
+        Array([[0.786, 0.786]], dtype=float32)
         ```
     """
 
