@@ -153,7 +153,7 @@ def test_wrong_choices_are_named():
             "picks 'plant.steps', which is not a floating-point array: 3",
             lambda leaf: True,
         ),
-        ("True or False of each leaf, got 'yes'", lambda leaf: "yes"),
+        ("True or False for each leaf, got 'yes'", lambda leaf: "yes"),
         ("nothing in Model is trainable: .*picks no leaf", lambda leaf: False),
         ("nothing in Model is trainable", []),
         ("gain must be bounded.*got", {"gain": dlx.bounded(0.0, 1.0)}),

@@ -328,8 +328,9 @@ class PolicySearch:
         return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
 
     def choose(self) -> tuple[str, AbstractController]:
-        """The best of the last policies, zero control and the LQR, on more initial
-        states.
+        """The final choice among the best policies, zero control and the LQR.
+
+        They are compared on more initial states.
 
         Good policies often differ only in a rare episode in which the plant runs away,
         and the first 64 initial states may have none.

@@ -130,7 +130,7 @@ def synthesise(
         one is left. The search trains it with the methods that still gain, and then at
         a tenth of the learning rate. When no method gains, it tries to imitate MPC
         ([`delucax.training.imitate`][]), if MPC costs less.
-    4. Choice. The candidates are the last four policies and the baselines. The
+    4. Choice. The candidates are the four best policies and the baselines. The
         criterion is the mean cost over up to 512 initial states that were not used for
         training. In this mean, costs above 20 times the usual cost grow like their
         logarithm only. If a baseline is as good to half a percent, it is returned.
