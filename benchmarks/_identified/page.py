@@ -60,9 +60,9 @@ _TITLES = {
         "those of [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) (Wigren "
         "and Schoukens, 2013). The file is `SNLS80mV.csv` of its archive with the "
         "columns `V1` and `V2`, compressed as `silverbox/SNLS80mV.csv.gz`. There "
-        "are three tests: the last quarter of the multisine, the whole arrow, and the part of the arrow whose amplitudes occur"
-        " in the estimation half. The error is in mV. Our models are fitted to the "
-        "first 16,000 of the 65,062 samples.",
+        "are three tests: the last quarter of the multisine, the whole arrow, and the "
+        "part of the arrow whose amplitudes occur in the estimation half. The error is "
+        "in mV. Our models are fitted to the first 16,000 of the 65,062 samples.",
     ),
     "bouc_wen": (
         "Bouc-Wen",

@@ -33,7 +33,7 @@ def c(
     """Write a controller, a plant or a function as a program in C.
 
     The files are `NAME.h` and `NAME.c` in `directory`. They are C99 and need no library
-    except the standard `math.h`. The program uses the stack only: it allocates no
+    except that of standard C. The program uses the stack only: it allocates no
     memory. It has no recursion, and no variable that outlives a call. Every loop has a
     bound. Whatever does not depend on the inputs, such as weights, becomes a constant.
 

@@ -17,9 +17,7 @@ from ._expressions import (
     Index,
     known,
     literal,
-    NOTHING,
     row_major,
-    union,
 )
 
 
@@ -230,8 +228,3 @@ def reshaped(value: Value, shape: Sequence[int]) -> Value | None:
         return tuple(indices[pairs[a]] if a in pairs else known(0) for a in range(rank))
 
     return remapped(value, shape, index)
-
-
-def reads_of(parts: Sequence[Expr]) -> frozenset[str]:
-    """The names that the expressions read."""
-    return union(p.reads for p in parts) if parts else NOTHING

@@ -131,7 +131,6 @@ def as_scalar(number: Any, dtype: Any) -> Any:
 
 
 @quickly_compiled
-@quickly_compiled
 @full_precision
 def _solved(problem, start, atol, rtol, max_steps, refinements) -> Solution:
     form = problem.form()

@@ -91,7 +91,7 @@ class Synthesis(NamedTuple):
             order = np.argsort(costs)
             places = {"median": order[len(order) // 2], "worst": order[-1]}
             rows[name] = dict(
-                mean=np.mean(costs), median=np.median(costs), worst=np.max(costs)
+                mean=np.mean(costs), **{what: costs[at] for what, at in places.items()}
             ) | {
                 f"{path}, {what}": values[at]
                 for what, at in places.items()
