@@ -1,6 +1,8 @@
 """Status codes, in one enumeration with those of Diffrax, Optimistix and Lineax."""
 
+import contextlib
 import functools
+import re
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -216,6 +218,36 @@ def or_none(result: Result) -> Result | None:
     return None if result is RESULTS.successful else result
 
 
+def error_if(
+    result: Result, value: Any, failed: Any, words: Callable[[str], str]
+) -> Any:
+    """`value`, or if `failed` an error with the message of `result` in these words: now
+    if all is concrete, else at run time."""
+    index: Any = result._value
+    messages = [words(m) for m in result._enumeration._index_to_message]
+    if isinstance(index, Tracer) or isinstance(failed, Tracer):
+        return eqx.branched_error_if(value, failed, index, messages)
+    if failed:
+        raise RuntimeError(messages[int(index)])
+    return value
+
+
+@contextlib.contextmanager
+def plain_errors(where: str):
+    """An error of a compiled program is raised again with its message alone.
+
+    Its own text holds the lines of the call that was compiled, which may be an earlier
+    one, and hides the message among them.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if said := _SAID.search(str(error)):
+            raise RuntimeError(f"{where}: {said[1]}") from None
+        raise
+
+
+_SAID = re.compile(r"EquinoxRuntimeError: (.*?)\n\n-+\n", re.DOTALL)
 _T = TypeVar("_T")
 
 
@@ -246,9 +278,7 @@ def raise_on_failure(
     result = solution.result
     if isinstance(result._value, Tracer):
         failed = result != RESULTS.successful
-        # Like `result.error_if`, with the name of the function before each message.
-        words = [f"{where}: {m}" for m in result._enumeration._index_to_message]
-        return eqx.branched_error_if(solution, failed, result._value, words)
+        return error_if(result, solution, failed, lambda why: f"{where}: {why}")
     # Compared by NumPy, because JAX would compile a program.
     if np.asarray(result._value) != RESULTS.successful._value:
         words = (

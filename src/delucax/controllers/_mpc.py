@@ -25,13 +25,21 @@ from .._check_models import check_cost_sizes
 from .._controller import AbstractController, Tally
 from .._jax import host_unless_traced, quickly_compiled, xp
 from .._module import as_float_array, function_field
-from .._results import Result, RESULTS
+from .._results import error_if, Result, RESULTS
 from .._typing import Control, Difference, Observation, PRNGKey, RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..planning import AbstractPlanner, Constraints, ILQR, Plan, Problem, SQP, Start
 from ._operating_point import check_state, deviation
+
+
+_REMEDY = (
+    "So there is no usable plan. With MPC(..., throw=False), or with a fallback, the "
+    "run goes on, and `run.incident_times['failed_plan']` is the first time without a "
+    "plan. Call the planner from the state at that time: its error says what is wrong, "
+    "and which constraint is violated most."
+)
 
 
 class MPCState(NamedTuple):
@@ -410,7 +418,7 @@ def _checked(mpc: MPC, u: Control, lost: Array, result: Result) -> Control:
     if throw and (isinstance(lost, Tracer) or lost):
         # Attached to the control, which every caller uses. Attached to the state, JAX
         # would remove the error as dead code if the caller does not read the state.
-        return result.error_if(u, lost)
+        return error_if(result, u, lost, lambda why: f"MPC: {why} {_REMEDY}")
     return u
 
 

@@ -24,7 +24,14 @@ from .._check import (
 from .._controller import AbstractController, initial_state, tallies
 from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array
-from .._results import choose, first_failure, first_of, or_none, RESULTS
+from .._results import (
+    choose,
+    first_failure,
+    first_of,
+    or_none,
+    plain_errors,
+    RESULTS,
+)
 from .._typing import Checkpoint, Numbers, PRNGKey
 from ..disturbances import Zero
 from ..environments import Environment
@@ -172,9 +179,9 @@ def rollout(
         decay = None
     if truncate is not None:
         truncate = check_count(truncate, "truncate", where)
-    trajectory = _rollout(
-        environment, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate
-    )
+    options = keep, checkpoint, decay, truncate
+    with plain_errors(where):
+        trajectory = _rollout(environment, controller, key, x0, w, horizon, *options)
     return checked(trajectory, where, environment.dynamics) if throw else trajectory
 
 
