@@ -1,8 +1,9 @@
 """Leaves by their path: `replace(env, {"dynamics.system.length": 1.2})`."""
 
+import itertools
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -50,10 +51,21 @@ def _nodes_along(tree: Any, path: str) -> list[Any]:
         children = children_of(nodes[-1])
         if part not in children:
             hint = did_you_mean(part, children) if children else "it is a leaf."
+            if places := list(itertools.islice(_places_of(part, nodes[-1]), 3)):
+                hint = f"did you mean {' or '.join(map(repr, places))}?"
             kind = type(nodes[-1]).__name__
             raise ValueError(f"path: {kind} has no {part!r} (in {path!r}); {hint}")
         nodes.append(children[part])
     return nodes
+
+
+def _places_of(name: str, node: Any, levels: int = 4) -> Iterator[str]:
+    """The paths below a node that end in a name."""
+    for part, child in children_of(node).items():
+        if part == name:
+            yield part
+        elif levels:
+            yield from (f"{part}.{p}" for p in _places_of(name, child, levels - 1))
 
 
 def with_values(tree: _T, values: Mapping[str, Any]) -> _T:

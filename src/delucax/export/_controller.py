@@ -42,10 +42,12 @@ def export_controller(
     most: int | None,
 ) -> Any:
     """The header and the source of a controller, and the values for its report."""
-    traced = TracedController(controller, dtype, example, key)
-    (m,) = traced.controls
     if plant is not None:
         check_instance(plant, AbstractPlant, "plant", "export.c")
+    size = None if plant is None else plant.observation_size
+    traced = TracedController(controller, dtype, example, key, size)
+    (m,) = traced.controls
+    if plant is not None:
         if plant.control_size != m:
             raise ValueError(
                 f"export.c: plant must have {m} controls, as many as the controller "

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .._files import as_path
-from .._message import did_you_mean
+from .._message import did_you_mean, shortened
 from ._compiler import find_compiler, FLAGS, shared_library
 from ._description import described, Description
 from ._loaded import LoadedController, LoadedFunction
@@ -85,9 +85,11 @@ def _find(folder: Path, name: str | None, where: str) -> Description:
         with contextlib.suppress(ValueError):  # the header of another program
             exports[header.stem] = described(header)
     if not exports:
+        below = [str(h.parent) for h in folder.glob("*/*.h")]
+        hint = f" Its folders with headers are {shortened(below)}." if below else ""
         raise ValueError(
             f"{where}: directory must hold what delucax.export.c wrote, got "
-            f"{str(folder)!r}, which holds no export."
+            f"{str(folder)!r}, which holds no export.{hint}"
         )
     if name is None and len(exports) > 1:
         raise ValueError(

@@ -28,7 +28,14 @@ class TracedController:
     - `controls`: the shape of a control.
     """
 
-    def __init__(self, controller: Any, dtype: np.dtype, example: Any, key: Any):
+    def __init__(
+        self,
+        controller: Any,
+        dtype: np.dtype,
+        example: Any,
+        key: Any,
+        size: int | None = None,
+    ):
         self.dtype = dtype
         with precision(dtype):
             controller = cast(controller, dtype)
@@ -81,7 +88,7 @@ class TracedController:
 
             number = jax.ShapeDtypeStruct((), dtype)
             state = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self.start]
-            y = _observation(step, number, state, dtype, example)
+            y = _observation(step, number, state, dtype, example, size)
             self.step = trace(step, number, y, *state, draws=True)
             self.observations, self.controls = y.shape[0], self.step.outs[0].shape
             u = jax.ShapeDtypeStruct(self.controls, dtype)
@@ -119,8 +126,11 @@ def _first_state(controller: AbstractController, dtype: np.dtype, key: Any) -> A
     return cast(state, dtype)
 
 
-def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: Any):
-    """The shape of an observation: as in the example, else the only size that fits."""
+def _observation(
+    step: Any, number: Any, state: Any, dtype: np.dtype, example: Any, size: int | None
+) -> Any:
+    """The shape of an observation: as in the example, else the only size that fits,
+    else the `size` of the plant's observation."""
     if example is not None:
         y = np.asarray(example) if not hasattr(example, "shape") else example
         if len(y.shape) != 1:
@@ -141,7 +151,9 @@ def _observation(step: Any, number: Any, state: Any, dtype: np.dtype, example: A
             break
     if len(fitting) == 1:
         return fitting[0]
+    if size is not None:
+        return jax.ShapeDtypeStruct((size,), dtype)
     raise ValueError(
-        "export.c: example must be an observation (zeros of its shape are enough), "
-        "because the controller does not fix its size."
+        "export.c: example must be an observation (zeros of its shape are enough), or "
+        "plant must be given, because the controller does not fix the size."
     )
