@@ -185,7 +185,13 @@ class PolicySearch:
             return None
         try:
             return local_lqr(self.environment)
-        except (ValueError, RuntimeError):
+        except (ValueError, RuntimeError) as error:
+            warnings.warn(
+                "synthesise: no LQR and no network around one is tried, because there "
+                f"is no LQR: {error} If the plant can rest somewhere, define its "
+                "`equilibrium`, or give the cost a target.",
+                stacklevel=4,
+            )
             return None
 
     def is_settled(self) -> bool:
