@@ -89,9 +89,10 @@ class Synthesis(NamedTuple):
         rows = {}
         for name, costs in self.costs.items():
             order = np.argsort(costs)
+            # Of an even number of episodes, the upper one of the two in the middle.
             places = {"median": order[len(order) // 2], "worst": order[-1]}
             rows[name] = dict(
-                mean=np.mean(costs), **{what: costs[at] for what, at in places.items()}
+                mean=np.mean(costs), median=np.median(costs), worst=np.max(costs)
             ) | {
                 f"{path}, {what}": values[at]
                 for what, at in places.items()

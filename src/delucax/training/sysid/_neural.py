@@ -149,8 +149,8 @@ def windows(
         import delucax as dlx
         import jax.numpy as jnp
 
-        states, controls = jnp.zeros((101, 2)), jnp.zeros((100, 1))
-        record = dlx.training.sysid.Record(states, controls, dt=0.05)
+        states = jnp.arange(202.0).reshape(101, 2)
+        record = dlx.training.sysid.Record(states, jnp.zeros((100, 1)), dt=0.05)
         data = dlx.training.sysid.windows(record, 10)
         data[1].shape
         ```
