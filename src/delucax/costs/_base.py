@@ -26,12 +26,13 @@ from ..systems import AbstractPlant
 class AbstractCost(eqx.Module):
     r"""A cost: a stage cost $c(t, x, u)$ and a final cost.
 
-    A cost is minus a reward. The stage cost is charged once per step, at the current
-    state and the control that was applied. The final cost is charged once: at the last
-    state, or at the state that terminates the episode.
+    A cost is minus a reward. The stage cost is charged once per step, for the current
+    state and the applied control. The final cost is charged once: at the last state, or
+    at the state that terminates the episode.
 
-    Subclass it and write `__call__`; override `final` for a final cost. Add two costs
-    with `+`, and multiply a cost by a number with `*`.
+    To define your own cost, subclass `AbstractCost` and write `__call__`, which returns
+    the stage cost. Override `final` to add a final cost. Add two costs with `+`, and
+    multiply a cost by a number with `*`.
 
     **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
     or violates its constraint.
@@ -62,11 +63,11 @@ class AbstractCost(eqx.Module):
     @property
     def targets(self) -> tuple[Array | None, Array | None] | None:
         """The targets `(x, u)` of the cost: the state and the control at which it is
-        smallest. Each is `None` if the cost has no such target. The default, for a cost
-        without any fixed target, is a single `None`.
+        smallest. `x` or `u` is `None` if the cost has no target for it. For a cost
+        without any fixed target, `targets` is a single `None`; this is the default.
 
         A cost made of other costs takes the first target that one of them has. Planners
-        use the targets for their default start; see
+        use the targets for their default initial plan; see
         [`delucax.planning.Start.default`][].
         """
         named = [part.targets for part in parts_of(self, AbstractCost)]
@@ -80,13 +81,15 @@ class AbstractCost(eqx.Module):
     def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
         """The state and the control about which to regulate a plant.
 
-        These are the `targets` if the cost has both, else the equilibrium of the plant,
-        else the one target of the cost, with zeros for the other.
+        The set point is the `targets` of the cost if the cost has both a target state
+        and a target control. Otherwise it is the equilibrium of the plant. If the plant
+        defines no equilibrium either, it is the one target that the cost has, with
+        zeros for the other one.
 
         **Arguments:** `plant`: a system or dynamics.
 
-        **Returns:** `(x, u)`, shapes `(n,)` and `(m,)`; or `None` if none of these
-        exists, or the sizes do not fit the plant.
+        **Returns:** `(x, u)`, shapes `(n,)` and `(m,)`; or `None` if the cost has no
+        target and the plant no equilibrium, or if the sizes do not fit the plant.
         """
         x, u = targets = self.targets or (None, None)
         if x is None or u is None:
@@ -153,7 +156,7 @@ class Function(AbstractCost):
     - `stage`: the stage cost, a function `(t, x, u) -> scalar`.
     - `final_cost`: the final cost, a function `(t, x) -> scalar`; zero by default.
 
-    **Raises:** `ValueError` if one is not a function.
+    **Raises:** `ValueError` if `stage` or `final_cost` is not a function.
 
     !!! example
 
@@ -190,7 +193,8 @@ class Sum(AbstractCost):
 
     - `*terms`: the costs, at least one.
 
-    **Raises:** `ValueError` if there is no cost, or one is not an `AbstractCost`.
+    **Raises:** `ValueError` if no cost is given, or if an argument is not an
+    `AbstractCost`.
 
     !!! example
 
@@ -276,7 +280,7 @@ class Rate(AbstractCost):
     **Arguments:**
 
     - `cost`: the cost per unit of time, an [`delucax.AbstractCost`][].
-    - `dt`: the step $\Delta t$, in units of time.
+    - `dt`: the time step $\Delta t$, in units of time.
 
     **Raises:** `ValueError` if `cost` is not a cost, or `dt` is not positive.
 

@@ -15,16 +15,18 @@ class Arrival(AbstractCost):
     r"""A sparse cost: a constant $a$ and an effort $b\, u^\top u$ per step, and a final
     cost $c$ if the last state is a goal.
 
-    Most Gym tasks have such a cost. Its gradient with respect to the state is 0 almost
-    everywhere, so gradient-based planners and policy gradients learn nothing from it.
+    Most Gym tasks have a sparse cost of this kind. The gradient of a sparse cost with
+    respect to the state is 0 almost everywhere, so gradient-based planners and policy
+    gradients learn nothing from it.
 
     **Arguments:**
 
-    - `reached`: whether the state is a goal, a function `(t, x) -> bool`. Usually it is
-        the `terminated` of the environment. Never by default.
+    - `reached`: a function `(t, x) -> bool` that says whether the state is a goal.
+        Usually `reached` is the `terminated` function of the environment. Never by
+        default.
     - `step_cost`: $a$, 1 by default.
     - `control_weight`: $b$, 0 by default.
-    - `arrival_cost`: $c$, 0 by default. Give a negative number for a reward.
+    - `arrival_cost`: $c$, 0 by default. Pass a negative number to reward the arrival.
 
     **Raises:** `ValueError` if a number is not finite.
 
@@ -103,15 +105,15 @@ class PendulumCost(AbstractCost):
 
 
 class AcrobotHeight(AbstractCost):
-    r"""A smooth cost for the acrobot: the squared distance in height of its tip from
+    r"""A smooth cost for the acrobot: the squared height by which its tip is below
     upright.
 
     $$q(x) + b\, \tau^2, \qquad q(x) = (2 + \cos\theta_1 + \cos(\theta_1 + \theta_2))^2
     + a\, (\dot\theta_1^2 + \dot\theta_2^2)$$
 
-    The final cost is $c\, q(x)$. The cost $q$ is 0 upright and at rest, and 16 where
-    both links hang at rest. Use this cost for planning and policy gradients, because
-    the reward of Gym's Acrobot-v1 has no gradient.
+    The final cost is $c\, q(x)$. The cost $q$ is 0 when both links are upright and at
+    rest, and 16 when both links hang at rest. Use this cost for planning and policy
+    gradients, because the reward of Gym's Acrobot-v1 has no gradient.
 
     **Arguments:**
 

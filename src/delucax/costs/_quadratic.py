@@ -85,8 +85,8 @@ class Quadratic(_AbstractQuadratic):
     - `difference`: a function `(x, x_target) -> deviation` that replaces $x - x^*$,
         such as `system.difference`, which wraps angles; subtraction by default.
 
-    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if a
-    target does not fit.
+    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if the
+    size of a target is wrong.
 
     !!! example
 
@@ -153,7 +153,7 @@ class Quadratic(_AbstractQuadratic):
 
 
 class Tracking(_AbstractQuadratic):
-    r"""A quadratic cost on the error from a reference that moves.
+    r"""A quadratic cost of the error with which a plant tracks a moving reference.
 
     $$e^\top Q e + u^\top R u, \qquad e = h(x) - r(t)$$
 
@@ -170,8 +170,8 @@ class Tracking(_AbstractQuadratic):
     - `output`: $h$, a function of the state to the vector that should follow the
         reference, shape `(p,)`; the state itself by default.
 
-    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or does
-    not fit what it weighs.
+    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if its
+    size does not fit the error or the control.
 
     !!! example
 

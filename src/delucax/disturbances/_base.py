@@ -25,12 +25,13 @@ class AbstractDisturbance(eqx.Module):
     r"""A disturbance: a sequence $w_0, \dots, w_{T-1}$, drawn for the whole episode at
     once.
 
-    Subclass it, give `size` and write `sequence`. Add two disturbances with `+`, and
-    limit one to a window of time with `between`.
+    To define your own disturbance, subclass `AbstractDisturbance`, set `size` and write
+    `sequence`. Add two disturbances with `+`, and limit one to a window of time with
+    `between`.
 
     **Attributes:**
 
-    - `size`: entries per step.
+    - `size`: the number of entries of the disturbance at each step.
 
     **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
     or violates its constraint.
@@ -66,7 +67,8 @@ class AbstractDisturbance(eqx.Module):
     @property
     def recorded_steps(self) -> int | None:
         """The largest number of steps that `sequence` can give, or `None` if there is
-        no limit. By default, that of the shortest disturbance among the fields.
+        no limit. By default, it is the smallest number among the disturbances in the
+        fields.
         """
         steps = [part.recorded_steps for part in parts_of(self, AbstractDisturbance)]
         return min((n for n in steps if n is not None), default=None)
@@ -79,8 +81,8 @@ class AbstractDisturbance(eqx.Module):
 
         - `key`: a random key, or `None` for a deterministic disturbance.
         - `times`: the start of each step, shape `(T,)`, increasing. A rollout passes
-            `0, dt, 2 dt, ...`, rounded to the precision of the state. Compare times to
-            the nearest step, not exactly.
+            `0, dt, 2 dt, ...`, rounded to the precision of the state. Because of this
+            rounding, compare times to the nearest step, not exactly.
 
         **Returns:** shape `(T, size)`.
         """
@@ -90,14 +92,14 @@ class AbstractDisturbance(eqx.Module):
 
         **Arguments:**
 
-        - `key`: a random key, or `None`; passed to `sequence`.
+        - `key`: a random key, or `None`; `draw` passes it to `sequence`.
         - `dt`: the control interval, a scalar.
         - `steps`: the number of steps.
         - `dtype`: the dtype of the times.
 
         **Returns:** shape `(steps, size)`.
 
-        **Raises:** `ValueError` if `sequence` returns another shape.
+        **Raises:** `ValueError` if `sequence` returns an array of another shape.
         """
         # At least two times, because Brownian motion infers the interval from them,
         # unless a recording has only one.
@@ -114,19 +116,19 @@ class AbstractDisturbance(eqx.Module):
         return w[:steps]
 
     def between(self, start: ArrayLike, stop: ArrayLike) -> "AbstractDisturbance":
-        r"""This disturbance inside a window of time, $\mathrm{start} \le t <
-        \mathrm{stop}$, and zero outside.
+        r"""A disturbance that is this one inside a window of time, $\mathrm{start} \le
+        t < \mathrm{stop}$, and zero outside.
 
-        An end of the window that is within rounding of a step is moved to that step, so
-        that a window of 5 steps acts on 5 steps.
+        An end of the window that differs from the time of a step only by rounding is
+        moved to that step, so that a window of 5 steps acts on 5 steps.
 
         **Arguments:** `start`, `stop`: the ends of the window, in units of time.
 
         **Returns:** the disturbance.
 
-        **Raises:** `ValueError` if `stop` is before `start`. Also if the horizon has
-        more than 2^22 steps in single precision, because its times are then too coarse
-        for the steps.
+        **Raises:** `ValueError` if `stop` is before `start`. The disturbance also
+        raises a `ValueError` if the horizon has more than 2^22 steps in single
+        precision, because single-precision times cannot tell so many steps apart.
         """
         return _Window(self, start, stop)
 
@@ -141,15 +143,15 @@ class AbstractDisturbance(eqx.Module):
 
 
 class Sum(AbstractDisturbance):
-    """The sum of several disturbances. Each term is drawn with a key of its own.
+    """The sum of several disturbances. Each term is drawn with its own random key.
     `disturbance + other` makes one.
 
     **Arguments:**
 
     - `*terms`: disturbances of the same size, at least one.
 
-    **Raises:** `ValueError` if there is none, if one is not an `AbstractDisturbance`,
-    or if sizes differ.
+    **Raises:** `ValueError` if no disturbance is given, if an argument is not an
+    `AbstractDisturbance`, or if the sizes differ.
 
     !!! example
 

@@ -20,7 +20,7 @@ class Zero(AbstractDisturbance):
 
     **Arguments:**
 
-    - `size`: entries per step.
+    - `size`: the number of entries of the disturbance at each step.
 
     **Raises:** `ValueError` if `size` is below 1.
 
@@ -55,7 +55,8 @@ class Constant(AbstractEntrywise):
     **Arguments:**
 
     - `value`: a number, or shape `(size,)`.
-    - `size`: entries per step; follows from `value` if that is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if `value` is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -85,14 +86,15 @@ class Constant(AbstractEntrywise):
 def shock(
     value: Any, start: Any, duration: Any, *, size: int | None = None
 ) -> AbstractDisturbance:
-    """A push: a constant disturbance for a while, and zero before and after.
+    """A push: a disturbance that is constant for a while, and zero before and after.
 
     **Arguments:**
 
     - `value`: a number, or shape `(size,)`.
-    - `start`: when it starts, in units of time.
-    - `duration`: how long it lasts, in units of time.
-    - `size`: entries per step; follows from `value` if that is a vector.
+    - `start`: the time at which the push starts, in units of time.
+    - `duration`: how long the push lasts, in units of time.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if `value` is a vector.
 
     **Returns:** the disturbance.
 
@@ -126,13 +128,14 @@ class Sinusoid(AbstractEntrywise):
 
     $$w_k = a \sin(2 \pi f t_k + \phi) + b$$
 
-    **Arguments:** each is a number or has shape `(size,)`.
+    **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `amplitude`: $a$.
     - `frequency`: $f$, in hertz if time is in seconds.
     - `phase`: $\phi$ [rad], 0 by default.
     - `offset`: $b$, 0 by default.
-    - `size`: entries per step; follows from the others if one is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -174,20 +177,22 @@ class Square(AbstractEntrywise):
     """A square wave: `+amplitude` in the first part of each period, `-amplitude` in the
     rest.
 
-    A period that is within rounding of a whole number of steps lasts that number of
-    steps; the same holds for its first part. The gradient with respect to `period` and
-    `duty` is zero almost everywhere.
+    A period that differs from a whole number of steps only by rounding lasts exactly
+    that number of steps. The first part of a period is rounded in the same way. The
+    gradient with respect to `period` and `duty` is zero almost everywhere.
 
-    **Arguments:** each is a number or has shape `(size,)`.
+    **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
-    - `amplitude`: half of the distance between the two values.
+    - `amplitude`: half the difference between the two values of the wave.
     - `period`: in units of time, positive.
     - `duty`: the fraction of the period at `+amplitude`, from 0 to 1; 0.5 by default.
-    - `size`: entries per step; follows from the others if one is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
-    positive, or `duty` is not between 0 and 1. Also if the horizon has more than 2^22
-    steps in single precision, because its times are then too coarse for the steps.
+    positive, or `duty` is not between 0 and 1. `sequence` also raises a `ValueError` if
+    the horizon has more than 2^22 steps in single precision, because single-precision
+    times cannot tell so many steps apart.
 
     !!! example
 

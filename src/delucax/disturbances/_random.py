@@ -20,11 +20,12 @@ from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 class Gaussian(AbstractEntrywise):
     r"""Independent normal noise, $w_k \sim \mathcal{N}(\mu, \sigma^2)$.
 
-    **Arguments:** each is a number or has shape `(size,)`.
+    **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `std`: the standard deviation $\sigma$.
     - `mean`: $\mu$, 0 by default.
-    - `size`: entries per step; follows from the others if one is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` is
     negative.
@@ -64,10 +65,11 @@ class Gaussian(AbstractEntrywise):
 class Uniform(AbstractEntrywise):
     r"""Independent uniform noise, $w_k \sim \mathcal{U}(\mathrm{low}, \mathrm{high})$.
 
-    **Arguments:** each is a number or has shape `(size,)`.
+    **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `low`, `high`: the ends of the interval.
-    - `size`: entries per step; follows from the others if one is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `high` is
     below `low`.
@@ -110,11 +112,12 @@ class RandomWalk(AbstractEntrywise):
     $$w_k = \operatorname{clip}(w_{k-1} + \sigma e_k, -b, b), \qquad
     e_k \sim \mathcal{N}(0, 1), \qquad w_{-1} = 0$$
 
-    **Arguments:** each is a number or has shape `(size,)`.
+    **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `std`: $\sigma$, the standard deviation of a step, 0.3 by default.
     - `bound`: $b$, 1 by default.
-    - `size`: entries per step; follows from the others if one is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave it
+        out if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` or
     `bound` is negative.
@@ -168,14 +171,17 @@ class Brownian(AbstractDisturbance):
     **Arguments:**
 
     - `size`: the number of Brownian motions.
-    - `dt`: the control interval $\Delta t$, in units of time. By default it is the
-        distance between the times of the sequence, which then needs at least two.
-    - `substeps`: solver steps per interval, 1 by default. `w` holds the increments of
-        all substeps, one after the other.
+    - `dt`: the control interval $\Delta t$, in units of time. By default, `sequence`
+        takes the interval between its first times, of which there must then be at least
+        two.
+    - `substeps`: the number of solver steps per control interval, 1 by default. The
+        disturbance holds the increments of all substeps of an interval, one after the
+        other.
 
     **Raises:** `ValueError` if `size` or `substeps` is below 1 or `dt` is not positive.
-    If `dt` is left out, also if there are fewer than two times, or if late times are
-    too coarse to give it.
+    If `dt` is left out, `sequence` also raises a `ValueError` if there are fewer than
+    two times, or if the times are so large that rounding hides the interval between
+    them.
 
     !!! example
 

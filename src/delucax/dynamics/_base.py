@@ -21,12 +21,13 @@ from ..systems import AbstractPlant, AbstractSystem
 class AbstractDynamics(AbstractPlant):
     r"""Dynamics in discrete time, $x_{k+1} = F(t_k, x_k, u_k, w_k)$.
 
-    Environments, planners and controllers step such dynamics. Subclass it, give `dt`
-    and the names of states and controls, and write `advance`.
+    Environments, planners and controllers compute the next state of a plant with these
+    dynamics. To define your own, subclass `AbstractDynamics`, set `dt` and the names of
+    the states and controls, and write `advance`.
 
     **Attributes:**
 
-    - `dt`: the step, in units of time, a scalar.
+    - `dt`: the time step, in units of time, a scalar.
 
     **Raises:** `ValueError` at construction if `dt` is not a positive number, or if a
     [`delucax.parameter`][] is not finite or violates its constraint.
@@ -57,9 +58,9 @@ class AbstractDynamics(AbstractPlant):
 
     @property
     def increments(self) -> int:
-        """The number of Brownian increments that `w` holds, one after the other, all of
-        the same variance. Each has `disturbance_size / increments` entries. By default
-        1 if `noise` is `"brownian"`, else 0.
+        """The number of Brownian increments that `w` holds, one after the other. They
+        have the same variance. Each has `disturbance_size / increments` entries. By
+        default, the number is 1 if `noise` is `"brownian"`, else 0.
         """
         return 1 if self.noise == "brownian" else 0
 
@@ -69,7 +70,7 @@ class AbstractDynamics(AbstractPlant):
     ) -> tuple[Array, Result]:
         """One step and its status.
 
-        `result` is the status of the solver alone. `x_next` is not checked: if the
+        `result` says only whether the solver succeeded. `x_next` is not checked: if the
         state is NaN, or so large that it overflows, `x_next` is not finite although
         `result` is a success. [`delucax.rollout`][] checks for that.
 
@@ -94,14 +95,17 @@ class AbstractDynamics(AbstractPlant):
     ) -> tuple[Array, Result, Any]:
         """One step, its status and its events.
 
-        If you wrap dynamics that have events, write it besides `advance`.
+        If you wrap dynamics that have events, write this method in addition to
+        `advance`.
 
         **Arguments:** `t`, `x`, `u`, `w`: as in `advance`.
 
-        **Returns:** `(x_next, result, events)`: as in `advance`, and
-        [`delucax.dynamics.Events`][], or `None` for dynamics without events.
+        **Returns:** `(x_next, result, events)`. The first two are as in `advance`;
+        `events` is a [`delucax.dynamics.Events`][], or `None` for dynamics without
+        events.
 
-        **Raises:** `ValueError` if the dynamics have events and do not write it.
+        **Raises:** `ValueError` if the dynamics have events but do not define this
+        method.
         """
         if self.event_names:
             raise ValueError(
@@ -116,11 +120,12 @@ class AbstractDynamics(AbstractPlant):
         """A sentence that says where a step of a hybrid system failed, for an error
         message.
 
-        **Arguments:** `times`, `states`, `controls`, `w`: those at the start of each
-            step, with a leading axis over the steps; `w` may be `None`.
+        **Arguments:** `times`, `states`, `controls`, `w`: the time, state, control and
+            disturbance at the start of each step, with a leading axis over the steps;
+            `w` may be `None`.
 
-        **Returns:** the sentence about the first step that failed; an empty string if
-        none did.
+        **Returns:** the sentence about the first step that failed, or an empty string
+        if no step failed.
         """
         _, results, events = _each_step(self, times, states, controls, w)
         bad = np.asarray(results != RESULTS.successful)
@@ -169,8 +174,9 @@ def open_loop(
 
     $$x_{k+1} = F(t_0 + k\, \Delta t, x_k, u_k, w_k)$$
 
-    Use it for planning and identification. It is already compiled: call it directly. It
-    is differentiable with respect to every array.
+    Use it for planning and identification. `open_loop` is already compiled: call it
+    directly, without `jax.jit`. The states are differentiable with respect to every
+    array in the arguments.
 
     **Arguments:**
 
@@ -252,9 +258,8 @@ def _forwarded_units(what: str) -> Any:
         same = getattr(self, f"{what}_names") == getattr(self._inside, f"{what}_names")
         return getattr(self._inside, f"{what}_units") if same else ()
 
-    return property(
-        units, doc="As in the wrapped plant if the names are the same, else ()."
-    )
+    return property( units, doc="The units of the wrapped plant if its names are the
+        same, else ()." )
 
 
 class Forwarding(AbstractDynamics):
@@ -300,12 +305,14 @@ class Forwarding(AbstractDynamics):
 
 
 class AbstractDiscretization(Forwarding):
-    """Dynamics that step a continuous-time system, in a field `system`. Names, units,
-    sensor and equilibrium are those of the system.
+    """Discrete-time dynamics of a continuous-time system. The field `system` holds this
+    system, and the dynamics have the names, units, sensor and equilibrium of the
+    system.
 
-    Subclass it, declare the fields `system` and `dt`, and write `advance`. There, `w`
-    has to act as the `noise` of the system says. You rarely need to:
-    [`delucax.Discretized`][] takes any system and any solver.
+    Subclass it, declare the fields `system` and `dt`, and write `advance`. In
+    `advance`, the disturbance `w` must act as the property `noise` of the system says.
+    You rarely need your own subclass, because [`delucax.Discretized`][] takes any
+    system and any solver.
 
     !!! example
 
@@ -347,8 +354,8 @@ class AbstractDiscretization(Forwarding):
 
 
 class AbstractWrapper(Forwarding):
-    """Dynamics around other dynamics. It forwards everything that a subclass does not
-    override to the wrapped dynamics, in a field `dynamics`.
+    """Dynamics around other dynamics. The field `dynamics` holds the wrapped dynamics,
+    and everything that a subclass does not override is taken from them.
 
     Subclass it, declare the field `dynamics`, and write `advance`. If the wrapper adds
     entries to the state, also give `state_names`, `observe`, `difference` and

@@ -57,71 +57,83 @@ class Discretized(AbstractDiscretization):
     $$x_{k+1} = x_k + \int_{t_k}^{t_k + \Delta t} f(s, x(s), u_k, w_k)\, \mathrm{d}s$$
 
     After the integration, the system's `project` is applied. If the system has
-    `disturbance_names`, `w` enters the field and is held over the interval. If it has
-    none, `w` is added to the projected state, which may move the state off the manifold
-    of `project` until the next step.
+    `disturbance_names`, the disturbance `w` enters the vector field and is held over
+    the interval. If the system has no `disturbance_names`, `w` is added to the
+    projected state, which may move the state off the manifold of `project` until the
+    next step.
 
     **Fixed steps** (the default): the interval is cut into `substeps` equal steps of
-    `solver`. Explicit Runge-Kutta methods and diagonally implicit ones work.
+    `solver`. The solver may be an explicit or a diagonally implicit Runge-Kutta method.
 
-    **Adaptive steps** (with a `stepsize_controller`): each interval is one
-    `diffrax.diffeqsolve`, and `adjoint` decides how its gradient is computed.
+    **Adaptive steps** (with a `stepsize_controller`): each interval is solved by one
+    call of `diffrax.diffeqsolve`, and `adjoint` decides how the gradient of this solve
+    is computed.
 
-    **Late times:** the interval is integrated in its own time, from 0, so that an
-    autonomous step is the same at any `t`. A time-dependent field or diffusion is
-    evaluated at `t + s`. Below double precision this sum is rounded, by up to 5e-4 at a
-    time of 1e4 in float32. The field is then corrected for the rounding error with its
-    first two derivatives with respect to time. If the second forward-mode derivative
-    does not exist, as for a `jax.custom_vjp` of time, there is no correction.
+    **Late times:** each interval is integrated in a local time $s$ that starts at 0, so
+    that a step of an autonomous system has the same result at any start time `t`. A
+    time-dependent vector field or diffusion is evaluated at `t + s`. Below double
+    precision, the sum `t + s` is rounded: in float32 the error is up to 5e-4 at a time
+    of 1e4. The vector field is then corrected for this rounding error with its first
+    two derivatives with respect to time. If the second forward-mode derivative does not
+    exist, for example because the field uses a `jax.custom_vjp` of time, there is no
+    correction.
 
     **Diffusion:** if the system has a `diffusion`, `w` holds the Brownian increments of
     all substeps, one after the other, each with the variance `dt / substeps`. Use one
-    of the solvers Euler (Euler-Maruyama) or ItoMilstein for Itô's interpretation, and
-    EulerHeun, Heun, Midpoint, Ralston or StratonovichMilstein for Stratonovich's.
+    of the Diffrax solvers Euler (Euler-Maruyama) or ItoMilstein for Itô's
+    interpretation, and EulerHeun, Heun, Midpoint, Ralston or StratonovichMilstein for
+    Stratonovich's.
 
     **Events:** a [`delucax.systems.AbstractHybridSystem`][] is integrated from event to
     event.
 
-    - *Detection.* A cubic through each guard and its rate at both ends of a step
-        detects crossings, also those that go there and back within the step. The event
-        is then located to rounding by shortening the step, so that states keep the
-        order of the solver.
-    - *Limits.* Up to `max_events` events may fall in one interval. Crossings of guards
-        that are not enabled count too. If several guards cross at once, the event that
-        is first in `event_names` fires; the others are checked after its reset.
-    - *Derivatives* are those of the computed trajectory, in both modes and to any
-        order. The time of an event moves with the state (the saltation matrix).
+    - *Detection.* Each guard is interpolated over a step by a cubic, from its values
+        and its time derivatives at both ends of the step. The cubic detects where the
+        guard crosses zero, even if the guard crosses zero and comes back within the
+        same step. The step is then shortened until it ends at the event, up to
+        rounding, so that the states keep the order of the solver.
+    - *Limits.* Up to `max_events` events may happen in one control interval. A crossing
+        of a guard whose event is not enabled counts as one of them. If several guards
+        cross at once, the event that is first in `event_names` fires; the other events
+        are checked after the reset of the first one.
+    - *Derivatives* are the exact derivatives of the computed trajectory, in forward and
+        reverse mode and to any order. They take into account that the time of an event
+        changes with the state (the saltation matrix).
 
     If something goes wrong, the status says so:
 
-    - `RESULTS.too_many_events`: events accumulate, or a reset leaves its guard at zero.
-        The state is held after the last event that was handled.
+    - `RESULTS.too_many_events`: there are more than `max_events` events in the
+        interval, because they accumulate or because a reset leaves its guard at zero.
+        The state then stays at its value after the last event that was handled.
     - `RESULTS.beyond_guard`: the state is beyond an enabled guard at the start of the
-        interval or after a reset. Its event does not fire until the guard has come
-        back.
-    - `RESULTS.grazing`: a guard hardly crosses zero. The state is right, and
-        derivatives are NaN. If a guard comes closer to zero than the error of the
-        cubic without crossing, the event may fire or not.
+        interval or after a reset. The event of this guard does not fire until the guard
+        has returned to the side where it should be.
+    - `RESULTS.grazing`: a guard hardly crosses zero. The state is still correct, but
+        the derivatives are NaN. If a guard does not cross zero but comes closer to zero
+        than the error of the cubic interpolation, the event may or may not fire.
     - `RESULTS.unknown_mode`: the mode is not one of the system's modes.
 
     Additive disturbances make the state jump at the end of an interval, possibly beyond
-    a guard. Give the system `disturbance_names` to hold them in the field instead. The
-    field must be defined a little beyond each guard.
+    a guard. To avoid such jumps, give the system `disturbance_names`: disturbances then
+    enter the vector field and are held over the interval. The vector field must be
+    defined a little beyond each guard, because a step may pass the guard before the
+    event is located.
 
     **Arguments:**
 
     - `system`: the continuous-time system.
-    - `dt`: the control interval $\Delta t$, in units of time, a positive number. It is
-        an array leaf, so changing it does not compile again.
+    - `dt`: the control interval $\Delta t$, in units of time, a positive number. `dt`
+        is an array leaf, so a new value does not cause a new compilation.
     - `solver`: a Diffrax solver; [`delucax.dynamics.RK4`][] by default, and
         `diffrax.Euler` for a system with a diffusion.
-    - `substeps`: solver steps per interval, 1 by default; for fixed steps only.
-    - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
-        `None` (default) for fixed steps.
+    - `substeps`: the number of solver steps per control interval, 1 by default; for
+        fixed steps only.
+    - `stepsize_controller`: a step-size controller of Diffrax, such as
+        `diffrax.PIDController(rtol=1e-6, atol=1e-8)`; `None` (default) for fixed steps.
     - `adjoint`: any `diffrax.AbstractAdjoint`, for adaptive steps only;
         `diffrax.RecursiveCheckpointAdjoint()` by default. Fixed steps are
-        differentiated directly. `diffrax.BacksolveAdjoint()` raises if you ask for a
-        gradient with respect to `dt`.
+        differentiated directly. `diffrax.BacksolveAdjoint()` raises an error if you ask
+        for a gradient with respect to `dt`.
     - `max_steps`: the largest number of adaptive steps in an interval, 256 by default.
     - `max_events`: the largest number of events in an interval of a hybrid system, 16
         by default.
@@ -323,7 +335,8 @@ class Discretized(AbstractDiscretization):
     def flow(self, args: Any, in_loop: bool = False) -> Any:
         """One step of the solver, as a function `(s, x, h) -> (x_next, result)`: a step
         of length `h` from the state `x` at the time `s` after the start of the
-        interval. With `in_loop`, the stages are in a loop. `args` come from `_args`."""
+        interval. With `in_loop`, the stages of the solver are computed in a loop.
+        `args` come from `_args`."""
         system, start, u, held = args
         assert self.solver is not None
         tableau = tableau_of(self.solver)
@@ -391,10 +404,9 @@ class Discretized(AbstractDiscretization):
     def solve(
         self, s: Array, x: Array, end: Array, args: Any, every_step: bool = False
     ) -> tuple[diffrax.Solution, Result]:
-        """A solve with adaptive steps from `x` at `s` to `end`, and its result.
-
-        `ys` of the solution holds the state at the end. With `every_step` it also holds
-        the states of all steps.
+        """A solve with adaptive steps from the state `x` at the time `s` to the time
+        `end`, and the result of this solve. `ys` of the solution holds the state at the
+        end. With `every_step`, `ys` also holds the states of all steps.
         """
         method: Any = dict(solver=self.solver, max_steps=self.max_steps)
         method |= dict(stepsize_controller=self.stepsize_controller)

@@ -22,8 +22,8 @@ class AbstractPlant(eqx.Module):
     """The common base of systems and dynamics: the names and sizes of a plant, its
     sensor and its equilibrium.
 
-    You rarely subclass it directly. [`delucax.AbstractSystem`][] adds a vector field,
-    [`delucax.AbstractDynamics`][] adds a step.
+    You rarely subclass `AbstractPlant` directly. [`delucax.AbstractSystem`][] adds a
+    vector field, [`delucax.AbstractDynamics`][] adds a step.
 
     !!! example
 
@@ -76,11 +76,11 @@ class AbstractPlant(eqx.Module):
     def noise(self) -> Noise:
         """How the disturbance `w` acts on the plant.
 
-        - `None`: it enters the equations. This is the default with
-            `disturbance_names`.
-        - `"additive"`: it is added to the next state. This is the default without
-            `disturbance_names`.
-        - `"brownian"`: it holds the increments of Brownian motions.
+        - `None`: the disturbance enters the equations. This is the default for a plant
+            with `disturbance_names`.
+        - `"additive"`: the disturbance is added to the next state. This is the default
+            for a plant without `disturbance_names`.
+        - `"brownian"`: the disturbance holds the increments of Brownian motions.
         """
         return None if self.disturbance_names else "additive"
 
@@ -139,7 +139,8 @@ class AbstractPlant(eqx.Module):
 
         **Returns:** `(x, u)`, shapes `(state_size,)` and `(control_size,)`.
 
-        **Raises:** `ValueError` if the class defines none, as by default.
+        **Raises:** `ValueError` if the class defines no equilibrium, which is the
+        default.
         """
         raise ValueError(
             f"{type(self).__name__} defines no equilibrium: override `equilibrium`, or "
@@ -169,22 +170,24 @@ def check_names(plant: AbstractPlant) -> None:
 class AbstractSystem(AbstractPlant):
     r"""A system in continuous time, $\dot x = f(t, x, u, w)$.
 
-    Subclass it, name the states and controls, and write `vector_field`. States,
-    controls and disturbances are vectors. Their sizes follow from the names.
+    To define your own system, subclass `AbstractSystem`, name the states and controls,
+    and write `vector_field`. States, controls and disturbances are vectors. Their sizes
+    follow from the names.
 
     **Class attributes** (or properties, if they depend on a field):
 
     - `state_names`, `control_names`: tuples of strings.
-    - `angle_names`: the states that are angles, which `difference` wraps; none by
-        default.
-    - `disturbance_names`: a tuple of strings, empty by default. With names, `w` enters
-        the vector field and is held over a step. Without names, `w` has the size of the
-        state, and the discrete-time dynamics add it to the next state.
+    - `angle_names`: the names of the states that are angles; none by default. The
+        method `difference` wraps the differences of these states.
+    - `disturbance_names`: a tuple of strings, empty by default. With names, the
+        disturbance `w` enters the vector field and is held constant over a step.
+        Without names, `w` has the size of the state, and the discrete-time dynamics add
+        it to the next state.
     - `state_units`, `control_units`: tuples of strings, empty by default.
     - `time_unit`: a string, `"s"` by default.
 
     **Hooks:** you may override `observe`, `project`, `difference`, `equilibrium` and
-    `diffusion`. Leave the other methods as they are.
+    `diffusion`. Do not override the other methods.
 
     **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
     or violates its constraint, or if the names are missing.
@@ -230,14 +233,15 @@ class AbstractSystem(AbstractPlant):
 
     @property
     def noise(self) -> Noise:
-        """How `w` acts: `"brownian"` with a `diffusion`; otherwise `None` with
-        `disturbance_names` and `"additive"` without."""
+        """How the disturbance `w` acts: `"brownian"` if the system has a `diffusion`,
+        else `None` if it has `disturbance_names`, else `"additive"`."""
         return super().noise if _brownian_size(self) is None else "brownian"
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`: the number of Brownian motions with a `diffusion`, else the
-        number of `disturbance_names`, else the number of states."""
+        """The size of the disturbance `w`: the number of Brownian motions if the system
+        has a `diffusion`, else the number of `disturbance_names` if there are any, else
+        the number of states."""
         motions = _brownian_size(self)
         return super().disturbance_size if motions is None else motions
 
@@ -257,8 +261,9 @@ class AbstractSystem(AbstractPlant):
         """
 
     def project(self, x: State) -> State:
-        """Bring the state back to its manifold after each control interval; the
-        identity by default. Normalise a quaternion or wrap an angle here.
+        """Project the state back onto its manifold after each control interval. By
+        default, the state is returned unchanged. Override `project` to normalise a
+        quaternion or to wrap an angle.
 
         **Arguments:** `x`: state, shape `(state_size,)`.
 
@@ -270,8 +275,8 @@ class AbstractSystem(AbstractPlant):
         r"""The matrix $g$ of $\mathrm{d}x = f \,\mathrm{d}t + g \,\mathrm{d}B$; none by
         default.
 
-        With a diffusion, `w` holds the increments of the $k$ Brownian motions over the
-        step. You may name them in `disturbance_names`.
+        If there is a diffusion, the disturbance `w` holds the increments of the $k$
+        Brownian motions over the step. You may name them in `disturbance_names`.
 
         **Arguments:** `t`: time, a scalar. `x`: state, shape `(state_size,)`. `u`:
             control, shape `(control_size,)`.
