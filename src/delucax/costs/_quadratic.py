@@ -79,7 +79,8 @@ class Quadratic(_AbstractQuadratic):
 
     - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`.
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
-    - `final`: final weight $Q_f$, of a shape like `Q`; no final cost by default.
+    - `final`: final weight $Q_f$, symmetric, or its diagonal, like `Q`; no final cost
+        by default.
     - `state_target`: $x^*$, shape `(n,)`; zero by default.
     - `control_target`: $u^*$, shape `(m,)`; zero by default.
     - `difference`: a function `(x, x_target) -> deviation` that replaces $x - x^*$,
@@ -166,7 +167,8 @@ class Tracking(_AbstractQuadratic):
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
     - `reference`: $r$, a function of time to a vector of shape `(p,)`, such as those in
         `delucax.references`.
-    - `final`: final weight $Q_f$, of a shape like `Q`; no final cost by default.
+    - `final`: final weight $Q_f$, symmetric, or its diagonal, like `Q`; no final cost
+        by default.
     - `output`: $h$, a function of the state to the vector that should follow the
         reference, shape `(p,)`; the state itself by default.
 

@@ -128,7 +128,7 @@ class AbstractDisturbance(eqx.Module):
 
         **Raises:** `ValueError` if `stop` is before `start`. The disturbance also
         raises a `ValueError` if the horizon has more than 2^22 steps in single
-        precision, because single-precision times cannot tell so many steps apart.
+        precision, because the times are then too coarse to resolve a step.
         """
         return _Window(self, start, stop)
 

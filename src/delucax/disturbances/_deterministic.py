@@ -191,8 +191,8 @@ class Square(AbstractEntrywise):
 
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
     positive, or `duty` is not between 0 and 1. `sequence` also raises a `ValueError` if
-    the horizon has more than 2^22 steps in single precision, because single-precision
-    times cannot tell so many steps apart.
+    the horizon has more than 2^22 steps in single precision, because the times are then
+    too coarse to resolve a step.
 
     !!! example
 

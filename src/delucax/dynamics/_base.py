@@ -258,8 +258,8 @@ def _forwarded_units(what: str) -> Any:
         same = getattr(self, f"{what}_names") == getattr(self._inside, f"{what}_names")
         return getattr(self._inside, f"{what}_units") if same else ()
 
-    return property( units, doc="The units of the wrapped plant if its names are the
-        same, else ()." )
+    doc = "The units of the wrapped plant if its names are the same, else ()."
+    return property(units, doc=doc)." )
 
 
 class Forwarding(AbstractDynamics):

@@ -36,7 +36,7 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
     \left(I + \tfrac{\Delta t}{2} A\right), \qquad
     B_d = \left(I - \tfrac{\Delta t}{2} A\right)^{-1} B\, \Delta t$$
 
-    A disturbance that enters the vector field is held too.
+    A disturbance that enters the vector field is held over the step too.
 
     **Arguments:**
 
@@ -91,9 +91,9 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     $$A = \tfrac{2}{\Delta t} (A_d + I)^{-1} (A_d - I), \qquad
     B = \tfrac{2}{\Delta t} (A_d + I)^{-1} B_d$$
 
-    Several continuous-time systems have the same samples. `"zoh"` returns the one whose
-    frequencies are below $\pi / \Delta t$. The result is differentiable to any order,
-    in forward and reverse mode.
+    Several continuous-time systems can have the same samples. `"zoh"` returns the
+    system whose frequencies are below $\pi / \Delta t$. The result is differentiable to
+    any order, in forward and reverse mode.
 
     **Arguments:**
 

@@ -104,14 +104,16 @@ class _AbstractDelay(AbstractWrapper):
 
 
 class Delayed(_AbstractDelay):
-    r"""Dynamics with an input delay, an output delay or both, in whole steps.
+    r"""Dynamics with an input delay, an output delay or both, of a whole number of
+    steps.
 
     $$x_{k+1} = F(t_k, x_k, u_{k-c}, w_k), \qquad y_k = h(t_{k-s}, x_{k-s})$$
 
     The state holds the pending controls and observations after the state of the plant:
-    $(x_k, u_{k-1}, \dots, u_{k-c}, y_{k-1}, \dots, y_{k-s})$. This is a true transport
-    delay, not an approximation, and differentiable like any other state. For delays
-    that are no whole number of steps, use [`delucax.dynamics.TransportDelay`][].
+    $(x_k, u_{k-1}, \dots, u_{k-c}, y_{k-1}, \dots, y_{k-s})$. The delay is an exact
+    transport delay, not an approximation, and the delayed values are differentiable
+    like any other state. For delays that are not a whole number of steps, use
+    [`delucax.dynamics.TransportDelay`][].
 
     **Arguments:**
 
@@ -196,18 +198,18 @@ class TransportDelay(_AbstractDelay):
 
     The control is held over each control interval, so the delayed control switches once
     within an interval. The interval is therefore integrated in two parts, which is
-    exact. If the sensor is late, the part up to the time that it reads is integrated
-    once more.
+    exact. If the sensor is delayed, the interval is also integrated from its start to
+    the time of the delayed reading.
 
     The state is $(x_k, u_{k-1}, \dots, y_{k-1}, \dots)$: the state of the plant, the
     pending controls and the earlier readings of the sensor, the newest first. `filled`
-    makes one. Disturbances act as in the plant; additive ones are added at the end of
-    the interval.
+    makes such a state from a state of the plant. Disturbances act as in the plant; an
+    additive disturbance is added at the end of the interval.
 
-    The delays are differentiable. Where a delay is a whole number of steps, the
-    derivative is the one to the right. The number of controls and readings in the state
-    is fixed at construction. If you change a delay later, as `delucax.training.fit`
-    may, it must stay within this memory; otherwise the status is
+    The delays are differentiable. If a delay is a whole number of steps, its derivative
+    is the right-hand derivative. The number of controls and readings in the state is
+    fixed at construction. If you change a delay later, as `delucax.training.fit` may,
+    the new delay must not need more of them; otherwise the status of a step is
     `delay_beyond_memory`.
 
     **Arguments:**

@@ -19,12 +19,13 @@ class Events(eqx.Module):
 
     - `times`: the time of each event, in units of time, shape `(max_events,)`; NaN
         after the last event.
-    - `kinds`: which event each is, as an index in `event_names`, shape `(max_events,)`;
-        -1 after the last event.
+    - `kinds`: the kind of each event, as an index into `event_names`, shape
+        `(max_events,)`; -1 after the last event.
     - `before`, `after`: the states of the plant just before and just after each event,
         shape `(max_events, n)`; NaN after the last event.
-    - `fault_time`, `fault_kind`: when the interval first failed, and by which guard, as
-        an index in `event_names`; NaN and -1 if it did not fail.
+    - `fault_time`, `fault_kind`: the time of the first failure in the interval, and the
+        event whose guard failed, as an index into `event_names`; NaN and -1 if nothing
+        failed.
 
     !!! example
 
@@ -69,8 +70,9 @@ class Events(eqx.Module):
         return cls(*rows, states, states, nan, none)
 
     def then(self, later: "Events") -> "Events":
-        """The events of two intervals, one after the other. The record keeps its size:
-        events beyond it are dropped.
+        """A record of the events of two intervals, one after the other. The record
+        keeps its size: if there are more events than it has room for, the last ones are
+        dropped.
 
         **Arguments:** `later`: the events of the second interval.
 
@@ -98,8 +100,9 @@ class Events(eqx.Module):
     ) -> "Events":
         """The record with one more event.
 
-        **Arguments:** `fires`: whether there is one; if not, nothing is added. `time`,
-            `kind`, `before`, `after`: the new entries of the attributes.
+        **Arguments:** `fires`: whether an event happened; if not, nothing is added.
+            `time`, `kind`, `before`, `after`: the time, kind, state before and state
+            after the event.
 
         **Returns:** the new record.
         """
@@ -114,9 +117,9 @@ class Events(eqx.Module):
         )
 
     def unless(self, over: Array) -> "Events":
-        """The record, emptied if a flag is set.
+        """The record, or an empty record if a flag is set.
 
-        **Arguments:** `over`: whether to empty it.
+        **Arguments:** `over`: whether to empty the record.
 
         **Returns:** the new record.
         """
@@ -125,8 +128,8 @@ class Events(eqx.Module):
     def with_fault(self, failed: Array, kind: Array, time: Array) -> "Events":
         """The record with a fault.
 
-        **Arguments:** `failed`: whether there is one; if not, nothing changes. `kind`,
-            `time`: its guard and its time.
+        **Arguments:** `failed`: whether there is a fault; if not, nothing changes.
+            `kind`, `time`: the event whose guard failed, and the time of the fault.
 
         **Returns:** the new record.
         """

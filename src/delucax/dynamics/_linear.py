@@ -24,10 +24,10 @@ class LinearDynamics(AbstractDynamics):
     $$x_{k+1} = x_\mathrm{next} + A (x_k - x_\mathrm{ref}) + B (u_k - u_\mathrm{ref})
     + E w_k, \qquad y_k = C x_k$$
 
-    The dynamics are time-varying if `A` has a leading time axis of length `T`. The
-    other arguments then may have one too. At time `t`, the entries at `round(t / dt)`
-    apply. Before the first and after the last entry, the next state is NaN, which a
-    rollout reports.
+    The dynamics are time-varying if `A` has a leading time axis of length `T`. `B`, `E`
+    and the operating point may then have a leading time axis too. At time `t`, the
+    dynamics use the entries with the index `round(t / dt)`. Before the first and after
+    the last entry, the next state is NaN, which a rollout reports.
 
     **Arguments:**
 
@@ -35,7 +35,7 @@ class LinearDynamics(AbstractDynamics):
     - `B`: shape `(n, m)`, or `(T, n, m)`.
     - `C`: shape `(p, n)`, always time-invariant; the identity by default.
     - `E`: shape `(n, k)`, or `(T, n, k)`; the identity by default.
-    - `dt`: the step, in units of time; 1 by default.
+    - `dt`: the time step, in units of time; 1 by default.
     - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`, or `(T, n)` and
         `(T, m)`; zero by default.
     - `x_next`: the state that follows the operating point, shape `(n,)` or `(T, n)`; by

@@ -84,8 +84,8 @@ def linearize(
     $$f(x, u) \approx f(x_\mathrm{ref}, u_\mathrm{ref})
     + A (x - x_\mathrm{ref}) + B (u - u_\mathrm{ref})$$
 
-    The result keeps the operating point. A regulator designed on it therefore acts on
-    deviations from this point: `u = u_ref - K difference(x, x_ref)`.
+    The result keeps the operating point. A regulator designed for the linear model
+    therefore acts on deviations from this point: `u = u_ref - K difference(x, x_ref)`.
 
     **Arguments:**
 
@@ -94,7 +94,7 @@ def linearize(
     - `x`, `u`: the state and control to linearise at, shapes `(n,)` and `(m,)`; by
         default the `equilibrium` of the model. You may pass the
         [`delucax.dynamics.OperatingPoint`][] that [`delucax.trim`][] computes as `x`:
-        it holds both. Any point works, but regulators such as
+        it holds both the state and the control. Any point works, but regulators such as
         [`delucax.controllers.LQR`][] need an equilibrium.
 
     **Returns:** for dynamics, [`delucax.LinearDynamics`][] with the same `dt`; for a

@@ -29,20 +29,22 @@ class MethodOfSteps(Forwarding):
 
     Each control interval is cut into `substeps` equal steps of an explicit Runge-Kutta
     method. No step is longer than the shortest delay, so the delayed states are always
-    known. They are interpolated by the cubic through the states and slopes at the ends
-    of a past step, with an error of order 4. If the system has `disturbance_names`, `w`
-    is held over the interval; otherwise it is added to the next state.
+    known. A delayed state is interpolated by the cubic through the states and slopes at
+    both ends of a past step, with an error of order 4. If the system has
+    `disturbance_names`, the disturbance `w` is held over the interval; otherwise `w` is
+    added to the next state.
 
     The state is `(x, history)`. For each past step within `memory`, the history holds
     the state and the slope at the start and at the end of that step, the newest step
-    first. `filled` makes a state after a constant past, `started` makes one from a
-    function of time. It is a state like any other. For example, you can
-    [`delucax.linearize`][] the dynamics, and the eigenvalues of the matrix decide about
-    stability. Derivatives with respect to the delays go through the cubics.
+    first. `filled` makes such a state from a constant past, and `started` makes one
+    from a past that is a function of time. The state with its history can be used like
+    any other state. For example, you can [`delucax.linearize`][] the dynamics, and the
+    eigenvalues of the matrix `A` show whether they are stable. Derivatives with respect
+    to the delays are those of the cubic interpolation.
 
-    The slope of the state jumps where a control switches and where the history ends,
-    and a higher derivative jumps one delay later. The method has order 4 if the delays
-    are whole numbers of substeps.
+    The slope of the state jumps when a control switches and at the start of the
+    simulation, where the given history ends. One delay later, a higher derivative of
+    the state jumps. The method has order 4 if the delays are whole numbers of substeps.
 
     **Arguments:**
 
@@ -50,14 +52,14 @@ class MethodOfSteps(Forwarding):
     - `dt`: the control interval, in units of time, a positive number.
     - `solver`: an explicit Runge-Kutta method of Diffrax; [`delucax.dynamics.RK4`][] by
         default.
-    - `substeps`: steps per interval; by default the smallest number that keeps a step
-        within the shortest delay.
+    - `substeps`: the number of steps per control interval; by default the smallest
+        number that keeps a step within the shortest delay.
     - `memory`: the longest delay that you may set later, in substeps; by default the
         longest delay of the system.
 
     **Raises:** `ValueError` if a delay is not positive, is shorter than a substep or
-    longer than `memory`, or if `solver` does not fit. If you change a delay later to a
-    value outside of this range, the status is `delay_beyond_memory`.
+    longer than `memory`, or if `solver` does not fit. If you later change a delay to a
+    value outside of this range, the status of a step is `delay_beyond_memory`.
 
     Source: Hairer, Nørsett and Wanner, 1993, section II.17.
 
@@ -182,7 +184,8 @@ class MethodOfSteps(Forwarding):
         """The state after a given past. Use it as a first state.
 
         **Arguments:** `past`: the state of the system, shape `(n,)`, as a function of
-            time. Now is time 0, and `past` is called at negative times too.
+            time. `past` is called at time 0, which is the present, and at negative
+            times.
 
         **Returns:** the state with its history, shape `(state_size,)`.
 

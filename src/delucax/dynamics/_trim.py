@@ -49,16 +49,18 @@ def trim(
 
     Changes and residuals are measured in units that follow from the guess:
 
-    - The unit of a state is its guess. If that is zero, the unit is the largest guess
-        of a state, at most 1; or 1 if all guesses are zero. The same holds for
-        controls.
+    - A state is measured in units of its guess. If its guess is zero, the unit is the
+        largest guess of all states, but at most 1; if all guesses are zero, the unit
+        is 1. The units of the controls are chosen in the same way.
     - A guess counts as zero if it is below 100 eps times the largest guess or 1,
-        whichever is less. In float32, 100 eps is 1e-5. Scale states that are much
-        smaller than the others, for example by using nmol.
-    - A free state or control below 4 eps of its unit is set to zero.
-    - Each equation is measured in units of the size of its terms.
+        whichever is less. In float32, 100 eps is 1e-5. If a state is much smaller than
+        the others, express it in a smaller unit, for example in nmol instead of mol.
+    - A state or control that is not fixed is set to zero if it is below 4 eps times its
+        unit.
+    - The residual of each equation is measured relative to the size of the terms of
+        this equation.
 
-    At a multiple root the last digits may be missing, and the result may be
+    At a multiple root the last digits of the point may be wrong, and the result may be
     `no_equilibrium`.
 
     The method is Levenberg-Marquardt in a trust region, followed by Newton's method on
@@ -69,10 +71,12 @@ def trim(
     **Arguments:**
 
     - `model`: an [`delucax.AbstractSystem`][] or [`delucax.AbstractDynamics`][]. For
-        [`delucax.Discretized`][] dynamics, the operating point is that of the system.
+        [`delucax.Discretized`][] dynamics, the operating point is that of the
+        continuous-time system.
     - `t`: time, a scalar, 0 by default.
     - `x`, `u`: the guess, shapes `(n,)` and `(m,)`; by default the `equilibrium` of the
-        model. You may pass an `OperatingPoint` as `x`: it holds both.
+        model. You may pass an `OperatingPoint` as `x`: it holds both the state and the
+        control.
     - `fix`: the states and controls to hold at the guess: a name, several names, or a
         dictionary from names to values, which replace those of the guess. None by
         default.
@@ -83,8 +87,8 @@ def trim(
 
     **Raises:** `ValueError` on a wrong shape, an unknown name, a time or guess that is
     not finite, if everything is fixed, or if there is no guess and the model has no
-    equilibrium. An error at run time if there is no operating point and `throw` is
-    true.
+    equilibrium. An error is raised at run time if there is no operating point and
+    `throw` is true.
 
     Source: Nocedal and Wright, 2006.
 

@@ -15,13 +15,13 @@ from ._base import AbstractDynamics, AbstractWrapper
 
 
 class WorstCase(AbstractWrapper):
-    r"""Dynamics with an adversary, which adds to the disturbance by state feedback.
+    r"""Dynamics with an adversary, which adds a state feedback to the disturbance.
 
     $$x_{k+1} = F(t_k, x_k, u_k, w_k + L (x_k - x_\mathrm{ref}))$$
 
     Here $x_\mathrm{ref}$ is the equilibrium of the dynamics, and their `difference`
-    measures the deviation. With the `L` of [`delucax.controllers.HInfinity`][] or of
-    [`delucax.riccati.hinf_dare`][], the adversary plays the worst disturbance of the
+    measures the deviation. If `L` is the gain of [`delucax.controllers.HInfinity`][] or
+    of [`delucax.riccati.hinf_dare`][], the adversary plays the worst disturbance of the
     H-infinity game. Use `bound` to keep it realistic.
 
     **Arguments:**

@@ -37,7 +37,7 @@ def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Limit = 2.0) ->
 
     **Arguments:**
 
-    - `max_torque`: the bound of the torque [N m], 2 by default.
+    - `max_torque`: the largest absolute value of the torque [N m], 2 by default.
     - `max_speed`: the speed limit of Gym's integrator [rad/s], 8 by default.
 
     Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
@@ -83,7 +83,7 @@ def cartpole(
     - *State:* position [m], velocity [m/s], angle [rad], 0 upright; spin [rad/s].
         *Control:* force [N], continuous within its bounds. The integer actions 0 and 1
         are Gym's forces -10 and 10.
-    - *Start:* each state uniform in +-0.05.
+    - *Start:* each state is uniformly random in +-0.05.
     - *Cost:* -1 per step.
     - *End:* when the position or the angle leaves its bounds.
 
@@ -93,12 +93,14 @@ def cartpole(
 
     **Arguments:**
 
-    - `max_force`: the bound of the force [N], 10 by default.
-    - `max_position`: where the track ends [m], 2.4 by default.
+    - `max_force`: the largest absolute value of the force [N], 10 by default.
+    - `max_position`: the distance from the centre to an end of the track [m], 2.4 by
+        default.
     - `max_angle`: the angle at which the pole counts as fallen [rad], 12 degrees by
         default.
-    - `semi_implicit`: use Gym's semi-implicit integrator, whose positions move with the
-        new velocities. False by default, for Gym's explicit Euler step.
+    - `semi_implicit`: whether to use Gym's semi-implicit integrator, which updates the
+        positions with the new velocities. The default, false, uses Gym's explicit Euler
+        step.
 
     Source: Gymnasium (Towers et al., 2023), `CartPole-v1`; Barto, Sutton and Anderson,
     1983.
@@ -148,23 +150,23 @@ def mountain_car(
     goal_position: Number = 0.45,
     goal_velocity: Number = 0.0,
 ) -> Fields:
-    r"""Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
+    r"""Rock a car back and forth to leave a valley: Gym's MountainCarContinuous-v0.
 
     - *State:* position, velocity [1/step]. *Control:* push, in +-1.
-    - *Start:* at rest, with the position uniform in [-0.6, -0.4].
-    - *Cost:* `0.1 push^2` per step, and -100 on arrival at the goal. The push is that
-        after clipping; Gym charges the push before clipping.
+    - *Start:* at rest, with the position uniformly random in [-0.6, -0.4].
+    - *Cost:* `0.1 push^2` per step, and -100 on arrival at the goal. This cost uses the
+        push after clipping, whereas Gym uses the push before clipping.
     - *End:* at the goal.
 
     The arrival has no gradient. For planning and policy gradients, pass a
     [`delucax.costs.Quadratic`][] with the goal as `state_target`, `terminated=None`,
-    and a `solver` for dynamics without walls and speed limits.
+    and a `solver` in place of Gym's integrator, which has walls and speed limits.
 
     **Arguments:**
 
     - `goal_position`: 0.45 by default.
-    - `goal_velocity`: the smallest velocity that counts at the goal [1/step], 0 by
-        default.
+    - `goal_velocity`: the smallest velocity with which the car must reach the goal
+        [1/step], 0 by default.
     - `max_speed`: the speed limit of Gym's integrator [1/step], 0.07 by default.
     - `min_position`, `max_position`: the walls of Gym's integrator, -1.2 and 0.6 by
         default. The car stops at the left wall.
@@ -213,7 +215,7 @@ def mountain_car_discrete(
 
     - *Control:* the integer actions 0, 1 and 2 are the pushes -1, 0 and 1. A push in
         between works too.
-    - *Cost:* 1 per step, nothing on arrival.
+    - *Cost:* 1 per step, and no final cost on arrival.
 
     The cost has no gradient. See [`delucax.environments.mountain_car`][] for smooth
     alternatives.
@@ -222,8 +224,8 @@ def mountain_car_discrete(
 
     - `power`: power of the motor [1/step^2], 0.001 by default.
     - `goal_position`: 0.5 by default.
-    - `goal_velocity`: the smallest velocity that counts at the goal [1/step], 0 by
-        default.
+    - `goal_velocity`: the smallest velocity with which the car must reach the goal
+        [1/step], 0 by default.
 
     Source: Gymnasium (Towers et al., 2023), `MountainCar-v0`; Moore, 1990.
 
@@ -284,33 +286,36 @@ def acrobot(
     goal_height: Number = 1.0,
     disturbance: AbstractDisturbance | None = None,
 ) -> Fields:
-    r"""Swing the tip of two hanging links above a line, by a torque at the elbow.
+    r"""Swing the tip of two hanging links above a line, with a torque at the elbow.
 
-    - *State:* angle_1 [rad], angle_2 [rad], both 0 where the links hang; velocity_1
-        [rad/s], velocity_2 [rad/s]. *Control:* torque [N m]; the integer actions 0, 1
-        and 2 are the torques -1, 0 and 1. *Disturbance:* push [N m], added to the
-        torque.
-    - *Start:* each state uniform in +-0.1.
+    - *State:* angle_1 [rad], angle_2 [rad], both 0 when the links hang straight down;
+        velocity_1 [rad/s], velocity_2 [rad/s]. *Control:* torque [N m]; the integer
+        actions 0, 1 and 2 are the torques -1, 0 and 1. *Disturbance:* push [N m], added
+        to the torque.
+    - *Start:* each state is uniformly random in +-0.1.
     - *Cost:* 1 per step, and -1 on arrival, because Gym rewards the last step with 0.
     - *End:* when `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`.
     - *Features:* `encode` gives the cosines and sines of both angles, and the
         velocities.
 
     The cost has no gradient. For planning and policy gradients, pass
-    `cost=`[`delucax.costs.AcrobotHeight`][]`()`, `terminated=None`, and a `solver` for
-    dynamics without wraps and clips. Gym's dynamics are not smooth where a velocity
-    meets its limit. Where an angle wraps, the state jumps, but the gradient does not.
+    `cost=`[`delucax.costs.AcrobotHeight`][]`()`, `terminated=None`, and a `solver` in
+    place of Gym's integrator, which wraps angles and clips velocities. Gym's dynamics
+    are not smooth where a velocity meets its limit. When an angle is wrapped, the state
+    jumps, but the gradient does not.
 
-    A step equals Gym's up to rounding. But the acrobot is chaotic: of 100 episodes
-    under random actions in double precision, about 5 end more than 1e-6 from Gym's. The
-    same happens in Gym itself if the initial state is perturbed by one ulp.
+    A step has the same result as a step of Gym up to rounding. But the acrobot is
+    chaotic: of 100 episodes with random actions in double precision, about 5 end more
+    than 1e-6 away from the same episodes in Gym. Differences of this size also arise in
+    Gym itself if the last bit of the initial state is changed.
 
     **Arguments:**
 
-    - `max_torque`: the bound of the torque [N m], 1 by default.
-    - `torque_noise`: add a torque drawn uniformly from +-`torque_noise` [N m] at each
-        step, also beyond the bounds, as Gym's `torque_noise_max` does; none by default.
-        Do not combine it with a `disturbance`.
+    - `max_torque`: the largest absolute value of the torque [N m], 1 by default.
+    - `torque_noise`: the largest absolute value of a random torque [N m], drawn
+        uniformly from +-`torque_noise` and added at each step after clipping, as Gym's
+        `torque_noise_max` does; none by default. Do not combine `torque_noise` with a
+        `disturbance`.
     - `goal_height`: height of the line above the first joint, in lengths of a link; 1
         by default.
     - `disturbance`: the disturbance of the environment, in place of `torque_noise`;

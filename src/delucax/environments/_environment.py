@@ -55,7 +55,8 @@ class Step(NamedTuple):
     """The outcome of one step of an environment.
 
     - `state`: the next state, shape `(n,)`.
-    - `control`: the control that was applied, after the bounds, shape `(m,)`.
+    - `control`: the control that was applied, after clipping to the bounds, shape
+        `(m,)`.
     - `cost`: the stage cost at the current state and the applied control, a scalar.
     - `terminated`: whether the next state ends the episode, a boolean.
     - `result`: the status of the step, one of `delucax.RESULTS`.
@@ -88,22 +89,22 @@ class Environment(eqx.Module):
     - `dynamics`: the discrete-time dynamics, an [`delucax.AbstractDynamics`][].
     - `cost`: the stage and final cost, an [`delucax.AbstractCost`][]. A cost is minus a
         reward.
-    - `disturbance`: an [`delucax.AbstractDisturbance`][]. By default there is none, or
-        for dynamics with a diffusion, Brownian increments.
+    - `disturbance`: an [`delucax.AbstractDisturbance`][]. By default there is no
+        disturbance, except for dynamics with a diffusion: they get Brownian increments.
     - `sensor_noise`: an [`delucax.AbstractDisturbance`][] that is added to the
         observation; none by default.
-    - `initial_state`: shape `(n,)`, or a function of a random key to such a state; zero
-        by default.
-    - `control_bounds`: `(low, high)`, each a number or shape `(m,)`. Controls are
-        clipped to them. None by default.
+    - `initial_state`: the first state, shape `(n,)`, or a function that draws the first
+        state from a random key; zero by default.
+    - `control_bounds`: `(low, high)`, the bounds to which controls are clipped; each
+        bound is a number or has shape `(m,)`. None by default.
     - `horizon`: the number of steps of an episode, 200 by default.
-    - `terminated`: whether a state ends the episode, a function `(t, x) -> bool`; never
-        by default.
-    - `actions`: the control of each integer action, shape `(actions, m)`; none by
-        default.
-    - `encode`: a function of an observation to features for networks and Gymnasium
-        users, such as the cosine and sine of an angle; the identity by default.
-        Controllers get the observation itself.
+    - `terminated`: a function `(t, x) -> bool` that says whether a state ends the
+        episode; by default no state does.
+    - `actions`: the controls that the integer actions 0, 1, ... stand for, shape
+        `(actions, m)`; by default there are no integer actions.
+    - `encode`: a function from an observation to the features that networks and
+        Gymnasium users get, such as the cosine and sine of an angle; the identity by
+        default. Controllers get the observation itself.
     - `observation_bounds`: `(low, high)`, each a number or a vector: the bounds of
         `encode(y)` that define the observation space of Gymnasium. They are not
         enforced. None by default.
@@ -114,8 +115,8 @@ class Environment(eqx.Module):
 
         `jax.jit(env.step)` raises "unhashable", because `env` holds arrays. Use
         `eqx.filter_jit(env.step)`, or pass the environment as an argument,
-        `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither. The same
-        holds for the methods of every module.
+        `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither. The
+        methods of every other module must be compiled in one of these two ways too.
 
     !!! example
 
@@ -242,18 +243,19 @@ class Environment(eqx.Module):
         return shape[0]
 
     def trim(self, *, fix: Any = (), throw: bool = True) -> OperatingPoint:
-        """The operating point of the task, by [`delucax.trim`][].
+        """The operating point of the task, which [`delucax.trim`][] finds.
 
-        The guess is the `targets` of the cost if it has one for the state and one for
-        the control. Else it is the equilibrium of the dynamics, or else the one target
-        of the cost, with zeros for the other.
+        The initial guess is the `targets` of the cost if the cost has both a target
+        state and a target control. Otherwise the guess is the equilibrium of the
+        dynamics. If the dynamics define no equilibrium, the guess is the one target
+        that the cost has, with zeros for the other one.
 
         **Arguments:** `fix`, `throw`: as in [`delucax.trim`][].
 
         **Returns:** a [`delucax.dynamics.OperatingPoint`][].
 
-        **Raises:** `ValueError` if neither the cost nor the dynamics define a guess,
-        and the errors of [`delucax.trim`][].
+        **Raises:** `ValueError` if neither the cost nor the dynamics define a guess. It
+        also raises the errors of [`delucax.trim`][].
 
         !!! example
 
@@ -289,7 +291,8 @@ class Environment(eqx.Module):
         return start, disturbance, noise, controller
 
     def reset(self, key: PRNGKey) -> State:
-        """A first state, drawn if `initial_state` is a function.
+        """The first state of an episode, drawn at random if `initial_state` is a
+        function.
 
         **Arguments:** `key`: a random key.
 
@@ -303,14 +306,15 @@ class Environment(eqx.Module):
         return self.initial_state
 
     def saturate(self, u: ArrayLike) -> Array:
-        """Clip a control to `control_bounds`. An integer action is looked up first.
+        """Clip a control to `control_bounds`. An integer action is first replaced by
+        its row of `actions`.
 
         **Arguments:** `u`: a control, shape `(m,)`; or an integer action, a scalar, if
             the environment has `actions`.
 
         **Returns:** the control, shape `(m,)`.
 
-        **Raises:** `ValueError` on another shape or an unknown action.
+        **Raises:** `ValueError` if `u` has another shape or is an unknown action.
         """
         try:
             control = jnp.asarray(u)
@@ -342,10 +346,10 @@ class Environment(eqx.Module):
     ) -> Step:
         """One step: clip the control, charge the stage cost, advance the state.
 
-        `result` is the status of the solver alone. The next state is not checked: it is
-        NaN if the state or the control is NaN, and a huge state may overflow, although
-        `result` is a success. [`delucax.rollout`][], losses and adapters check for
-        states that are not finite.
+        `result` says only whether the solver succeeded. The next state is not checked:
+        it is NaN if the state or the control is NaN, and a huge state may overflow,
+        although `result` is a success. [`delucax.rollout`][], losses and adapters check
+        for states that are not finite.
 
         **Arguments:**
 

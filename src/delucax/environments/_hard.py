@@ -100,24 +100,26 @@ def cartpole_swing_up(
     max_position: Positive = 2.4,
     exit_cost: Number = 1000.0,
 ) -> Fields:
-    """Swing a pole up from hanging and keep it upright, on a track that ends.
+    """Swing a pole up from hanging and keep it upright, on a short track.
 
     - *State:* position [m], velocity [m/s], angle [rad], 0 upright; spin [rad/s].
         *Control:* force [N].
-    - *Start:* the position uniform in +-0.5 m, the angle within 0.2 rad of hanging, the
-        velocity and the spin in +-0.1.
+    - *Start:* the position uniformly random in +-0.5 m, the angle within 0.2 rad of
+        hanging, the velocity and the spin in +-0.1.
     - *Cost:* `0.1 position^2 + 2 (1 - cos(angle)) + 0.01 (velocity^2 + spin^2) +
         0.001 force^2` per step.
     - *End:* when the cart leaves the track. This costs `exit_cost`, more than a whole
         episode of hanging.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
-    The force is smaller than the weight, so a swing-up takes two or three pushes.
+    The largest force is smaller than the weight of cart and pole, so a swing-up takes
+    two or three pushes.
 
     **Arguments:**
 
-    - `max_force`: the bound of the force [N], 10 by default.
-    - `max_position`: where the track ends [m], 2.4 by default.
+    - `max_force`: the largest absolute value of the force [N], 10 by default.
+    - `max_position`: the distance from the centre to an end of the track [m], 2.4 by
+        default.
     - `exit_cost`: the cost of leaving the track, 1000 by default.
 
     Source: Barto, Sutton and Anderson, 1983 (the plant); Tassa et al., 2018 (the task).
@@ -147,21 +149,23 @@ def double_pendulum_cart(
 
     - *State:* position [m], angle_1 [rad], angle_2 [rad], both 0 upright; velocity
         [m/s], spin_1 [rad/s], spin_2 [rad/s]. *Control:* force [N].
-    - *Start:* at rest, the position uniform in +-0.1 m, the angles within 0.1 rad of
-        hanging.
+    - *Start:* at rest, the position uniformly random in +-0.1 m, the angles within 0.1
+        rad of hanging.
     - *Cost:* `0.1 position^2 + 2 (1 - cos(angle_1)) + 2 (1 - cos(angle_2)) +
         0.01 (velocity^2 + spin_1^2 + spin_2^2) + 0.0003 force^2` per step.
     - *End:* when the cart leaves the track. This costs `exit_cost`, more than a whole
         episode of hanging.
     - *Features:* `encode` replaces each angle by its cosine and sine.
 
-    Plans that look ahead by one second swing it up within a second and a half. A linear
-    controller catches it upright only from within a few degrees.
+    A planner with a horizon of one second swings the rods up within 1.5 seconds. A
+    linear controller can balance the rods only if they start within a few degrees of
+    upright.
 
     **Arguments:**
 
-    - `max_force`: the bound of the force [N], 40 by default.
-    - `max_position`: where the track ends [m], 3 by default.
+    - `max_force`: the largest absolute value of the force [N], 40 by default.
+    - `max_position`: the distance from the centre to an end of the track [m], 3 by
+        default.
     - `exit_cost`: the cost of leaving the track, 1500 by default.
 
     Source: Bogdanov, 2004 (the plant); Graichen, Treuer and Zeitz, 2007 (the task).
@@ -186,11 +190,11 @@ def furuta(system: FurutaPendulum, *, max_voltage: Limit = 5.0) -> Fields:
 
     - *State:* arm [rad], angle [rad], 0 upright; arm_rate [rad/s], spin [rad/s].
         *Control:* voltage [V].
-    - *Start:* the arm uniform in +-0.5 rad, the angle within 0.2 rad of hanging, the
-        rates in +-0.5 rad/s.
-    - *Cost:* `0.1 arm^2 + 2 (1 - cos(angle)) + 0.001 (arm_rate^2 + spin^2) +
-        0.001 voltage^2` per step. The arm is not wrapped, because turning it winds up
-        its cable.
+    - *Start:* the arm uniformly random in +-0.5 rad, the angle within 0.2 rad of
+        hanging, the rates in +-0.5 rad/s.
+    - *Cost:* `0.1 arm^2 + 2 (1 - cos(angle)) + 0.001 (arm_rate^2 + spin^2) + 0.001
+        voltage^2` per step. The angle of the arm is not wrapped, because every turn of
+        the arm winds up its cable.
     - *End:* never terminates.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
@@ -198,7 +202,8 @@ def furuta(system: FurutaPendulum, *, max_voltage: Limit = 5.0) -> Fields:
 
     **Arguments:**
 
-    - `max_voltage`: the bound of the voltage [V], 5 by default; the motor takes 10.
+    - `max_voltage`: the largest absolute value of the voltage [V], 5 by default; the
+        motor allows 10 V.
 
     Source: Furuta, Yamakita and Kobayashi, 1992; Cazzolato and Prime, 2011.
 
@@ -222,18 +227,20 @@ def quadrotor_flip(system: PlanarQuadrotor, *, max_thrust: Limit = 1.0) -> Field
 
     - *State:* x [m], y [m], angle [rad], vx [m/s], vy [m/s], rate [rad/s]. *Control:*
         thrusts left and right [N], not negative. *Disturbance:* force_x, force_y [N].
-    - *Start:* x and y uniform in +-0.5 m, the angle within 0.5 rad of upside down, the
-        velocities in +-0.5 m/s, the rate in +-1 rad/s.
+    - *Start:* x and y uniformly random in +-0.5 m, the angle within 0.5 rad of upside
+        down, the velocities in +-0.5 m/s, the rate in +-1 rad/s.
     - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 0.1 (vx^2 + vy^2) + 0.01 rate^2 +
         0.1 |u - u*|^2` per step, where each entry of `u*` is half of the weight.
     - *End:* never terminates.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
-    It falls by 2 or 3 m while it turns, because upside down its rotors push it down.
+    The quadrotor falls by 2 or 3 m while it turns, because its rotors push it down
+    while it is upside down.
 
     **Arguments:**
 
-    - `max_thrust`: the largest thrust of a rotor [N], 1 by default, about the weight.
+    - `max_thrust`: the largest thrust of a rotor [N], 1 by default, which is about the
+        weight of the quadrotor.
 
     Source: Gradu et al., 2021 (the plant); Lupashin, Schöllig, Sherback and D'Andrea,
     2010 (flips).
@@ -260,19 +267,21 @@ def slung_load(system: SlungLoad, *, max_thrust: Limit = 5.0) -> Fields:
     - *State:* x [m] and y [m] of the load, angle [rad], swing [rad], vx [m/s], vy
         [m/s], rate [rad/s], swing_rate [rad/s]. *Control:* the thrusts left [N] and
         right [N], not negative.
-    - *Start:* x and y uniform in +-4 m, the angle in +-0.1 rad, the swing in +-0.8 rad,
-        the velocities and rates in +-0.5.
+    - *Start:* x and y uniformly random in +-4 m, the angle in +-0.1 rad, the swing in
+        +-0.8 rad, the velocities and rates in +-0.5.
     - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 2 (1 - cos(swing)) +
         0.1 (vx^2 + vy^2 + swing_rate^2) + 0.01 rate^2 + 0.01 |u - u*|^2` per step,
         where each entry of `u*` is half of the whole weight.
     - *End:* never terminates.
     - *Features:* `encode` replaces each angle by its cosine and sine.
 
-    From this far, a linear controller asks for too much thrust and tips over.
+    From a start this far away, a linear controller asks for too much thrust, and the
+    quadrotor tips over.
 
     **Arguments:**
 
-    - `max_thrust`: the largest thrust of a rotor [N], 5 by default; 5.9 is the weight.
+    - `max_thrust`: the largest thrust of a rotor [N], 5 by default; the quadrotor and
+        its load weigh 5.9 N.
 
     Source: Sreenath, Lee and Kumar, 2013.
 
@@ -305,16 +314,17 @@ def drift(
     - *State:* vx [m/s], vy [m/s], rate [rad/s]. *Control:* force [N], steering [rad].
     - *Start:* vx within 2 m/s of the speed of the drift, vy in +-0.2 m/s, the rate in
         +-0.1 rad/s.
-    - *Cost:* `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 +
-        1e-7 (force - force*)^2 + (steering - steering*)^2` per step. The stars are the
-        drift to the left, an unstable equilibrium.
+    - *Cost:* `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 + 1e-7 (force -
+        force*)^2 + (steering - steering*)^2` per step. The stars mark the drift to the
+        left, an unstable equilibrium.
     - *End:* never terminates.
 
     **Arguments:**
 
-    - `speed`: vx of the drift [m/s], 8 by default.
+    - `speed`: the forward velocity vx of the drift [m/s], 8 by default.
     - `steering`: steering angle of the drift [rad], 12 degrees to the right by default.
-    - `max_force`: the bound of the force [N], 4500 by default, nine tenths of the grip.
+    - `max_force`: the largest absolute value of the force [N], 4500 by default, which
+        is nine tenths of the grip of the rear tyre.
     - `max_steering`: the largest steering angle to either side [rad], 0.6 by default.
 
     Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014.
@@ -361,22 +371,25 @@ def reactor_start_up(
 
     - *State:* concentration [mol/l], temperature [K]. *Control:* coolant [K]. Time is
         in minutes.
-    - *Start:* the concentration uniform in [0.9, 1] mol/l, with hardly any of the feed
-        reacted, the temperature in [295, 305] K.
+    - *Start:* the concentration uniformly random in [0.9, 1] mol/l, with hardly any of
+        the feed reacted, the temperature in [295, 305] K.
     - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
         step. The stars are the equilibrium at `concentration`.
     - *End:* above `max_temperature`. This costs `shutdown_cost`, more than a whole
         episode of doing nothing.
 
     The plant is that of [`delucax.environments.cstr`][], but the jacket must heat
-    first, and the goal has two unstable poles. Without enough heat the reaction never
-    starts; with too much it runs away.
+    first, and the linear model at the goal has two unstable poles. Without enough heat
+    the reaction never starts; with too much it runs away.
 
     **Arguments:**
 
-    - `concentration`: to hold [mol/l], below that of the feed; 0.3 by default.
-    - `min_coolant`, `max_coolant`: bounds of the coolant [K], 290 and 310 by default.
-    - `max_temperature`: where the reactor is shut down [K], 380 by default.
+    - `concentration`: the concentration to hold [mol/l], below that of the feed; 0.3 by
+        default.
+    - `min_coolant`, `max_coolant`: the lowest and the highest temperature of the
+        coolant [K], 290 and 310 by default.
+    - `max_temperature`: the temperature above which the reactor is shut down [K], 380
+        by default.
     - `shutdown_cost`: the cost of a shutdown, 5000 by default.
 
     Source: Henson and Seborg, 1997.

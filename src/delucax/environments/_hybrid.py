@@ -61,22 +61,22 @@ def bouncing_ball(
     """Keep a ball bouncing to a given height, with a force smaller than its weight.
 
     - *State:* height [m], velocity [m/s]. *Control:* force [N].
-    - *Start:* at rest, at a height uniform in [0.5, 1.5] m.
+    - *Start:* at rest, at a height uniformly random in [0.5, 1.5] m.
     - *Cost:* `(peak - height)^2 + 0.01 force^2` per step, where `height` is the
         argument and `peak` is the height to which the energy of the ball would lift it:
         its height plus `velocity^2 / (2 gravity)`.
     - *End:* when the peak is below 0.05 m. This costs `rest_cost`. Bounces do not
-        accumulate before, unless the restitution is below 0.2.
+        accumulate before the episode ends, unless the restitution is below 0.2.
 
-    The cost and the condition of termination also hold the ball. To change the ball,
-    call this function again, under `jax.vmap` for a batch, instead of using
-    [`delucax.replace`][].
+    The cost and the condition of termination use the parameters of the ball too. To
+    change these parameters, call this function again (under `jax.vmap` for a batch),
+    because [`delucax.replace`][] would change them in one of the three places only.
 
     **Arguments:**
 
     - `drag`: drag of the ball [kg/m], 0.02 by default.
-    - `height`: height of the bounces [m], 2 by default.
-    - `max_force`: the bound of the force [N], 3 by default.
+    - `height`: the height to which the ball should bounce [m], 2 by default.
+    - `max_force`: the largest absolute value of the force [N], 3 by default.
     - `rest_cost`: the cost of letting the ball come to rest, 1000 by default.
 
     Source: Goebel, Sanfelice and Teel, 2012.
@@ -116,16 +116,16 @@ def rimless_wheel(
     """Roll a wheel of spokes down a gentle slope, faster than it rolls by itself.
 
     - *State:* angle [rad], velocity [rad/s]. *Control:* torque [N m].
-    - *Start:* the angle uniform in +-0.2 rad about the vertical, the velocity in [0.8,
-        1.6] rad/s.
+    - *Start:* the angle uniformly random in +-0.2 rad about the vertical, the velocity
+        in [0.8, 1.6] rad/s.
     - *Cost:* `(velocity - speed)^2 + 0.1 torque^2` per step.
     - *End:* when the wheel rolls back. This costs `stall_cost`.
 
     **Arguments:**
 
     - `speed`: the velocity to hold [rad/s], 2 by default.
-    - `max_torque`: the bound of the torque [N m], 2 by default, about half of what
-        holds the wheel on its spokes.
+    - `max_torque`: the largest absolute value of the torque [N m], 2 by default, which
+        is about half of the gravity torque that keeps a standing wheel from rolling.
     - `stall_cost`: the cost of rolling back, 500 by default.
 
     Source: McGeer, 1990; Coleman, Chatterjee and Ruina, 1997.
@@ -194,22 +194,23 @@ def compass_gait(
         angles within 0.01 rad and the rates within 0.03 rad/s of it.
     - *Cost:* `(v - speed)^2 + 0.001 torque^2` per step, where `v` is the speed of the
         hip along the slope.
-    - *End:* when the walker trips, or leans by more than 0.8 rad from the normal of the
-        slope. This costs `fall_cost`.
+    - *End:* when the walker trips (the swing foot is still below the ground after the
+        legs have passed each other), or when the stance leg leans by more than 0.8 rad
+        from the normal of the slope. This costs `fall_cost`.
 
     On the default slope of 3 degrees the walker walks on without control. On level
     ground (`slope=0.0`) it slows down and falls.
 
-    The cost and the condition of termination also hold the walker. To change the
-    walker, call this function again, under `jax.vmap` for a batch, instead of using
-    [`delucax.replace`][].
+    The cost and the condition of termination use the parameters of the walker too. To
+    change these parameters, call this function again (under `jax.vmap` for a batch),
+    because [`delucax.replace`][] would change them in one of the three places only.
 
     **Arguments:**
 
-    - `speed`: the speed of the hip to hold [m/s], 0.73 by default, that of the passive
-        gait on 3 degrees.
-    - `max_torque`: the bound of the torque [N m], 10 by default; 0 for a passive
-        walker.
+    - `speed`: the speed of the hip to hold [m/s], 0.73 by default, which is the speed
+        of the passive gait on a slope of 3 degrees.
+    - `max_torque`: the largest absolute value of the torque [N m], 10 by default; 0 for
+        a passive walker.
     - `fall_cost`: the cost of falling, 200 by default.
 
     Source: Goswami, Thuilot and Espiau, 1998.
@@ -239,19 +240,19 @@ def compass_gait(
 def thermostat(
     system: Thermostat, *, target: Number = 20.0, max_heat: Limit = 2.0
 ) -> Fields:
-    """Reduce the temperature swings of a room with a thermostat, by a heat pump that is
-    too weak to heat alone.
+    """Reduce the temperature swings of a room with a thermostat, with a heat pump that
+    is too weak to heat the room alone.
 
     - *State:* temperature [degC], mode. *Control:* heat [kW]. Time is in hours.
-    - *Start:* the heater is off, the temperature uniform in [19.2, 20.8] degC.
+    - *Start:* the heater is off, the temperature uniformly random in [19.2, 20.8] degC.
     - *Cost:* `(temperature - target)^2 + 0.01 heat^2` per step.
     - *End:* never terminates.
 
     **Arguments:**
 
     - `target`: the temperature to hold [degC], 20 by default.
-    - `max_heat`: the bound of the heat pump, to heat or to cool [kW], 2 by default. To
-        hold the target takes 3 kW.
+    - `max_heat`: the largest heating or cooling power of the heat pump [kW], 2 by
+        default. Holding the default target takes 3 kW of heat.
 
     Source: Ihara and Schweppe, 1981.
 
@@ -280,9 +281,9 @@ def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
     """Bring a mass on a moving belt to rest, so that the belt slips under it.
 
     - *State:* position [m], velocity [m/s], mode. *Control:* force [N].
-    - *Start:* the mass sticks to the belt, the position uniform in +-0.1 m.
+    - *Start:* the mass sticks to the belt, the position uniformly random in +-0.1 m.
     - *Cost:* `100 (position - position*)^2 + 10 velocity^2 + force^2` per step, where
-        `position*` is that at rest.
+        `position*` is the position at rest.
     - *End:* never terminates.
 
     Without control the mass sticks and slips forever.
@@ -290,8 +291,8 @@ def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
     **Arguments:**
 
     - `damping`: damping of the mass [N s/m], 0.1 by default.
-    - `max_force`: the bound of the force [N], 0.5 by default, less than the static and
-        the kinetic friction.
+    - `max_force`: the largest absolute value of the force [N], 0.5 by default, less
+        than the static and the kinetic friction.
 
     Source: Popp and Stelter, 1990.
 
@@ -317,16 +318,17 @@ def valve_with_stops(system: ValveWithStops, *, max_force: Limit = 25.0) -> Fiel
     """Bring the valve of an engine to its open stop, land softly, and hold it there.
 
     - *State:* position, velocity [1/s], mode. *Control:* force [N].
-    - *Start:* free, the position uniform in [0.2, 0.8], the velocity in +-1 per second.
+    - *Start:* free, the position uniformly random in [0.2, 0.8], the velocity in +-1
+        per second.
     - *Cost:* `10 (position - 1)^2 + 0.1 velocity^2 + 0.0002 force^2` per step.
     - *End:* never terminates.
 
     Without control the valve comes to rest between its stops. A force of 19.5 N holds
-    it open.
+    the valve open.
 
     **Arguments:**
 
-    - `max_force`: the bound of the force [N], 25 by default.
+    - `max_force`: the largest absolute value of the force [N], 25 by default.
 
     Source: Hoffmann, Peterson and Stefanopoulou, 2003.
 

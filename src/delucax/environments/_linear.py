@@ -44,7 +44,7 @@ def cartpole_linear(
     - *State:* position $p$ [m], angle $\theta$ [rad], velocity [m/s], spin [rad/s], in
         this order. A positive angle leans towards negative positions. *Control:* force
         $F$ [N], without bounds.
-    - *Start:* each state uniform in +-0.05.
+    - *Start:* each state is uniformly random in +-0.05.
     - *Cost:* $x^\top x + u^\top u$ per step.
     - *End:* never terminates.
 
@@ -54,9 +54,9 @@ def cartpole_linear(
     - `pole_mass`: $m$ [kg], 0.1 by default.
     - `length`: $l$, length of the rod [m], 1 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
-    - `dt`: the step [s], 0.02 by default.
-    - `horizon`: steps per episode, 200 by default, which is 4 s. The paper's code stops
-        after 10 steps.
+    - `dt`: the time step [s], 0.02 by default.
+    - `horizon`: the number of steps per episode, 200 by default, which is 4 s. The
+        paper's code stops after 10 steps.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
@@ -132,26 +132,28 @@ def lds(
     $$x_{k+1} = A x_k + B u_k + w_k, \qquad y_k = C x_k, \qquad
     c = x^\top x + u^\top u$$
 
-    Define it in one of three ways: by matrices, by a linear model `system`, or by a
-    random `key`. The first state is zero. It never terminates.
+    Define the system in one of three ways: with matrices, with a linear model `system`,
+    or with a random `key`. The first state is zero. It never terminates.
 
     **Arguments:**
 
     - `A`, `B`, `C`: the matrices, shapes `(n, n)`, `(n, m)` and `(p, n)`; `C` is the
-        identity by default. Without `A` and `B`, all are drawn with `key`: entries are
-        standard normal, and `A` is scaled to `spectral_radius`.
-    - `system`: a [`delucax.LinearDynamics`][] or a
-        [`delucax.systems.LinearSystem`][], in place of the matrices. The latter is
-        sampled exactly with `dt`. `delucax.interop.from_control` makes one from a
+        identity by default. Without `A` and `B`, all matrices are drawn with `key`:
+        their entries are standard normal, and `A` is scaled to `spectral_radius`.
+    - `system`: a [`delucax.LinearDynamics`][] or a [`delucax.systems.LinearSystem`][],
+        in place of the matrices. A `LinearSystem` is converted exactly to discrete time
+        with the step `dt`. `delucax.interop.from_control` makes one from a
         python-control object, `delucax.interop.read_linear` from a file, and
         [`delucax.linearize`][] from any system.
-    - `dt`: the step, in units of time; 1 by default. It is required for a `system` in
-        continuous time, and must be left out for one in discrete time.
+    - `dt`: the time step, in units of time; 1 by default. `dt` is required for a
+        `system` in continuous time, and must be left out for a `system` in discrete
+        time.
     - `key`: a random key, for random matrices.
     - `states`, `controls`: `n` and `m` of random matrices, 2 and 1 by default.
     - `observations`: `p` of a random `C`; by default `C` is the identity.
-    - `spectral_radius`: that of the random `A`, 0.9 by default. Below 1 it is stable.
-    - `horizon`: steps per episode, 200 by default.
+    - `spectral_radius`: the spectral radius of a random `A`, 0.9 by default. Below 1 it
+        is stable.
+    - `horizon`: the number of steps per episode, 200 by default.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 

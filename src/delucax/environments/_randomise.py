@@ -19,10 +19,11 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     """Domain randomisation: a copy of an environment with some parameters drawn at
     random.
 
-    Use `jax.vmap` over keys to make a batch of plants, which compiles once. Traced
-    draws cannot be checked, so the ends of the ranges are checked instead: each end,
-    with all other parameters at their lower and at their upper ends. Draws by a
-    function are checked only outside of `jax.vmap` and `jax.jit`.
+    Use `jax.vmap` over keys to make a batch of plants, which compiles once. Values that
+    are drawn under `jax.vmap` or `jax.jit` cannot be checked. Therefore the ends of the
+    ranges are checked instead: each end, with all other parameters at their lower and
+    at their upper ends. Values that a function draws are checked only outside of
+    `jax.vmap` and `jax.jit`.
 
     **Arguments:**
 
@@ -35,8 +36,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     **Returns:** the copy.
 
     **Raises:** `ValueError` if a path does not exist or is part of another path, if a
-    range is neither a pair of finite numbers nor a function, or if it holds values that
-    are not valid.
+    range is neither a pair of finite numbers nor a function, or if a range holds values
+    that are not valid.
 
     !!! example
 

@@ -46,7 +46,7 @@ def make(name: str, **kwargs: Any) -> Environment:
 
     - `name`: such as `"pendulum"`. The names of the Deluca paper, such as
         `"classic/pendulum"`, work too. [`delucax.environments.registered`][] lists all.
-    - `**kwargs`: passed to the function that makes the task, such as
+    - `**kwargs`: keyword arguments for the function that makes the task, such as
         [`delucax.environments.pendulum`][].
 
     **Returns:** an [`delucax.Environment`][].
@@ -101,11 +101,11 @@ def register(name: str, entry_point: str) -> None:
     **Arguments:**
 
     - `name`: the name of the task.
-    - `entry_point`: `"module:function"`. It is imported when the task is first made.
-        The function must return an [`delucax.Environment`][].
+    - `entry_point`: `"module:function"`. The module is imported when the task is first
+        made. The function must return an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if the entry point does not have this form, or if another
-    task has the name.
+    **Raises:** `ValueError` if the entry point is not of the form `"module:function"`,
+    or if another task has this name.
 
     !!! example
 

@@ -40,13 +40,13 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fi
     """Bring a mass on a line to rest at the origin.
 
     - *State:* position [m], velocity [m/s]. *Control:* force [N].
-    - *Start:* the position uniform in +-2 m, the velocity in +-1 m/s.
+    - *Start:* the position uniformly random in +-2 m, the velocity in +-1 m/s.
     - *Cost:* `|x|^2 + 0.1 force^2` per step.
     - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_force`: the bound of the force [N], 1 by default.
+    - `max_force`: the largest absolute value of the force [N], 1 by default.
 
     Source: Åström and Murray, 2008.
 
@@ -64,16 +64,17 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fi
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
 def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> Fields:
-    """Bring a mass on a spring, or a chain of masses, to rest by a force on the last.
+    """Bring a mass on a spring, or a chain of masses, to rest with a force on the last
+    mass.
 
     - *State:* positions [m], velocities [m/s]. *Control:* force [N].
-    - *Start:* each state uniform in +-1.
+    - *Start:* each state is uniformly random in +-1.
     - *Cost:* `|x|^2 + 0.1 force^2` per step.
     - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_force`: the bound of the force [N], 1 by default.
+    - `max_force`: the largest absolute value of the force [N], 1 by default.
 
     Source: Åström and Murray, 2008.
 
@@ -94,13 +95,13 @@ def van_der_pol(system: VanDerPol, *, max_control: Limit = 3.0) -> Fields:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
     - *State:* x, v. *Control:* u.
-    - *Start:* each state uniform in +-2.
+    - *Start:* each state is uniformly random in +-2.
     - *Cost:* `x^2 + v^2 + 0.1 u^2` per step.
     - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_control`: the bound of the control, 3 by default.
+    - `max_control`: the largest absolute value of the control, 3 by default.
 
     Source: van der Pol, 1926.
 
@@ -121,14 +122,14 @@ def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
     - *State:* x, y, z. *Control:* u.
-    - *Start:* x and y uniform in +-20, z in [10, 40].
+    - *Start:* x and y uniformly random in +-20, z in [10, 40].
     - *Cost:* `(x - x*)^2 + (y - y*)^2 + (z - z*)^2 + 0.001 u^2` per step, where the
-        stars are the equilibrium.
+        stars mark the equilibrium.
     - *End:* never terminates.
 
     **Arguments:**
 
-    - `max_control`: the bound of the control, 50 by default.
+    - `max_control`: the largest absolute value of the control, 50 by default.
 
     Source: Lorenz, 1963; Kaiser, Kutz and Brunton, 2018.
 
@@ -152,7 +153,7 @@ def two_tank(system: TwoTank, *, level: Limit = 10.0, max_flow: Limit = 30.0) ->
 
     - *State:* the levels upper [cm] and lower [cm]. *Control:* flow [cm^3/s], not
         negative.
-    - *Start:* the levels uniform in [0, 20] cm.
+    - *Start:* the levels uniformly random in [0, 20] cm.
     - *Cost:* `(lower - level)^2 + 0.01 (flow - flow*)^2` per step, where `flow*` is the
         flow that holds the level.
     - *End:* never terminates.
@@ -191,15 +192,15 @@ def cstr(
         in minutes.
     - *Start:* within 0.05 mol/l and 3 K of the equilibrium.
     - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
-        step. The stars are the equilibrium at `concentration`.
+        step. The stars mark the equilibrium at `concentration`.
     - *End:* never terminates.
 
     **Arguments:**
 
     - `concentration`: the concentration to hold [mol/l], below that of the feed; 0.5 by
         default.
-    - `min_coolant`, `max_coolant`: the bounds of the coolant [K], 280 and 320 by
-        default.
+    - `min_coolant`, `max_coolant`: the lowest and the highest temperature of the
+        coolant [K], 280 and 320 by default.
 
     Source: Henson and Seborg, 1997.
 
@@ -225,15 +226,15 @@ def permanent_magnet_motor(
 
     - *State:* i_d [A], i_q [A], speed [rad/s]. *Control:* v_d [V], v_q [V].
         *Disturbance:* load [N m].
-    - *Start:* the currents uniform in +-1 A, the speed in +-50 rad/s.
+    - *Start:* the currents uniformly random in +-1 A, the speed in +-50 rad/s.
     - *Cost:* `0.01 |i - i*|^2 + 0.001 (speed - speed*)^2 + 1e-5 |v - v*|^2` per step,
-        where the stars are the equilibrium at the speed, without load.
+        where the stars mark the equilibrium at the speed, without load.
     - *End:* never terminates.
 
     **Arguments:**
 
     - `speed`: the speed to hold [rad/s], 100 by default.
-    - `max_voltage`: the bound of each voltage [V], 150 by default.
+    - `max_voltage`: the largest absolute value of each voltage [V], 150 by default.
 
     Source: Krause, Wasynczuk and Sudhoff, 2002.
 
@@ -269,7 +270,7 @@ def _drawn(
 def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
     """Bring the state of a learned vector field to the origin.
 
-    - *Start:* each state uniform in +-1.
+    - *Start:* each state is uniformly random in +-1.
     - *Cost:* `|x|^2 + 0.1 |u|^2` per step.
     - *End:* never terminates.
 
@@ -281,7 +282,7 @@ def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
     - `key`: a random key for random weights.
     - `states`, `controls`, `width`: sizes of the network with random weights, 2, 1 and
         32 by default; see [`delucax.systems.NeuralSystem`][].
-    - `max_control`: the bound of each control, 1 by default.
+    - `max_control`: the largest absolute value of each control, 1 by default.
 
     Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
 

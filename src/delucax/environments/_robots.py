@@ -83,8 +83,8 @@ def kinematic_bicycle(
 
     - *State:* x [m], y [m], heading [rad], speed [m/s]. *Control:* acceleration
         [m/s^2], steering [rad].
-    - *Start:* at x = 0, y uniform in +-2 m, the heading in +-0.3 rad, the speed within
-        3 m/s of the one to hold.
+    - *Start:* at x = 0, y uniformly random in +-2 m, the heading in +-0.3 rad, the
+        speed within 3 m/s of the speed to hold.
     - *Cost:* `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 +
         steering^2` per step, where `speed*` is the speed to hold. The heading is
         wrapped.
@@ -94,10 +94,9 @@ def kinematic_bicycle(
     **Arguments:**
 
     - `speed`: the speed to hold [m/s], 10 by default.
-    - `max_acceleration`: the bound of the acceleration, in either direction [m/s^2], 3
-        by default.
-    - `max_steering`: the bound of the steering angle, to either side [rad], 0.5 by
+    - `max_acceleration`: the largest absolute value of the acceleration [m/s^2], 3 by
         default.
+    - `max_steering`: the largest steering angle to either side [rad], 0.5 by default.
 
     Source: Kong, Pfeiffer, Schildbach and Borrelli, 2015.
 
@@ -125,8 +124,8 @@ def dynamic_bicycle(
 
     - *State:* x [m], y [m], heading [rad], vx [m/s], vy [m/s], rate [rad/s]. *Control:*
         acceleration [m/s^2], steering [rad].
-    - *Start:* at x = 0, y uniform in +-2 m, the heading in +-0.1 rad, vx within 5 m/s
-        of the speed to hold, vy in +-0.5 m/s, the rate in +-0.2 rad/s.
+    - *Start:* at x = 0, y uniformly random in +-2 m, the heading in +-0.1 rad, vx
+        within 5 m/s of the speed to hold, vy in +-0.5 m/s, the rate in +-0.2 rad/s.
     - *Cost:* `y^2 + heading^2 + 0.1 ((vx - speed*)^2 + vy^2 + rate^2) +
         0.1 acceleration^2 + steering^2` per step, where `speed*` is the speed to hold.
         The heading is wrapped.
@@ -136,10 +135,9 @@ def dynamic_bicycle(
     **Arguments:**
 
     - `speed`: the speed to hold [m/s], 20 by default.
-    - `max_acceleration`: the bound of the acceleration, in either direction [m/s^2], 5
-        by default.
-    - `max_steering`: the bound of the steering angle, to either side [rad], 0.2 by
+    - `max_acceleration`: the largest absolute value of the acceleration [m/s^2], 5 by
         default.
+    - `max_steering`: the largest steering angle to either side [rad], 0.2 by default.
 
     Source: Rajamani, 2012.
 
@@ -191,7 +189,7 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
         force_y [N].
     - *Start:* at rest at (1, 1).
     - *Cost:* `|x|^2 + 0.1 |u - u*|^2` per step, where each entry of `u*` is half of the
-        weight, whatever the wind.
+        weight, with or without wind.
     - *End:* never terminates.
 
     The default solver is explicit Euler, as in the paper.
@@ -249,8 +247,8 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
     - *State:* 13 entries: position [m], quaternion, velocity [m/s], body rates [rad/s].
         *Control:* the thrusts front, left, back and right [N]; or with
         `inputs="wrench"` thrust [N] and torques [N m]. *Disturbance:* a force [N].
-    - *Start:* the position uniform in +-1 m, the velocity in +-0.5 m/s, the rates in
-        +-0.5 rad/s, the attitude up to about 40 degrees from level.
+    - *Start:* the position uniformly random in +-1 m, the velocity in +-0.5 m/s, the
+        rates in +-0.5 rad/s, the attitude up to about 40 degrees from level.
     - *Cost:* $|p|^2 + |q - q^*|^2 + 0.1 (|v|^2 + |\omega|^2) + 0.1 |u - u^*|^2$ per
         step, with the attitude $q^*$ and the control $u^*$ of hovering.
     - *End:* never terminates.
@@ -261,7 +259,8 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
     **Arguments:**
 
     - `max_thrust`: the largest thrust of a rotor [N], 6 by default; the smallest is 0.
-        A wrench is bounded by the largest that the rotors give on each axis.
+        With `inputs="wrench"`, the thrust and each torque are bounded by the largest
+        value that the rotors can give.
 
     Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016.
 
@@ -347,9 +346,9 @@ def reacher(
 
     The default solver is explicit Euler, as in the paper.
 
-    The cost and `encode` also hold the arm. To change the arm, call this function
-    again, under `jax.vmap` for a batch: [`delucax.replace`][] would change only one of
-    the three.
+    The cost and `encode` use the parameters of the arm too. To change these parameters,
+    call this function again (under `jax.vmap` for a batch), because
+    [`delucax.replace`][] would change them in one of the three places only.
 
     **Arguments:**
 

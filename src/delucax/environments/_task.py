@@ -32,7 +32,7 @@ from ._environment import Environment
 
 
 class UniformState(eqx.Module):
-    """A first state, drawn uniformly from a box.
+    """An initial state that is drawn uniformly from a box.
 
     Pass it as `initial_state` of a [`delucax.Environment`][].
 
@@ -165,11 +165,13 @@ def task(
             substeps: int = substeps,
             **others: Any,
         ) -> Environment:
-            """- `system`: a [`delucax.systems.{kind}`][], by default from `others`.
+            """- `system`: a [`delucax.systems.{kind}`][]; by default one is made from
+                `others`.
             - `dt`: the control interval{unit}, {dt} by default.
-            - `horizon`: steps per episode, {horizon} by default.
+            - `horizon`: the number of steps per episode, {horizon} by default.
             - `solver`: a Diffrax solver, {solver}.
-            - `substeps`: solver steps per interval, {substeps} by default.
+            - `substeps`: the number of solver steps per control interval, {substeps} by
+                default.
             - `**others`: arguments of [`delucax.systems.{kind}`][] or
                 [`delucax.Environment`][], such as `disturbance`.
 
@@ -177,7 +179,8 @@ def task(
 
             **Raises:** `ValueError` on invalid numbers, or on arguments that exclude
             each other: a system and arguments of its class, or a solver and limits of
-            Gym's integrator. `substeps` needs a solver in tasks with Gym's integrator.
+            Gym's integrator. A task with Gym's integrator also raises it if `substeps`
+            is given without a `solver`.
             """
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             check_step(dt, where)
