@@ -31,11 +31,11 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def constrain(self, z: Array) -> Array:
-        """The valid value of an unconstrained `z`."""
+        """The valid value that belongs to an unconstrained number `z`."""
 
     @abc.abstractmethod
     def unconstrain(self, value: Array) -> Array:
-        """The `z` with `constrain(z)` equal to `value`."""
+        """The unconstrained number `z` for which `constrain(z)` equals `value`."""
 
     @abc.abstractmethod
     def holds(self, value: Array) -> Array:
@@ -43,8 +43,8 @@ class AbstractConstraint(eqx.Module):
 
 
 class _Positive(AbstractConstraint):
-    """The constraint that values are above zero. Training changes the logarithm, so
-    steps are relative.
+    """The constraint that values are above zero. Training changes the logarithm of a
+    value instead of the value, so that training steps are relative changes.
 
     !!! example
 
@@ -88,7 +88,8 @@ class bounded(AbstractConstraint):
     r"""The constraint $\mathrm{low} < x < \mathrm{high}$ of a [`delucax.parameter`][]
     or [`delucax.weight`][].
 
-    Training changes the logit of the value, so that no step can leave the interval.
+    Training changes the logit of the value instead of the value, so that no training
+    step can leave the interval.
 
     **Arguments:**
 
@@ -211,8 +212,8 @@ def parameter(
     - `default`: the default value, a number or an array. Without it, the field is
         required.
     - `constraint`: the valid values, [`delucax.positive`][] or a [`delucax.bounded`][];
-        none by default. It is checked when a module is made, and `delucax.training.fit`
-        keeps it.
+        none by default. The constraint is checked when a module is constructed, and
+        [`delucax.training.fit`][] keeps to it.
 
     **Returns:** a dataclass field.
 

@@ -88,25 +88,25 @@ def by_path(flat: Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Arr
 
 
 def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
-    """Replace leaves by their paths: a copy of `tree` with new values.
+    """Copy a `tree` with new values for the leaves at given paths.
 
-    Nothing compiles again, because a number that replaces a [`delucax.parameter`][]
-    becomes the same kind of leaf. If you replace the dynamics of an environment, the
-    fields that it derived from the old dynamics follow: its default disturbance, and an
-    initial state of zeros.
+    Compiled functions do not compile again, because a number that replaces a
+    [`delucax.parameter`][] becomes the same kind of leaf. If you replace the dynamics
+    of an environment, the fields that were derived from the old dynamics are derived
+    again: its default disturbance, and an initial state of zeros.
 
-    After all changes, every module above a change runs the checks of its constructor.
-    Pass values that only fit together in one call. In a batch from `jax.vmap`, every
-    member is checked. In a batch of more than 4096, only a sample is checked, with a
-    warning: the members with extreme numbers, and others spread evenly. For traced
-    values, only shapes are checked.
+    After all changes, every module that contains a changed leaf runs the checks of its
+    constructor. If several new values are valid only together, pass them in one call.
+    In a batch from `jax.vmap`, every member is checked. In a batch of more than 4096,
+    only a sample is checked, with a warning: the members with extreme numbers, and
+    others spread evenly. For traced values, only shapes are checked.
 
     **Arguments:**
 
     - `tree`: any pytree, for example an environment or a controller.
     - `changes`: a dictionary from paths to new values. A path is a string of names
-        joined by dots, such as `"dynamics.system.length"`; whole numbers index
-        sequences.
+        joined by dots, such as `"dynamics.system.length"`; a whole number is the index
+        of an item in a sequence.
 
     **Returns:** the copy.
 

@@ -86,20 +86,20 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     """Load what [`delucax.save`][] wrote.
 
     Loading runs no code from the file: classes and functions are looked up by name, and
-    only in trusted packages. But the loaded object calls the functions that the file
-    names. Only load files from sources that you trust.
+    only in trusted packages. But the loaded object calls the functions that are named
+    in the file. Only load files from sources that you trust.
 
     **Arguments:**
 
     - `path`: the file to read.
-    - `trust`: names of more packages or modules whose classes and functions the file
-        may use; none by default. Always trusted are delucax, Diffrax, Equinox, Lineax,
-        Optax, Optimistix, the public functions of JAX and NumPy, and what you defined
-        in the running notebook or script.
+    - `trust`: names of additional packages or modules whose classes and functions the
+        file may use; none by default. Always trusted are delucax, Diffrax, Equinox,
+        Lineax, Optax, Optimistix, the public functions of JAX and NumPy, and what you
+        defined in the running notebook or script.
 
     **Returns:** the object, with the same structure. A function that was compiled for
-    the saved object does not compile again. If JAX is in single precision, arrays in
-    double precision are rounded, with a warning.
+    the saved object does not compile again for the loaded object. If JAX is in single
+    precision, arrays in double precision are rounded, with a warning.
 
     **Raises:** `ValueError` if the file is damaged, not from delucax or from a newer
     version, or if it names something that is not trusted, does not exist or has other

@@ -259,7 +259,7 @@ def _forwarded_units(what: str) -> Any:
         return getattr(self._inside, f"{what}_units") if same else ()
 
     doc = "The units of the wrapped plant if its names are the same, else ()."
-    return property(units, doc=doc)." )
+    return property(units, doc=doc)
 
 
 class Forwarding(AbstractDynamics):

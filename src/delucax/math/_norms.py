@@ -58,17 +58,17 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
     """Clip `x` to the range from `low` to `high`, either of which may be infinite.
 
     On CPU it is faster than `jnp.clip` for a batch, because it uses comparisons.
-    `jnp.clip` must also propagate a NaN of the limits, which takes as long as the rest
-    of a pendulum's step. Here NaN limits are ignored. A NaN in `x` stays NaN. The
-    gradient goes to `x` where it is within the limits or on them, and to the limit
-    elsewhere.
+    `jnp.clip` must also propagate NaN limits, and in a step of the pendulum this takes
+    as long as everything else. Here NaN limits are ignored. A NaN in `x` stays NaN. The
+    gradient goes to `x` if `x` is within the limits or equal to one of them, and to the
+    limit otherwise.
 
     **Arguments:**
 
     - `x`: an array of any shape.
     - `low`, `high`: the limits, numbers or arrays that broadcast against `x`.
 
-    **Returns:** the clipped array, of the dtype to which the three promote.
+    **Returns:** the clipped array, of the dtype to which the three arguments promote.
 
     !!! example
 

@@ -85,9 +85,10 @@ def rollout(
     The final cost is charged once: at the last state, or at the first state that
     terminates the episode. After termination, the state is held and costs nothing.
 
-    `rollout` is already compiled: call it directly. Another key, start or number does
-    not compile again. For a batch, use `jax.vmap`. You can differentiate with respect
-    to every array leaf of the arguments.
+    `rollout` is already compiled: call it directly, without `jax.jit`. A call with
+    another random key, first state or parameter does not compile it again. For a batch,
+    use `jax.vmap`. You can differentiate with respect to every array leaf of the
+    arguments.
 
     **Arguments:**
 
@@ -95,7 +96,7 @@ def rollout(
     - `controller`: a [`delucax.AbstractController`][].
     - `key`: a random key for the first state, the disturbances, the sensor noise and
         the controller.
-    - `horizon`: the number of steps; that of the environment by default.
+    - `horizon`: the number of steps; by default the horizon of the environment.
     - `x0`: the first state, shape `(n,)`; drawn by the environment by default.
     - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default. For
         a system with a diffusion, pass Brownian increments: standard normal numbers
@@ -103,30 +104,33 @@ def rollout(
     - `keep`: the names of the arrays that the trajectory stores. By default all of
         `"states"`, `"observations"`, `"controls"`, `"disturbances"`, `"costs"`,
         `"terminated"`, `"incidents"` and `"controller_state"`. For a plant with events
-        you may add `"events"`; they need room for `2 * max_events` states per step.
+        you may add `"events"`; the events need memory for `2 * max_events` states per
+        step.
     - `checkpoint`: what the gradient stores. `"step"` (default) stores the state at
-        each step, and computes the step again. `"sqrt"` stores about the square root of
-        that many states; use it for long horizons. `None` stores all intermediate
-        values and computes nothing again.
+        each step, and computes each step a second time in the backward pass. `"sqrt"`
+        stores only about the square root of that number of states; use it for long
+        horizons. `None` stores all intermediate values and computes no step a second
+        time.
     - `gradient_decay`: a factor on the gradient that passes back through the state at
         each step. 1 (default) gives the true gradient. 0.9 damps exploding gradients
-        over a long, unstable horizon. To forget over a fixed time `tau` for any `dt`,
-        use `exp(-dt / tau)`.
+        over a long, unstable horizon. To let the gradient decay with the time constant
+        `tau`, whatever `dt` is, use `exp(-dt / tau)`.
     - `truncate`: cut the gradient before every `truncate`-th step, in the state and in
         the memory of the controller (truncated back-propagation). Never by default.
     - `throw`: whether to raise if a step fails, the states become NaN or infinite, or a
-        learner refuses an update; true by default. With `throw=False`, check
-        `trajectory.result` yourself.
+        learning controller refuses an update; true by default. With `throw=False`,
+        check `trajectory.result` yourself.
 
     **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first of these that
     applies: the first failure of a step; `diverged`; `update_refused`, if the update of
-    a learner was not finite; `plan_failed`, `estimate_failed` or `filter_failed`, if a
-    plan, an estimate or a safety filter of the controller did not succeed; success.
-    `throw` does not raise on the last three failures, because the controller handles
-    them (see `throw=` of [`delucax.controllers.MPC`][]).
+    a learning controller was not finite; `plan_failed`, `estimate_failed` or
+    `filter_failed`, if a plan, an estimate or a safety filter of the controller did not
+    succeed; success. `throw` does not raise an error for `plan_failed`,
+    `estimate_failed` and `filter_failed`, because the controller handles them (see
+    `throw=` of [`delucax.controllers.MPC`][]).
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape. An error at run
-    time if the rollout fails and `throw` is true.
+    **Raises:** `ValueError` on an argument of the wrong kind or shape. An error is
+    raised at run time if the rollout fails and `throw` is true.
 
     !!! example
 

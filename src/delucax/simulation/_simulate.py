@@ -72,25 +72,26 @@ def simulate(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    r"""Simulate a controlled system over the whole horizon in one solve.
+    r"""Simulate a controlled system over the whole horizon with one call of an ODE
+    solver.
 
-    It integrates $\dot x = f(t, x, u, w)$ from `t0` to `t1` by a single
+    `simulate` integrates $\dot x = f(t, x, u, w)$ from `t0` to `t1` by a single call of
     `diffrax.diffeqsolve`, so that `adjoint` applies to the gradient of the whole
-    horizon. It is already compiled: call it directly.
+    horizon. `simulate` is already compiled: call it directly, without `jax.jit`.
 
-    The horizon is cut into $T$ equal intervals. With `hold="zero"`, the control of an
-    interval is held over it. The solve is exact at the switches: no step crosses a
-    switch, all stages of a step use the control of its interval, and a step that starts
-    at a switch uses no slope from before.
+    The horizon is cut into $T$ equal intervals. With `hold="zero"`, the control is held
+    constant over each interval and switches between intervals. The solve is exact at
+    the switches: no step crosses a switch, all stages of a step use the control of its
+    interval, and a step that starts at a switch uses no slope from before.
 
-    A late start costs no precision, because the solve counts its time in intervals from
+    A large `t0` costs no precision, because the solve counts its time in intervals from
     `t0`. In single precision, switches are rounded to about `1e-7 (t1 - t0)`, however
-    large `t0` is. A step-size controller gets the time since `t0`. A field whose
+    large `t0` is. A step-size controller gets the time since `t0`. A vector field whose
     control is not held is corrected for the rounding of `t0 + s`, as in
     [`delucax.Discretized`][]. Held controllers get the rounded time.
 
-    There are no costs: `costs` of the trajectory is `None`, and `final_cost` and
-    `total_cost` are zero.
+    `simulate` computes no costs: `costs` of the trajectory is `None`, and `final_cost`
+    and `total_cost` are zero.
 
     **Arguments:**
 
@@ -99,50 +100,55 @@ def simulate(
 
         - an array of controls, shape `(T, m)`;
         - a function of time to a control, shape `(m,)`;
-        - a controller. A held controller reads the sensor at each switch. Its `applied`
-            is called right after, with its own control and a cost of zero, so a
-            controller that learns from costs is refused.
+        - a controller. A held controller reads the sensor at each switch. Then its
+            method `applied` is called with its own control and a cost of zero, so
+            `simulate` refuses a controller that learns from costs.
 
     - `t0`, `t1`: start and end of the horizon, in units of time, with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
-    - `hold`: `"zero"` (default) to hold the control over each interval. `None` for a
-        control that is a function of time, or for continuous feedback
-        $u = \pi(t, h(t, x))$ by a controller that has no state.
-    - `dt`: the interval, in units of time; `t1 - t0` must be a whole multiple. By
-        default `(t1 - t0) / T` if `controller_or_controls` or `w` is an array; required
-        otherwise.
+    - `hold`: `"zero"` (default) to hold the control over each interval. Pass `None` for
+        a control that is a function of time, or for continuous feedback $u = \pi(t,
+        h(t, x))$ by a controller that has no state.
+    - `dt`: the length of an interval, in units of time; `t1 - t0` must be a whole
+        multiple of `dt`. By default it is `(t1 - t0) / T` if `controller_or_controls`
+        or `w` is an array; otherwise `dt` is required.
     - `w`: disturbances that enter the vector field, shape `(T, k)`, held over the
         intervals with any `hold`; zero by default.
     - `solver`: a Diffrax solver; `diffrax.Tsit5()` by default.
-    - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
-        `None` (default) for fixed steps.
-    - `substeps`: fixed steps per interval, 1 by default.
+    - `stepsize_controller`: a step-size controller of Diffrax, such as
+        `diffrax.PIDController(rtol=1e-6, atol=1e-8)`; `None` (default) for fixed steps.
+    - `substeps`: the number of fixed steps per interval, 1 by default.
     - `adjoint`: `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()` or
-        `diffrax.BacksolveAdjoint()`. The last needs a `stepsize_controller`, and does
-        not work with a held controller, because its memory cannot run backwards. With
-        `ts`, it raises if you ask for a gradient with respect to `t0`, `t1` or `ts`.
+        `diffrax.BacksolveAdjoint()`. `diffrax.BacksolveAdjoint()` needs a
+        `stepsize_controller`, and does not work with a held controller, because the
+        memory of a controller cannot run backwards. With `ts`,
+        `diffrax.BacksolveAdjoint()` raises an error if you ask for a gradient with
+        respect to `t0`, `t1` or `ts`.
     - `max_steps`: the largest number of adaptive steps over the horizon; by default
         4096, or 64 per interval if that is more.
     - `ts`: the times to save at, shape `(S + 1,)`, increasing and between `t0` and
         `t1`. By default the `T + 1` ends of the intervals; the states there are not
         interpolated.
     - `key`: a random key for the controller's `init`; none by default.
-    - `progress_meter`: such as `diffrax.TqdmProgressMeter()`; none by default.
+    - `progress_meter`: a progress meter of Diffrax, such as
+        `diffrax.TqdmProgressMeter()`; none by default.
     - `throw`: whether to raise if the solve fails or the state becomes NaN or infinite;
         true by default. With `throw=False`, check `trajectory.result` yourself.
 
     **Returns:** a [`delucax.Trajectory`][] at the saved times. Its `controls` and
-    `disturbances` are those that act just before each time, from the second on. With
-    `hold=None`, `controls` are those just after each time, up to the last but one.
-    `observations` are the readings of the sensor at each time, up to the last but one.
+    `disturbances` are the values just before each saved time, without the first time.
+    With `hold=None`, its `controls` are the values just after each saved time, without
+    the last time. Its `observations` are the readings of the sensor at each saved time,
+    without the last time.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
     adjoint that does not fit, on a controller that learns from costs, and on more than
-    2^22 steps in single precision, which is too coarse for their times. It also raises
-    on systems that one solve cannot integrate: systems that override `project`, systems
-    with a `diffusion` or events, and systems without `disturbance_names` if `w` is
-    given. Use [`delucax.Discretized`][] for these. An error at run time if the solve
+    2^22 steps in single precision, because the times are then too coarse to resolve a
+    step. The error is also raised for systems that cannot be integrated by one call of
+    the solver: systems that override `project`, systems with a `diffusion` or events,
+    and systems without `disturbance_names` if `w` is given. Use
+    [`delucax.Discretized`][] for these. An error is raised at run time if the solve
     fails and `throw` is true.
 
     Source: Kidger, 2021 (Diffrax).

@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 class Trajectory(eqx.Module):
     """The record of a simulation: `T` steps and `T + 1` states.
 
-    [`delucax.rollout`][] and [`delucax.simulate`][] return it. Arrays that you left out
-    of `keep=` are `None`. Under `jax.vmap` every array has a leading batch axis.
+    [`delucax.rollout`][] and [`delucax.simulate`][] return it. An array that you left
+    out of the argument `keep` of `rollout` is `None`. Under `jax.vmap` every array has
+    a leading batch axis.
 
     **Attributes:**
 
     - `times`: shape `(T + 1,)`, in units of time.
     - `states`: shape `(T + 1, n)`.
-    - `observations`: those that the controller got, shape `(T, p)`.
-    - `controls`: those that were applied, after the bounds, shape `(T, m)`.
+    - `observations`: the observations that the controller got, shape `(T, p)`.
+    - `controls`: the controls that were applied, after clipping to the bounds, shape
+        `(T, m)`.
     - `disturbances`: shape `(T, k)`.
     - `costs`: stage costs, shape `(T,)`; 0 after termination.
     - `terminated`: whether the episode had terminated after step k, shape `(T,)`.
@@ -41,17 +43,20 @@ class Trajectory(eqx.Module):
     - `total_cost`: the sum of the stage costs and the final cost, a scalar.
     - `length`: the number of steps until termination, or T without termination.
     - `ended`: whether the episode terminated within the T steps.
-    - `result`: the first failure, or success; one of `delucax.RESULTS`.
-    - `incidents`: a dictionary from each kind of incident in the controller to the
-        steps at which it happened, booleans of shape `(T,)`. The kinds are
+    - `result`: the first failure, or success if nothing failed; one of
+        `delucax.RESULTS`.
+    - `incidents`: a dictionary from the name of each kind of incident to booleans of
+        shape `(T,)`, which are true at the steps at which the incident happened. The
+        kinds are
 
         - `"clipped_control"`: the bounds of the environment changed the control.
         - `"failed_plan"`: a plan of [`delucax.controllers.MPC`][] did not succeed.
         - `"failed_estimate"`: an estimator did not succeed.
         - `"failed_filter"`: a [`delucax.controllers.SafetyFilter`][] found no control
             that keeps its barriers.
-        - `"refused_update"`: the update of a learner was not finite, and was not made.
-        - others that a controller counts with [`delucax.controllers.Tally`][].
+        - `"refused_update"`: the update of a learning controller was not finite and was
+            left out.
+        - other incidents that a controller counts with [`delucax.controllers.Tally`][].
 
     - `controller_state`: the arrays of the controller's state at the end.
     - `dt`: the control interval, in units of time.
@@ -60,7 +65,8 @@ class Trajectory(eqx.Module):
     - `recorded_times`, `recorded_observations`, `recorded_disturbances`,
         `recorded_terminated`, `recorded_events`: the stored arrays behind `times`,
         `observations`, `disturbances`, `terminated` and `events`, or `None` if they
-        follow from other fields. Read the latter instead.
+        follow from other fields. Read `times`, `observations` and so on instead of
+        these.
     - `state_names`, `control_names`, `state_units`, `control_units`, `event_names`:
         tuples of strings. `time_unit`: a string.
 
@@ -119,7 +125,7 @@ class Trajectory(eqx.Module):
         length T. `times` and `kinds` have shape `(T, max_events)`, `before` and `after`
         have shape `(T, max_events, n)`.
 
-        **Raises:** `ValueError` if they were not kept.
+        **Raises:** `ValueError` if the events were not kept.
         """
         if self.recorded_events is None:
             raise ValueError(
@@ -131,7 +137,8 @@ class Trajectory(eqx.Module):
     def event_list(self) -> list[tuple[float, str]]:
         """The events of one trajectory in order, each as `(time, name)`.
 
-        **Raises:** `ValueError` if they were not kept, or for a batch.
+        **Raises:** `ValueError` if the events were not kept, or if the trajectory is a
+        batch.
         """
         if self.batch_shape:
             raise ValueError(
@@ -283,10 +290,10 @@ class Trajectory(eqx.Module):
         """A table with one row per time: `time`, states, controls, disturbances and
         `cost`.
 
-        A batch has its index in the column `batch`, or in the columns `batch0`,
-        `batch1`, ... if it has several axes. If a name is already in use, `state`,
-        `control` or `disturbance` is put before it. The last row of each trajectory has
-        no control, disturbance or cost.
+        For a batch, the column `batch` holds the index of the trajectory; if the batch
+        has several axes, the columns `batch0`, `batch1`, ... hold the indices. If a
+        name is already in use, `state`, `control` or `disturbance` is put before it.
+        The last row of each trajectory has no control, disturbance or cost.
 
         **Returns:** a `pandas.DataFrame`.
 
@@ -327,15 +334,15 @@ class Trajectory(eqx.Module):
         return pd.DataFrame({k: np.ravel(v) for k, v in columns.items()})
 
     def statistics(self) -> dict[str, Array]:
-        """Statistics of the total cost over a batch, and of how its members ended.
+        """Statistics over a batch: of the total cost, and of how the episodes ended.
 
         One trajectory counts as a batch of one. It works under `jax.jit`.
 
         **Returns:** a dictionary to scalars. `"5%"`, `"25%"`, `"50%"`, `"75%"`, `"95%"`
         and `"mean"` are quantiles and the mean of the total cost, over the members
-        whose cost is finite (NaN if there are none). `"finite"` is the fraction of
-        these members, `"successful"` the fraction that is not `failed`, `"terminated"`
-        the fraction whose episode terminated.
+        whose cost is finite (NaN if there are none). `"finite"` is the fraction of the
+        members whose total cost is finite, `"successful"` the fraction that did not
+        fail (see `failed`), and `"terminated"` the fraction whose episode terminated.
 
         !!! example
 

@@ -252,8 +252,8 @@ class Acrobot(AbstractSystem):
     The state is (angle_1 [rad], angle_2 [rad], velocity_1 [rad/s], velocity_2 [rad/s]),
     the control is (torque [N m]). The disturbance (push [N m]) is added to the torque.
     The first link hangs down at `angle_1 = 0`, and `angle_2` is measured from the line
-    of the first link. The vector field is smooth. `equilibrium` is the upright one,
-    `angle_1 = pi`.
+    of the first link. The vector field is smooth. `equilibrium` is the upright
+    position, `angle_1 = pi`.
 
     **Arguments:**
 
@@ -266,8 +266,8 @@ class Acrobot(AbstractSystem):
         mass [kg m^2], 1 by default.
     - `gravity`: $g$ [m/s^2], 9.8 by default.
     - `form`: `"book"` (default) for the equations of motion; or `"nips"` for the
-        equations printed in the paper. Those lack the term in $\dot\theta_1^2$ and do
-        not conserve energy.
+        equations printed in the paper. The equations in the paper lack the term in
+        $\dot\theta_1^2$ and do not conserve energy.
 
     **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
     not finite, or `form` is neither `"book"` nor `"nips"`.

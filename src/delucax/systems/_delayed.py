@@ -16,8 +16,8 @@ class AbstractDelaySystem(AbstractPlant):
 
     $$\dot x(t) = f(t, x(t), u, w, x(t - \tau_1), \dots, x(t - \tau_d))$$
 
-    Subclass it like [`delucax.AbstractSystem`][]; its `vector_field` takes one more
-    argument, `late`, which holds the delayed states.
+    Subclass `AbstractDelaySystem` like [`delucax.AbstractSystem`][]; its `vector_field`
+    takes one more argument, `late`, which holds the delayed states.
     [`delucax.dynamics.MethodOfSteps`][] turns it into discrete-time dynamics. If only
     controls or sensor readings are late, use [`delucax.dynamics.TransportDelay`][]
     instead.

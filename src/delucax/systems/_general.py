@@ -44,8 +44,9 @@ class LinearSystem(AbstractSystem):
     - `A`: shape `(n, n)`.
     - `B`: shape `(n, m)`.
     - `C`: shape `(p, n)`; the identity by default.
-    - `E`: shape `(n, k)`: how `w` enters the vector field. By default `w` has the size
-        of the state, and the discrete-time dynamics add it to the next state.
+    - `E`: shape `(n, k)`, by which the disturbance `w` enters the vector field. By
+        default `w` has the size of the state, and the discrete-time dynamics add it to
+        the next state.
     - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`; zero by default.
     - `dx_ref`: $\dot x_\mathrm{ref}$, the vector field at the operating point, shape
         `(n,)`; zero by default.
@@ -132,8 +133,8 @@ class FunctionSystem(AbstractSystem):
 
     **Arguments:**
 
-    - `function`: `(t, x, u, w) -> dx/dt`. It may be an `eqx.Module`: its arrays are
-        then leaves of the system.
+    - `function`: `(t, x, u, w) -> dx/dt`. The function may be an `eqx.Module`: its
+        arrays are then leaves of the system.
     - `state_names`, `control_names`: tuples of strings.
     - `disturbance_names`: a tuple of strings, empty by default.
 
@@ -173,12 +174,13 @@ def system(
 
     **Arguments:**
 
-    - `f`: the vector field. Constants inside a function are fixed. To train or
-        differentiate them, pass an `eqx.Module` with a `__call__` and make them its
-        fields.
+    - `f`: the vector field. Constants inside a function are fixed. To train constants
+        or to differentiate with respect to them, pass an `eqx.Module` with a `__call__`
+        and make the constants its fields.
     - `states`, `controls`: the names of the states and controls, or how many there are.
     - `disturbances`: the names of the disturbances that enter `f`, or how many there
-        are. None by default: then `w` is added to the next state.
+        are. By default there are no names, and the disturbance `w` is added to the next
+        state.
 
     **Returns:** a [`delucax.systems.FunctionSystem`][].
 

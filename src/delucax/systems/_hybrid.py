@@ -28,7 +28,8 @@ class BouncingBall(AbstractHybridSystem):
     - `mass`: $m$ [kg], 1 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
     - `drag`: $d$ [kg/m], 0 by default.
-    - `restitution`: $e$, the fraction of its speed that the ball keeps, 0.8 by default.
+    - `restitution`: $e$, the fraction of its speed that the ball keeps in a bounce, 0.8
+        by default.
 
     **Raises:** `ValueError` if the mass or the restitution is not positive, or a number
     is not finite.
@@ -84,15 +85,15 @@ class RimlessWheel(AbstractHybridSystem):
     $$\theta^+ = \theta^- - 2 \alpha, \qquad
     \dot\theta^+ = \cos(2 \alpha)\, \dot\theta^-$$
 
-    When the wheel rolls back, the same happens in the other direction. The state is
-    (angle [rad], velocity [rad/s]), the control is (torque [N m]).
+    When the wheel rolls back, the spoke behind hits the ground in the same way. The
+    state is (angle [rad], velocity [rad/s]), the control is (torque [N m]).
 
     Steady rolling is a limit cycle with the multiplier $\cos^2(2 \alpha)$.
 
     **Arguments:**
 
     - `length`: $l$, the length of a spoke [m], 1 by default.
-    - `mass`: $m$, all of it at the hub [kg], 1 by default.
+    - `mass`: $m$, the mass of the wheel, all at the hub [kg], 1 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
     - `half`: $\alpha$, half the angle between spokes [rad], pi / 8 by default.
     - `slope`: $\gamma$, the slope of the ground [rad], 0.08 by default.

@@ -21,11 +21,11 @@ class AbstractHybridSystem(AbstractSystem):
     $x^+ = r_i(t, x^-, u)$.
 
     Subclass it, name the events, and write `vector_field`, `guards` and `resets`.
-    [`delucax.Discretized`][] steps it like any other system, so environments, planners
-    and controllers take it too.
+    [`delucax.Discretized`][] computes the steps of a hybrid system like those of any
+    other system, so environments, planners and controllers take hybrid systems too.
 
-    Think of a guard as a distance, such as the height of a ball: the plant lives where
-    it is positive, and the event fires when it falls to zero. If the state is on the
+    Think of a guard as a distance, such as the height of a ball: the guard is normally
+    positive, and the event fires when the guard falls to zero. If the state is on the
     guard and moves beyond it, the event fires at once. If the state is already beyond
     an enabled guard at the start of an interval or after a reset, the model is wrong,
     and the status is `RESULTS.beyond_guard`. An urgent event fires instead.
@@ -42,8 +42,7 @@ class AbstractHybridSystem(AbstractSystem):
         between intervals.
     - `crossing_events`: the events that only report that their guard crosses zero, such
         as the tick of a clock or the top of a flight. They need a direction. The state
-        may be on either side of the guard, and the reset may leave it there. None by
-        default.
+        may be on either side of the guard, before and after the reset. None by default.
     - `mode_names`: the names of discrete modes, none by default. With modes, one of the
         states is named `"mode"` and holds 0.0, 1.0, ...; resets change it, and its
         derivative is zero. Read it with `mode`.
@@ -151,7 +150,7 @@ class AbstractHybridSystem(AbstractSystem):
 
     @abc.abstractmethod
     def guards(self, t: Time, x: State, u: Control) -> Sequence[Scalar] | Array:
-        """The guard of each event: the number that crosses zero there.
+        """The guard of each event: a number that crosses zero when the event happens.
 
         **Arguments:** `t`: time, a scalar. `x`: state, shape `(state_size,)`. `u`:
             control, shape `(control_size,)`, held over the interval.

@@ -26,7 +26,7 @@ class CSTR(AbstractSystem):
 
     With the default constants, half the feed's concentration is an unstable
     equilibrium: if the tank gets a little warmer, it reacts faster and gets warmer
-    still. The poles there are 2.83 and -0.45 per minute.
+    still. The poles at this equilibrium are 2.83 and -0.45 per minute.
 
     **Arguments:**
 
@@ -86,12 +86,13 @@ class CSTR(AbstractSystem):
     def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
         """The equilibrium at a given concentration.
 
-        **Arguments:** `concentration`: of the reactant in the tank [mol/l], above 0 and
-            below `feed_concentration`; 0.5 by default.
+        **Arguments:** `concentration`: the concentration of the reactant in the tank
+            [mol/l], above 0 and below `feed_concentration`; 0.5 by default.
 
         **Returns:** `(x, u)`, shapes `(2,)` and `(1,)`.
 
-        **Raises:** `ValueError` if `concentration` is outside of this range.
+        **Raises:** `ValueError` if `concentration` is not between 0 and
+        `feed_concentration`.
         """
         c, feed = (
             xp.asarray(concentration, jnp.result_type(float)),
@@ -125,7 +126,7 @@ class TwoTank(AbstractSystem):
     Torricelli's law has $r(h) = \sqrt h$, which has an infinite slope at an empty tank
     and no value below. The $r$ used here is odd and smooth everywhere. Its relative
     error is about $(s / h)^2 / 4$: with the default $s$, 2.5e-5 at a level of 1 cm.
-    With a smaller $s$, an empty tank is stiffer.
+    With a smaller $s$, the equations of an empty tank are stiffer.
 
     **Arguments:**
 
@@ -134,7 +135,8 @@ class TwoTank(AbstractSystem):
     - `upper_outlet`, `lower_outlet`: $a_1$ and $a_2$, areas of the outlets [cm^2],
         0.071 by default.
     - `gravity`: $g$ [cm/s^2], 981 by default.
-    - `smoothing`: $s$, a level [cm], 0.01 by default.
+    - `smoothing`: $s$, the level below which $r$ departs from $\sqrt h$ [cm], 0.01 by
+        default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -194,7 +196,7 @@ class TwoTank(AbstractSystem):
 
 class PermanentMagnetMotor(AbstractSystem):
     r"""A synchronous motor with permanent magnets, in coordinates that turn with the
-    rotor: d along the magnets, q across them.
+    rotor: the d axis along the magnets, the q axis across them.
 
     $$\begin{aligned}
     L_d \dot i_d &= v_d - R i_d + p \omega L_q i_q \\
@@ -249,7 +251,7 @@ class PermanentMagnetMotor(AbstractSystem):
     disturbance_names = ("load",)
 
     def torque(self, x: State) -> Scalar:
-        """The torque of the currents on the shaft.
+        """The torque that the currents exert on the shaft.
 
         **Arguments:** `x`: state, shape `(3,)`.
 

@@ -68,8 +68,8 @@ class MassSpringDamper(AbstractSystem):
     T_i = k_i (q_i - q_{i-1}) + c_i (v_i - v_{i-1})$$
 
     The wall is $q_0 = v_0 = 0$, and $T_{n+1}$ is the force. The state is the positions
-    [m], measured from rest, followed by the velocities [m/s]. The control is (force
-    [N]).
+    [m], measured from the positions at rest, followed by the velocities [m/s]. The
+    control is (force [N]).
 
     **Arguments:**
 
@@ -150,7 +150,7 @@ class VanDerPol(AbstractSystem):
 
     $$\dot x = v, \qquad \dot v = \mu (1 - x^2) v - x + u$$
 
-    Without control, every trajectory that starts outside of the origin converges to one
+    Without control, every trajectory that does not start at the origin converges to one
     limit cycle, of amplitude near 2. The vector field is smooth, and stiff for large
     $\mu$. States, control and time have no units.
 

@@ -141,7 +141,8 @@ class FurutaPendulum(AbstractSystem):
         0.0645 by default.
     - `inertia`: $J_2$, inertia of the pendulum about the hinge [kg m^2], 1.331e-4 by
         default.
-    - `arm_friction`, `friction`: $b_1$ and $b_2$ [N m s/rad], 1e-3 and 5e-5 by default.
+    - `arm_friction`, `friction`: $b_1$ and $b_2$, the friction of the arm and of the
+        pendulum [N m s/rad], 1e-3 and 5e-5 by default.
     - `motor_constant`: $k$ [N m/A], 0.042 by default.
     - `resistance`: $R$ [ohm], 8.4 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.

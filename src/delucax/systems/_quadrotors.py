@@ -141,8 +141,9 @@ class Quadrotor(AbstractSystem):
 
     To design a regulator, linearise [`delucax.Discretized`][] dynamics, not the system
     itself, and give the regulator this `difference`. The length of the quaternion is
-    not controllable. The discrete-time dynamics project it to 1 in every step. In the
-    linearised system it is a marginal mode, for which no regulator exists.
+    not controllable. The discrete-time dynamics project this length to 1 in every step.
+    In the linearised system the length is a marginal mode, for which no regulator
+    exists.
 
     **Arguments:**
 
@@ -156,7 +157,7 @@ class Quadrotor(AbstractSystem):
     - `inputs`: `"rotors"` (default) or `"wrench"`.
 
     **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
-    not finite or `inputs` is neither of the two.
+    not finite or `inputs` is neither `"thrusts"` nor `"wrench"`.
 
     Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016
     (RotorS), for the constants of the Hummingbird.

@@ -67,8 +67,8 @@ class KinematicBicycle(AbstractSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """Standing at the origin. The linearisation there is not controllable, because
-        a standing car cannot turn or move sideways.
+        """Standing at the origin. The linearisation at this equilibrium is not
+        controllable, because a standing car cannot turn or move sideways.
 
         **Returns:** the zero state and control, shapes `(4,)` and `(2,)`.
         """
@@ -93,17 +93,18 @@ class DynamicBicycle(AbstractSystem):
     The control is (acceleration $a$ [m/s^2], steering $\delta$ [rad]).
 
     The exact slip angle, $\arctan(v / v_x)$, is not defined at rest. The speed $v_0$
-    makes it smooth there. The model is meant for driving forward, much faster than
-    $v_0$.
+    makes the slip angle smooth at rest. The model is meant for driving forward, much
+    faster than $v_0$.
 
     **Arguments:**
 
     - `mass`: $m$ [kg], 1573 by default.
-    - `inertia`: $I$, about the vertical axis [kg m^2], 2873 by default.
+    - `inertia`: $I$, the moment of inertia about the vertical axis [kg m^2], 2873 by
+        default.
     - `front`, `rear`: $l_f$ and $l_r$, distances from the centre of mass to the axles
         [m], 1.1 and 1.58 by default.
-    - `front_stiffness`, `rear_stiffness`: $C_f$ and $C_r$, of both tyres of an axle
-        together [N/rad], 160000 by default.
+    - `front_stiffness`, `rear_stiffness`: $C_f$ and $C_r$, the cornering stiffness of
+        both tyres of an axle together [N/rad], 160000 by default.
     - `standstill`: $v_0$ [m/s], 1 by default.
 
     **Raises:** `ValueError` if a number is not positive.
@@ -178,18 +179,19 @@ class Reacher(AbstractSystem):
     Here $h$ holds the Coriolis and centrifugal torques and $G$ those of gravity. The
     state is (shoulder $q_1$ [rad], elbow $q_2$ [rad], shoulder_rate [rad/s], elbow_rate
     [rad/s]), the control is (shoulder_torque [N m], elbow_torque [N m]). The angle of
-    the shoulder is measured from the x axis and that of the elbow from the first link:
-    at zero the arm is stretched along the x axis. The vector field is smooth.
+    the shoulder is measured from the x axis and the angle of the elbow from the first
+    link: if both angles are zero, the arm is stretched along the x axis. The vector
+    field is smooth.
 
     A positive `gravity` pulls **along the x axis**, and a negative one against it. The
-    paper's experiments change it to make a plant that differs from its model. For
-    ordinary gravity, let the x axis point down.
+    experiments of the Deluca paper change `gravity` to make a plant that differs from
+    its model. For ordinary gravity, let the x axis point down.
 
     **Arguments:**
 
     - `mass_1`, `mass_2`: $m_1$ and $m_2$ [kg], 1 by default.
     - `length_1`, `length_2`: $l_1$ and $l_2$ [m], 1 by default.
-    - `gravity`: along the x axis [m/s^2], 0 by default.
+    - `gravity`: the acceleration of gravity along the x axis [m/s^2], 0 by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.

@@ -115,12 +115,12 @@ class StickSlip(AbstractHybridSystem):
     (faster than the belt).
 
     Without damping and control, the mass settles into a cycle of sticking and slipping.
-    It begins to slip at `position = static / stiffness`.
+    The mass begins to slip at `position = static / stiffness`.
 
     **Arguments:**
 
     - `mass`: $m$ [kg], 1 by default.
-    - `stiffness`: $k$, of the spring [N/m], 10 by default.
+    - `stiffness`: $k$, the stiffness of the spring [N/m], 10 by default.
     - `damping`: $c$ [N s/m], 0 by default.
     - `belt`: velocity of the belt [m/s], 0.2 by default.
     - `static`: the largest friction while the mass sticks [N], 1.5 by default.
@@ -213,9 +213,10 @@ class ValveWithStops(AbstractHybridSystem):
     $$m \ddot p = F - k (p - p_0) - c \dot p, \qquad 0 \le p \le 1$$
 
     The position $p$ is 0 where the valve is closed and 1 where it is open. At a stop
-    the valve bounces, $\dot p^+ = -e\, \dot p^-$. If it would leave more slowly than
-    `rest_speed`, it stays at the stop, in the mode `"closed"` or `"open"`. It leaves
-    again when the force away from the stop exceeds `adhesion`.
+    the valve bounces, $\dot p^+ = -e\, \dot p^-$. If the valve would leave a stop more
+    slowly than `rest_speed`, it stays at the stop, in the mode `"closed"` or `"open"`.
+    The valve leaves the stop again when the force away from the stop exceeds
+    `adhesion`.
 
     The state is (position, velocity [1/s], mode), the control is (force [N]). The modes
     are `"free"`, `"closed"` and `"open"`. The unit of length is the travel of the
@@ -224,14 +225,15 @@ class ValveWithStops(AbstractHybridSystem):
     **Arguments:**
 
     - `mass`: $m$ [N s^2], 1 by default.
-    - `stiffness`: $k$, of the spring [N], 40 by default.
+    - `stiffness`: $k$, the stiffness of the spring [N], 40 by default.
     - `damping`: $c$ [N s], 1 by default.
     - `neutral`: $p_0$, the position where the spring is relaxed. The default, 0.5, is
-        that of two springs that push against each other. Take a value below 0 for a
-        valve that the spring closes.
-    - `restitution`: $e$, the fraction of its speed that the valve keeps, 0.3 by
+        the position for two springs that push against each other. Choose a value below
+        0 for a valve that the spring closes.
+    - `restitution`: $e$, the fraction of its speed that the valve keeps in a bounce,
+        0.3 by default.
+    - `adhesion`: the largest force with which a stop holds the valve [N], 0.5 by
         default.
-    - `adhesion`: the force that a stop holds back [N], 0.5 by default.
     - `rest_speed`: [1/s], 0.02 by default.
 
     **Raises:** `ValueError` if the mass, the restitution, the adhesion or `rest_speed`

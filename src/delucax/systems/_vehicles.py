@@ -139,20 +139,22 @@ class DriftingCar(AbstractSystem):
     In a drift the rear tyre slides, and the car turns against its steering. This
     equilibrium is unstable: only feedback holds it.
 
-    Two changes keep the model defined everywhere. At rest a slip angle has no value, so
-    its tangent is $z = v / \sqrt{w^2 + v_0^2}$, with the velocities $v$ across and $w$
-    along the tyre. And a rear tyre that uses all its grip for driving keeps a fiftieth
-    of it for cornering.
+    Two changes keep the model defined everywhere. First, the slip angle of a tyre is
+    not defined at rest, so its tangent is computed as $z = v / \sqrt{w^2 + v_0^2}$,
+    with the velocities $v$ across and $w$ along the tyre. Second, a rear tyre that uses
+    all its grip for driving keeps a fiftieth of this grip for cornering.
 
     **Arguments:**
 
     - `mass`: $m$ [kg], 1724 by default.
-    - `inertia`: $I$, about the vertical axis [kg m^2], 1300 by default.
+    - `inertia`: $I$, the moment of inertia about the vertical axis [kg m^2], 1300 by
+        default.
     - `front`, `rear`: $l_f$ and $l_r$, distances from the centre of mass to the axles
         [m], 1.35 and 1.15 by default.
-    - `front_stiffness`, `rear_stiffness`: $C_f$ and $C_r$, of both tyres of an axle
-        together [N/rad], 120000 and 175000 by default.
-    - `grip`: $\mu$, the coefficient of friction, 0.55 by default, that of wet asphalt.
+    - `front_stiffness`, `rear_stiffness`: $C_f$ and $C_r$, the cornering stiffness of
+        both tyres of an axle together [N/rad], 120000 and 175000 by default.
+    - `grip`: $\mu$, the coefficient of friction, 0.55 by default, the value for wet
+        asphalt.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
     - `standstill`: $v_0$ [m/s], 0.1 by default.
 
@@ -192,7 +194,8 @@ class DriftingCar(AbstractSystem):
     def grips(self) -> tuple[Scalar, Scalar]:
         r"""The largest force of each axle.
 
-        **Returns:** $\mu N_f$ and $\mu N_r$ [N], scalars.
+        **Returns:** $\mu N_f$ for the front axle and $\mu N_r$ for the rear axle [N],
+        scalars.
         """
         whole = self.grip * self.mass * self.gravity / (self.front + self.rear)
         return whole * self.rear, whole * self.front

@@ -22,9 +22,9 @@ class SimplestWalker(AbstractHybridSystem):
     Here $\theta$ is the angle of the stance leg, $\phi$ the angle of the swing leg from
     the stance leg and $\tau$ the torque at the hip. Lengths are in units of the leg,
     times in units of $\sqrt{l / g}$. The swing foot strikes at $\phi = 2 \theta$, once
-    the stance leg has passed the normal of the slope. The moment before, when the legs
-    pass each other, is no event. The state is (stance, stance rate, swing, swing rate),
-    the control is (torque).
+    the stance leg has passed the normal of the slope. The legs also have $\phi = 2
+    \theta$ earlier in the step, when they pass each other; this is not an event. The
+    state is (stance, stance rate, swing, swing rate), the control is (torque).
 
     **Arguments:**
 
@@ -96,7 +96,8 @@ class CompassGait(AbstractHybridSystem):
     - `hip_mass`: mass at the hip [kg], 10 by default.
     - `lower`, `upper`: distances from the foot to the leg's mass and from there to the
         hip [m], 0.5 by default.
-    - `gravity`: [m/s^2], 9.81 by default. The numbers in the source are for 9.8.
+    - `gravity`: [m/s^2], 9.81 by default. The numbers in the source are for a gravity
+        of 9.8.
     - `slope`: $\gamma$ [rad], 3 degrees by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not

@@ -33,8 +33,8 @@ class DissipativeWind(_AbstractWind):
 
     $$F = s\, (x, y)$$
 
-    A positive strength destabilises, because the force points away from the origin. The
-    name comes from the paper.
+    A positive strength destabilises the plant, because the force points away from the
+    origin. The name comes from the paper.
 
     **Arguments:**
 
@@ -72,7 +72,7 @@ class ConstantWind(_AbstractWind):
     **Arguments:**
 
     - `strength`: $s$ [N], 0.1 by default.
-    - `direction`: $\alpha$ [rad], pi / 4 by default.
+    - `direction`: $\alpha$, the direction of the force [rad], pi / 4 by default.
 
     **Raises:** `ValueError` if a number is not finite.
 
@@ -107,8 +107,9 @@ class VortexWind(_AbstractWind):
     J = \begin{pmatrix} 0 & -1 \\ 1 & 0 \end{pmatrix}$$
 
     Here $p$ is the position. Each vortex is strongest at the distance $r$ from its
-    centre, where its force is $s$. Inside, it rotates like a solid. Outside, it decays
-    with the inverse of the distance. The force is smooth everywhere.
+    centre, where its force is $s$. Inside, it rotates like a solid. Outside of this
+    distance, the force decays with the inverse of the distance. The force is smooth
+    everywhere.
 
     **Arguments:**
 

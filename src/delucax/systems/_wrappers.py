@@ -22,8 +22,8 @@ def _forwarded(name: str) -> Any:
 
 
 class AbstractSystemWrapper(AbstractSystem):
-    """A system around another system. It forwards everything that a subclass does not
-    override to the wrapped system, in a field `system`.
+    """A system around another system. The field `system` holds the wrapped system, and
+    everything that a subclass does not override is taken from it.
 
     A subclass declares the field `system` and writes `vector_field`. Systems with
     events cannot be wrapped.
@@ -105,12 +105,13 @@ class Calibrated(AbstractSystemWrapper):
     **Arguments:**
 
     - `system`: the system inside, an [`delucax.AbstractSystem`][].
-    - `control_scale`, `control_offset`: $a_u$ and $b_u$, a number or shape `(m,)`; 1
+    - `control_scale`, `control_offset`: $a_u$ and $b_u$, each a number or shape `(m,)`;
+        1 and 0 by default.
+    - `output_scale`, `output_offset`: $a_y$ and $b_y$, each a number or shape `(p,)`; 1
         and 0 by default.
-    - `output_scale`, `output_offset`: $a_y$ and $b_y$, a number or shape `(p,)`; 1 and
-        0 by default.
 
-    **Raises:** `ValueError` on other shapes, or if `system` has events.
+    **Raises:** `ValueError` if an argument has another shape, or if `system` has
+    events.
 
     !!! example
 
@@ -168,18 +169,18 @@ class Corrected(AbstractSystemWrapper):
     - `width`, `depth`: units in each hidden layer and number of hidden layers of the
         network, 16 and 1 by default.
     - `size`: $s$, the size of the correction to the derivative of each state, shape
-        `(n,)` or a number; 1 by default. Take 0 for a derivative that is known exactly,
+        `(n,)` or a number; 1 by default. Pass 0 for a derivative that is known exactly,
         such as that of a position.
-    - `x_mean`, `x_scale`: $\bar x$ and $\sigma_x$, shape `(n,)` or a number; 0 and 1 by
-        default.
-    - `u_mean`, `u_scale`: $\bar u$ and $\sigma_u$, shape `(m,)` or a number; 0 and 1 by
-        default.
+    - `x_mean`, `x_scale`: $\bar x$ and $\sigma_x$, the mean and the scale of the
+        states, shape `(n,)` or a number; 0 and 1 by default.
+    - `u_mean`, `u_scale`: $\bar u$ and $\sigma_u$, the mean and the scale of the
+        controls, shape `(m,)` or a number; 0 and 1 by default.
     - `key`: a random key for the initial weights.
 
     **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
 
-    **Raises:** `ValueError` on other shapes, a scale that is not positive, or if
-    `system` has events.
+    **Raises:** `ValueError` if an argument has another shape, a scale is not positive,
+    or `system` has events.
 
     !!! example
 
