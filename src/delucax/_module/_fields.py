@@ -44,7 +44,7 @@ class AbstractConstraint(eqx.Module):
 
 class _Positive(AbstractConstraint):
     """The constraint that values are above zero. Training changes the logarithm of a
-    value instead of the value, so that training steps are relative changes.
+    value instead of the value itself, so that training steps are relative changes.
 
     !!! example
 
@@ -88,8 +88,8 @@ class bounded(AbstractConstraint):
     r"""The constraint $\mathrm{low} < x < \mathrm{high}$ of a [`delucax.parameter`][]
     or [`delucax.weight`][].
 
-    Training changes the logit of the value instead of the value, so that no training
-    step can leave the interval.
+    Training changes the logit of the value instead of the value itself, so that no
+    training step can leave the interval.
 
     **Arguments:**
 

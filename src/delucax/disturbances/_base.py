@@ -116,8 +116,8 @@ class AbstractDisturbance(eqx.Module):
         return w[:steps]
 
     def between(self, start: ArrayLike, stop: ArrayLike) -> "AbstractDisturbance":
-        r"""A disturbance that is this one inside a window of time, $\mathrm{start} \le
-        t < \mathrm{stop}$, and zero outside.
+        r"""A disturbance that is this one inside a window of time,
+        $\mathrm{start} \le t < \mathrm{stop}$, and zero outside.
 
         An end of the window that differs from the time of a step only by rounding is
         moved to that step, so that a window of 5 steps acts on 5 steps.

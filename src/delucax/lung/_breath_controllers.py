@@ -25,11 +25,11 @@ class _Phases(NamedTuple):
 class Breathing(AbstractController):
     r"""A controller of whole breaths, made from a controller of the inspiratory valve.
 
-    In the inspiratory phase, the control of the inspiratory valve is that of
+    In the inspiratory phase, the control of the inspiratory valve is the control of
     `inspiratory`, clipped to [0, 100]. In the expiratory phase the inspiratory valve is
-    closed. With an `expiratory_opening` $u_e$, it is opened to $u_e (1 - e^{-5 s})$ in
-    the second half of each period, where $s$ is the time since the middle of the period
-    [s]. This keeps the airway open against a leak.
+    closed. With an `expiratory_opening` $u_e$, the inspiratory valve is opened to
+    $u_e (1 - e^{-5 s})$ in the second half of each period, where $s$ is the time since
+    the middle of the period [s]. This flow keeps the airway open in spite of a leak.
 
     The inspiratory controller is reset at the start of each breath. Its state does not
     change in the expiratory phase.
@@ -39,7 +39,7 @@ class Breathing(AbstractController):
     - `inspiratory`: any controller of one control, such as a
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
-    - `expiratory_opening`: $u_e$ [%], 0 by default; 5 in the original.
+    - `expiratory_opening`: $u_e$ [%], 0 by default; 5 in the code of Deluca.
     - `valve`: a controller of the expiratory valve. By default its control is 0 in the
         inspiratory phase and 1 in the expiratory phase.
 
@@ -152,15 +152,16 @@ class BangBang(AbstractController):
 
 
 class BreathPolicy(AbstractController):
-    r"""A policy of the inspiratory valve: a network of errors, targets and controls.
+    r"""A policy of the inspiratory valve: a network whose inputs are errors, targets
+    and controls.
 
     $$u_k = 100 \, \sigma(\mathrm{network}(e_k, \dots, e_{k + 1 - n_e},
     r_{k + 1}, r_{k + 2}, r_k, u_{k - 1}, \dots, u_{k - n_u}) + \mathrm{shift})$$
 
     The inputs are the last errors $e$, the target $r$ now and at the next two steps,
-    and the last controls $u$. They are scaled to about 1, and errors and controls are
-    zero before the breath. The sigmoid $\sigma$ enforces the bounds of the valve, and
-    its gradient is never zero.
+    and the last controls $u$. The inputs are scaled to about 1, and errors and controls
+    are zero before the breath. The sigmoid $\sigma$ enforces the bounds of the valve,
+    and its gradient is never zero.
 
     The kind `"mlp"` is a fully connected network. The kind `"cnn"` first takes the
     means of the last 1, 2, ..., `errors` errors, and convolves them.
@@ -182,7 +183,7 @@ class BreathPolicy(AbstractController):
     open at first.
 
     **Raises:** `ValueError` if a size is too small, the kind is unknown, `waveform` is
-    not a `BreathWaveform`, or there is no key.
+    not a `BreathWaveform`, or `key` is missing.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.

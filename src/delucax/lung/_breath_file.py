@@ -55,9 +55,9 @@ def read_breaths(
     **Raises:** `ValueError` if a column is missing, a value is not a finite number,
         `u_in` is out of its bounds, `R`, `C` or `u_out` has a value that is not
         allowed, `R` or `C` changes within a breath, time does not increase, or a breath
-        is too short. The message names the column and the row, which is the line of the
-        file as an editor counts it: the header is row 1, and blank lines count.
-        `OSError` if the file cannot be read.
+        is too short. The message of the error names the column and the row, which is
+        the line of the file as an editor counts it: the header is row 1, and blank
+        lines count. `OSError` if the file cannot be read.
 
     Source: Google Brain, 2021 (the data set); Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu,
     Singh, Zhang, Minasyan, LaChance, Zajdel, Schottdorf, Cohen and Hazan, 2021.

@@ -152,7 +152,7 @@ class Breaths(eqx.Module):
 
         **Returns:** `(train, test)`.
 
-        **Raises:** `ValueError` if one of them would be empty.
+        **Raises:** `ValueError` if one of the two parts would be empty.
         """
         check_key(key, "split")
         check_range(test, "test", "split", 0, 1)
@@ -168,7 +168,7 @@ class Breaths(eqx.Module):
     def open_loop_error(self, model: Any) -> Array:
         """The mean absolute error of a lung that is given only the recorded controls.
 
-        The error is taken from `truth` if it is known, else from `pressure`.
+        The error is measured against `truth` if it is known, else against `pressure`.
 
         **Arguments:** `model`: a [`delucax.lung.LearnedLung`][] or
             [`delucax.lung.LungModel`][].

@@ -27,16 +27,17 @@ GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
 
 
 class Explorer(AbstractController):
-    r"""A PID with random gains and a random disturbance, to collect data of a lung.
+    r"""A PID with random gains and a random disturbance, to collect data from a lung.
 
     The control is the sum of the PID and a bump, clipped to [0, 100], with the
-    expiratory valve closed. In the expiratory phase it is (0, 1).
+    expiratory valve closed. In the expiratory phase the control is (0, 1): the
+    inspiratory valve is closed and the expiratory valve is open.
 
     The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn for each
     episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10}, times `scale`. A bump is drawn too:
     a triangle of height -30 to 30 % and width 0.1 to 0.5 s, at a random time in the
-    inspiration. With probability 0.15 it is instead a ramp, which falls from a height
-    of 0 to 100 % to zero within 0.05 to 0.3 s.
+    inspiration. With probability 0.15 the bump is instead a ramp, which falls from a
+    height of 0 to 100 % to zero within 0.05 to 0.3 s.
 
     **Arguments:**
 
@@ -127,9 +128,9 @@ def explore(
 ) -> Breaths:
     """Collect breaths of a lung with an [`delucax.lung.Explorer`][].
 
-    Each breath begins at the start of the task. Breaths whose pressure passes the abort
-    limit are left out, because a real machine would not finish them. Other breaths are
-    drawn in their place.
+    Each breath begins at the start of the task. Breaths whose pressure exceeds the
+    abort limit are left out, because a real machine would not finish them. Other
+    breaths are drawn in their place.
 
     **Arguments:**
 
@@ -140,8 +141,8 @@ def explore(
     - `pips`: the peak pressures to draw from, 10, 15, ..., 35 cmH2O by default.
     - `scale`: the scale of the random PID gains, 1 by default.
     - `abort`: the abort limit [cmH2O], 70 by default.
-    - `resistance`, `compliance`: of the lung, to record with the breaths; `None` by
-        default.
+    - `resistance`, `compliance`: the resistance and the compliance of the lung, which
+        are recorded with the breaths; `None` by default.
 
     **Returns:** a [`delucax.lung.Breaths`][] with `truth`.
 

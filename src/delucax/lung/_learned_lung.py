@@ -52,19 +52,20 @@ class LearnedLung(AbstractDynamics):
     $$z = (v(u_k), \dots, v(u_{k + 1 - n_u}), p_k, \dots, p_{k + 1 - n_p})$$
 
     Here $u$ are the normalised controls, $\ell$ is `line`, and $v$ is a small network
-    of one control that linearises the curve of the valve. The last term, of `output`
-    and `hidden` and the whole history $z_\mathrm{all}$, is only there for
-    $k < \mathrm{boundary}$. Before an inspiration the valve is closed and the pressure
-    is the start pressure of the breaths.
+    of one control that linearises the curve of the valve. The last term has the weights
+    `output` ($o_k$) and `hidden` ($H_k$) and takes the whole history $z_\mathrm{all}$;
+    it is present only for $k < \mathrm{boundary}$. Before an inspiration the valve is
+    closed and the pressure is the start pressure of the breaths.
 
-    With `published` it is the model of the paper: $p_{k + 1} = \mathrm{network}(z)$ of
-    the raw controls, only the last term for $k < \mathrm{boundary}$, and a history of
-    zeros before an inspiration.
+    With `published=True` the model is that of the paper:
+    $p_{k + 1} = \mathrm{network}(z)$, where $z$ holds the controls without $v$. For
+    $k < \mathrm{boundary}$ there is only the last term, and the history before an
+    inspiration is zero.
 
     The networks of the first steps have 16 hidden units each and are stacked in one
-    array. While `u_out` is above 1/2, the state is reset to that before an inspiration.
-    The state is (the controls, the pressures, both newest first, and the number of
-    steps). The observation is the pressure [cmH2O].
+    array. While `u_out` is above 1/2, the state is reset to the state before an
+    inspiration. The state is (the controls, the pressures, both newest first, and the
+    number of steps). The observation is the pressure [cmH2O].
 
     **Arguments:**
 
@@ -81,7 +82,7 @@ class LearnedLung(AbstractDynamics):
     **Attributes:** `line`, `valve`, `network`, `hidden` and `output`, trainable;
     `u_mean`, `u_std`, `p_mean`, `p_std`, `start`.
 
-    **Raises:** `ValueError` if a size is below 1, or there are no breaths or no key.
+    **Raises:** `ValueError` if a size is below 1, or if `breaths` or `key` is missing.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -152,7 +153,8 @@ class LearnedLung(AbstractDynamics):
 
     @property
     def window(self) -> int:
-        """The number of controls in the state, and of pressures."""
+        """The number of controls in the state, which is also the number of
+        pressures."""
         return self.hidden.shape[-1] // 2
 
     @property
@@ -243,7 +245,7 @@ class LearnedLung(AbstractDynamics):
 
         **Arguments:** `u_in`: the controls [%], shape `(T,)`.
 
-        **Returns:** the pressures [cmH2O], shape `(T,)`. The first is the pressure
+        **Returns:** the pressures [cmH2O], shape `(T,)`. The first pressure is the one
         before any control acted.
         """
         return self._predicted(u_in, None)
@@ -254,7 +256,7 @@ class LearnedLung(AbstractDynamics):
         **Arguments:** `u_in`: the controls [%], shape `(T,)`. `pressure`: the recorded
             pressures [cmH2O], shape `(T,)`.
 
-        **Returns:** the pressures [cmH2O], shape `(T,)`. The first is the pressure
+        **Returns:** the pressures [cmH2O], shape `(T,)`. The first pressure is the one
         before any control acted.
         """
         return self._predicted(u_in, (pressure - self.p_mean) / self.p_std)

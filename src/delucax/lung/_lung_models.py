@@ -125,7 +125,7 @@ class NeuralLung(AbstractLung):
     **Attributes:** `network`, trainable; `p_mean` and `p_std`, the scale of the
         pressures, 20 and 10 cmH2O; `rate`, the scale of the time derivatives, 10 / s.
 
-    **Raises:** `ValueError` if a size is below 1, or there is no key.
+    **Raises:** `ValueError` if a size is below 1, or `key` is missing.
 
     Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
 
@@ -186,7 +186,8 @@ class NeuralLung(AbstractLung):
 
 
 class GreyBoxLung(AbstractLung):
-    r"""A single compartment, with networks for what it leaves out.
+    r"""A single-compartment lung, with neural networks for the effects that it leaves
+    out.
 
     $$p = p_\mathrm{single}(x) + p_\mathrm{std} \, \mathrm{network}(q,
     V / (C p_\mathrm{std}), h), \qquad
@@ -206,7 +207,7 @@ class GreyBoxLung(AbstractLung):
     **Attributes:** `network` and `memory`, trainable; `p_std`, the scale of the
         pressures, 10 cmH2O; `rate`, the scale of $\dot h$, 5 / s.
 
-    **Raises:** `ValueError` if a size is below 1, or there is no key.
+    **Raises:** `ValueError` if a size is below 1, or `key` is missing.
 
     !!! example
 

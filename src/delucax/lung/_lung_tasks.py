@@ -226,19 +226,21 @@ def learned_lung(
     horizon: int = 100,
     **options: Any,
 ) -> Environment:
-    """Ventilate a lung that was learned from breaths, to train controllers in it.
+    """Ventilate a lung that was learned from breaths, for example to train controllers.
 
     The task is like `lung/balloon_lung`, but its time step is the time between samples
-    of the breaths. It exhales to their start pressure, whatever the PEEP of `waveform`.
-    The sensor of a [`delucax.lung.LungModel`][] has the delay of the model.
+    of the breaths. The lung exhales to the start pressure of the breaths, whatever the
+    PEEP of `waveform` is. The sensor of a [`delucax.lung.LungModel`][] has the delay of
+    the model.
 
     **Arguments:**
 
     - `model`: a [`delucax.lung.LearnedLung`][], a [`delucax.lung.LungModel`][] or a
         [`delucax.lung.PublishedLung`][]. The default is the learned lung that comes
-        with the library. It was fitted to breaths of the task
-        `lung/double_compartment`, whose sensor is two samples late, so its pressure is
-        late too. In the repository, `python -m benchmarks.learned_lung` makes it.
+        with the library. The default was fitted to breaths of the task
+        `lung/double_compartment`, whose sensor is two samples late, so the pressure of
+        this lung is late too. In the repository, `python -m benchmarks.learned_lung`
+        trains this default lung.
     - `horizon`: the number of steps per episode, 100 by default.
     - `**options`: `waveform`, `noise`, `limit` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].

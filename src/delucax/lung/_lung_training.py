@@ -68,12 +68,13 @@ def fit_lungs(
 ) -> Fitted:
     """Fit several lungs at once, each to its own breaths.
 
-    The first part, only for a [`delucax.lung.LearnedLung`][], predicts each pressure
-    from the recorded pressures before it, as published. The second part predicts the
-    whole breath from its controls only, so that the noise of the sensor does not bias
-    the model. The loss is the mean absolute error, relative to the standard deviation
-    of the pressures. The optimiser is Adam with a learning rate that falls to 0 along a
-    cosine.
+    The training has two parts. The first part, only for a
+    [`delucax.lung.LearnedLung`][], fits the prediction of each pressure from the
+    recorded pressures before it, as in the paper. The second part fits the prediction
+    of the whole breath from its controls only, so that the noise of the sensor does not
+    bias the model. The loss is the mean absolute error, relative to the standard
+    deviation of the pressures. The optimiser is Adam with a learning rate that falls to
+    0 along a cosine.
 
     **Arguments:**
 
@@ -85,7 +86,7 @@ def fit_lungs(
     - `key`: a random key, for the batches.
     - `teacher_steps`: the number of steps of the first part, 1000 by default.
     - `steps`: the number of steps of the second part, 800 by default.
-    - `learning_rate`: 5e-3 by default. The first part uses twice this rate.
+    - `learning_rate`: 5e-3 by default. The first part uses twice this learning rate.
     - `optimiser`: an Optax optimiser for both parts in place of Adam, with its own
         learning rate; none by default.
     - `batch_size`: the number of breaths of each lung in a step, 64 by default; `None`
@@ -181,11 +182,11 @@ def breath_error(
     - `key`: a random key, for the noise of the sensor.
     - `pips`: the peak pressures to follow, each in its own episode; 10, 15, ..., 35
         cmH2O by default.
-    - `horizon`: the number of steps per episode, 29 by default: 0.87 s of an
+    - `horizon`: the number of steps per episode, 29 by default, which is 0.87 s of an
         inspiration.
 
     **Returns:** the mean of $|p - r|$ over the steps of each episode [cmH2O], shape
-        `(pips,)`. It is NaN if a run failed.
+        `(pips,)`. The error is NaN if a simulation failed.
 
     **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
     below PEEP).
@@ -300,7 +301,7 @@ def train_controllers(
     checkpoint: Any = None,
     throw: bool = True,
 ) -> Fitted:
-    """Train controllers in lungs, by the gradient of their error.
+    """Train controllers in lungs, with the gradient of their error.
 
     The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
     noise in each step. The optimiser is Adam with a learning rate that falls to 0 along
@@ -414,8 +415,8 @@ def pid_grid(
     - `key`: a random key, for the noise of the sensor, which is the same for all PIDs.
     - `kind`: `"leaky"` (default) for [`delucax.controllers.LeakyPID`][], as in the
         original; `"true"` for [`delucax.controllers.PID`][].
-    - `kp`, `ki`, `kd`: the gains. All combinations are tried. By default 0, 0.1, ...,
-        0.9, 1, 2, ..., 10 for `kp` and `ki`, and 0 for `kd`.
+    - `kp`, `ki`, `kd`: the gains. All combinations are tried. The defaults are 0, 0.1,
+        ..., 0.9, 1, 2, ..., 10 for `kp` and `ki`, and 0 for `kd`.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
 
     **Returns:** the gains (kp, ki, kd) of each PID, shape `(grid, 3)`, and the mean

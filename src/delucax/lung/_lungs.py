@@ -29,7 +29,7 @@ PER_ML = 1e-3
 
 
 class AbstractLung(AbstractSystem):
-    """The base class of lungs behind [`delucax.lung.Valves`][].
+    """The base class of lungs that are ventilated through [`delucax.lung.Valves`][].
 
     The sensor reads the pressure of the airway [cmH2O]. The control is `(u_in, u_out)`:
     the opening of the inspiratory valve, from 0 to 100 %, and the opening of the
@@ -75,7 +75,7 @@ class AbstractLung(AbstractSystem):
 
     @abc.abstractmethod
     def resting(self, pressure: RealScalar) -> State:
-        """The state of a lung at rest at a pressure, with both valves closed.
+        """The state of a lung at rest at a given pressure, with both valves closed.
 
         **Arguments:** `pressure`: the pressure everywhere [cmH2O].
 
@@ -197,13 +197,13 @@ class DoubleCompartment(_AbstractRigidPipe):
     $$\dot V_i = \frac{p_c - V_i / C_i}{R_i}, \qquad
     p_c = p - R_0 (\dot V_1 + \dot V_2)$$
 
-    The resistance $R$ has a central part $R_0 = c R$, with $c$ = `central`. The rest is
-    the two branches in parallel, $1 / (1 / R_1 + 1 / R_2) = (1 - c) R$, with
-    $R_2 / R_1$ = `imbalance`. The compliance is divided into $C_1 = s C$ and
-    $C_2 = (1 - s) C$, with $s$ = `share`. So $R$ is the resistance at high frequencies,
-    and $C$ is the static compliance. The state is (inflow [L/s], opening, fast volume
-    $V_1$ [L], slow volume $V_2$ [L]). The vector field is not smooth at an opening of
-    0.
+    The resistance $R$ has a central part $R_0 = c R$, with $c$ = `central`. The rest of
+    the resistance consists of the two branches in parallel,
+    $1 / (1 / R_1 + 1 / R_2) = (1 - c) R$, with $R_2 / R_1$ = `imbalance`. The
+    compliance is divided into $C_1 = s C$ and $C_2 = (1 - s) C$, with $s$ = `share`. So
+    $R$ is the resistance at high frequencies, and $C$ is the static compliance. The
+    state is (inflow [L/s], opening, fast volume $V_1$ [L], slow volume $V_2$ [L]). The
+    vector field is not smooth at an opening of 0.
 
     **Arguments:**
 
@@ -287,22 +287,24 @@ def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
 
 
 class BalloonLung(_AbstractCompartment):
-    r"""A lung like a balloon behind a resistance.
+    r"""A lung that behaves like a balloon, behind a flow resistance.
 
     $$\dot V = \frac{p - P(V)}{R}, \qquad
     P(V) = \frac{k}{r_0^2 r} \left(1 - \left(\frac{r_0}{r}\right)^6\right)$$
 
     Here $r$ and $r_0$ are the radii of spheres of the volumes $V$ and $V_0$. As the
     balloon fills, the pressure rises, is greatest at $V = 2.65 \, V_0$, and then falls.
-    Below $V_0 / 10$ it is constant. The state is (inflow [L/s], opening, volume $V$
-    [L]). The vector field is not smooth at an opening of 0 and at $V = V_0 / 10$.
+    Below $V_0 / 10$ the pressure is constant. The state is (inflow [L/s], opening,
+    volume $V$ [L]). The vector field is not smooth at an opening of 0 and at
+    $V = V_0 / 10$.
 
     **Arguments:**
 
     - `resistance`: $R$ [cmH2O s/L], 20 by default.
     - `stiffness`: $k$ [cmH2O L], 40 by default. With the default `rest`, the pressure
         is at most 69 cmH2O.
-    - `rest`: $V_0$, the volume without pressure [L], 1.5 by default.
+    - `rest`: $V_0$, the volume at which the balloon has no pressure [L], 1.5 by
+        default.
     - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
     **Raises:** `ValueError` if a number is not positive.
@@ -340,7 +342,7 @@ class BalloonLung(_AbstractCompartment):
 
 
 class DelayLung(AbstractLung):
-    r"""A lung like a balloon at the end of an elastic pipe.
+    r"""A lung that behaves like a balloon, at the end of an elastic pipe.
 
     $$C_p \dot p = q_\mathrm{in} - \frac{p - P(V)}{R} - q_\mathrm{out}, \qquad
     \dot V = \frac{p - P(V)}{R}$$
@@ -355,7 +357,7 @@ class DelayLung(AbstractLung):
 
     - `resistance`: $R$ [cmH2O s/L], 20 by default.
     - `stiffness`: the stiffness of the balloon [cmH2O L], 40 by default.
-    - `rest`: the volume without pressure [L], 1.5 by default.
+    - `rest`: the volume at which the balloon has no pressure [L], 1.5 by default.
     - `pipe`: $C_p$, the compliance of the pipe [mL/cmH2O], 5 by default.
     - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 

@@ -44,16 +44,16 @@ class PublishedLung(AbstractDynamics):
     \mathrm{network}(z) & k \ge 5
     \end{cases}$$
 
-    with $z_\mathrm{all} = (u_k, \dots, u_{k - 4}, p_k, \dots, p_{k - 4})$ and
-    $z = (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})$, where $u$ are the scaled
+    with $z_\mathrm{all} = (u_k, \dots, u_{k - 4}, p_k, \dots, p_{k - 4})$ and $z =
+    (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})$, where $u$ are the scaled
     controls. The published network has three layers of SELUs without biases. Before an
     inspiration the history is zero, except for the start pressure. While `u_out` is
-    above 1/2, the state is reset to that before an inspiration. The task clips the
-    controls; the model does not.
+    above 1/2, the state is reset to the state before an inspiration. The task
+    `lung/learned_lung` clips the controls; the model does not.
 
     The model is rebuilt from the published weights, without the program of the authors.
-    Under the conditions of their notebook it has the errors that are printed there; see
-    [the comparison](../../ventilator.md#the-published-simulator).
+    Under the conditions of the authors' notebook, the model has the same errors as in
+    the notebook; see [the comparison](../../ventilator.md#the-published-simulator).
 
     The state is (the controls, the pressures, both scaled and newest first, and the
     number of steps). The observation is the pressure [cmH2O].
@@ -161,8 +161,9 @@ class PublishedController(AbstractController):
     middle row has an effect.
 
     The controller is rebuilt from the published weights, like
-    [`delucax.lung.PublishedLung`][]. Unlike the original, it is reset before each
-    breath by [`delucax.lung.Breathing`][]. Its gradient is zero where it is clipped.
+    [`delucax.lung.PublishedLung`][]. Unlike the original controller, this one is reset
+    before each breath by [`delucax.lung.Breathing`][]. The gradient of the control is
+    zero where the control is clipped.
 
     **Arguments:**
 
@@ -253,8 +254,8 @@ def read_published(
     names and shapes are
 
     - `sim/params/0/shallow_fc1_model1/kernel` (10, 100), and `kernel` (100, 1) and
-        `bias` (1,) of `shallow_fc2_model1`. Each of the first five steps has these, up
-        to `sim/params/4/shallow_fc1_model5/kernel`.
+        `bias` (1,) of `shallow_fc2_model1`. Each of the first five steps has such
+        arrays, up to `sim/params/4/shallow_fc1_model5/kernel`.
     - `sim/params/5/SNN_fc0/kernel` (10, 100), `SNN_fc1` and `SNN_fc2` (100, 100), and
         `kernel` (100, 1) and `bias` (1,) of `SNN_fc3`. The first two inputs of
         `SNN_fc0` are always zero.
@@ -263,8 +264,8 @@ def read_published(
         `deep_controller/params/deep_conv`, and (100, 1) and (1,) of `deep_fc`.
 
     In these arrays the newest control, pressure and error come last. The pressure
-    before an inspiration is not in the file. It is 1.51449 standard deviations below
-    the mean, which is 6.094 cmH2O with the scales of the authors.
+    before an inspiration is not in the file. This pressure is 1.51449 standard
+    deviations below the mean, which is 6.094 cmH2O with the scales of the authors.
 
     **Arguments:**
 
@@ -275,8 +276,8 @@ def read_published(
     **Returns:** a [`delucax.lung.Published`][]: `(lung, controller)`.
 
     **Raises:** `ValueError` if the file is not an `.npz`, an array is missing or has
-    another shape, or a number is not finite. The message names the file and the array.
-    `OSError` if the file cannot be read.
+    another shape, or a number is not finite. The message of the error names the file
+    and the array. `OSError` if the file cannot be read.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021 (deluca-lung).

@@ -31,10 +31,10 @@ _applied = eqx.filter_jit(
 class Runner(Protocol):
     """The interface of a ventilator for [`delucax.lung.run_breaths`][].
 
-    Write a class with these methods for your machine. They need no JAX, and may block
-    or raise an error.
+    Write a class with these methods for your machine. The methods need no JAX, and may
+    block or raise an error.
 
-    **Attributes:** `dt`, the time of a step [s].
+    **Attributes:** `dt`, the length of a step [s].
 
     !!! example
 
@@ -68,7 +68,7 @@ class Runner(Protocol):
 
     @abc.abstractmethod
     def wait(self) -> None:
-        """Return when the next step is due."""
+        """Wait until the next step is due."""
 
     @abc.abstractmethod
     def should_abort(self, pressure: float) -> bool:
@@ -79,7 +79,8 @@ class Runner(Protocol):
 
     @abc.abstractmethod
     def cleanup(self) -> None:
-        """Leave the machine safe. It is called once at the end, even after an error."""
+        """Leave the machine safe. `run_breaths` calls this method once at the end, even
+        after an error."""
 
 
 class SimulatedRunner:
@@ -90,8 +91,8 @@ class SimulatedRunner:
     - `environment`: a task of a lung.
     - `key`: a random key, for the noise of the sensor.
     - `abort`: the pressure above which the run is aborted [cmH2O], 60 by default.
-    - `real_time`: whether `wait` waits for the time of a step, as a machine does;
-        `False` by default.
+    - `real_time`: whether `wait` waits for the duration of a step, as on a real
+        machine; `False` by default.
 
     **Raises:** `ValueError` if `environment` is not a task of a lung, or `abort` is not
     positive.
@@ -198,8 +199,8 @@ class Recording(NamedTuple):
     **Attributes:**
 
     - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry for each step.
-    - `aborted`: whether the run was aborted. The last entry is then the reading that
-        was too high, with the controls of the clean-up.
+    - `aborted`: whether the run was aborted. After an abort, the last entry is the
+        reading that was too high, with the controls of the clean-up.
     """
 
     times: np.ndarray
@@ -219,8 +220,8 @@ def run_breaths(
     """Run a controller at a ventilator.
 
     Each step reads the pressure, stops if `runner.should_abort` is true, calls the
-    controller, sets the valves, and waits. At the end `runner.cleanup()` is called. It
-    is also called after an error or an interruption, which is then raised again.
+    controller, sets the valves, and waits. At the end `runner.cleanup()` is called. The
+    clean-up also happens after an error or an interruption, which is then raised again.
 
     **Arguments:**
 
@@ -231,8 +232,8 @@ def run_breaths(
 
     **Returns:** a named tuple of NumPy arrays with an entry for each step, `times` [s],
         `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`, whether the run was
-        aborted. The last entry is then the reading that was too high, with the controls
-        of the clean-up.
+        aborted. After an abort, the last entry is the reading that was too high, with
+        the controls of the clean-up.
 
     **Raises:** `ValueError` if `runner` is not a runner, `controller` is not a
         controller, or a control is not finite.

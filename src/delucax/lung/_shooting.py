@@ -22,11 +22,12 @@ from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 class ShootingMPC(AbstractController):
     r"""Model predictive control with a learned lung, by gradient descent.
 
-    The learned lung runs beside the true lung under the same controls. A fixed gain
-    corrects its pressure towards the measured one. At each step, some iterations of
-    Adam improve the plan, which minimises the error to the target, and the first
-    control of the plan is applied. The controls are $u = 100 \, \sigma(z)$ of free
-    variables $z$, so they keep the bounds of the valve.
+    The controller simulates the learned lung in parallel to the true lung, with the
+    same controls. A fixed gain corrects the pressure of the learned lung towards the
+    measured pressure. At each step, some iterations of Adam improve the plan, which
+    minimises the error to the target, and the first control of the plan is applied. The
+    controls are $u = 100 \, \sigma(z)$ of free variables $z$, so they keep the bounds
+    of the valve.
 
     **Arguments:**
 

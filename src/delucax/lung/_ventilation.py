@@ -27,15 +27,16 @@ class Valves(eqx.Module):
     $$q(u) = q_\mathrm{max} \frac{z(u) - z(0)}{z(100) - z(0)}, \qquad
     z(u) = \sigma(a (u - m))$$
 
-    It does not depend on the pressure of the airway, because the pressure of the supply
-    is much higher. Both valves follow their controls through a first-order lag:
+    The flow $q$ does not depend on the pressure of the airway, because the pressure of
+    the supply is much higher. Both valves follow their controls through a first-order
+    lag:
 
     $$T_\mathrm{in} \dot q_\mathrm{in} = q(u_\mathrm{in}) - q_\mathrm{in}, \qquad
     T_\mathrm{out} \dot o = u_\mathrm{out} - o$$
 
     The flow out is $\max(o, 0) (p - \mathrm{peep}) / R_\mathrm{out}$ through the
-    expiratory valve, and $G p$ through a leak. It is not smooth at an opening $o$ of 0,
-    which the lag approaches but does not cross.
+    expiratory valve, and $G p$ through a leak. The flow out is not smooth at an opening
+    $o$ of 0; the lagged opening approaches 0 but does not cross it.
 
     **Arguments:**
 
@@ -47,7 +48,7 @@ class Valves(eqx.Module):
     - `expiratory_resistance`: $R_\mathrm{out}$, the resistance of the expiratory valve
         when fully open [cmH2O s/L], 5 by default.
     - `peep`: the pressure behind the expiratory valve [cmH2O], 5 by default.
-    - `leak`: $G$, the conductance to the room [L/s/cmH2O], 0 by default.
+    - `leak`: $G$, the conductance of the leak to the room [L/s/cmH2O], 0 by default.
 
     **Raises:** `ValueError` if `peep` or `leak` is negative, or if a number other than
     these and `midpoint` is not positive.
@@ -156,7 +157,7 @@ class PressureSensor(AbstractWrapper):
     """Adds the observation of the dynamics, a pressure, to the end of the state.
 
     A cost can then read the pressure without knowing the lung. For a sensor delay, wrap
-    it in [`delucax.dynamics.Delayed`][].
+    the `PressureSensor` in [`delucax.dynamics.Delayed`][].
 
     **Arguments:** `dynamics`: the dynamics of a lung, which observe one number.
 
@@ -236,8 +237,8 @@ class BreathCost(AbstractCost):
     r"""The weighted absolute error of the pressure, $w \, |p - r(t)|$.
 
     The weight $w$ is 1 in the inspiratory phase and `expiration_weight` in the
-    expiratory phase. With a `limit`, each cmH2O above it costs 10 more, because a
-    pressure that is too high is worse than an error. The cost is not smooth at the
+    expiratory phase. With a `limit`, each cmH2O above the limit costs 10 more, because
+    a pressure that is too high is worse than an error. The cost is not smooth at the
     target and at the limit.
 
     **Arguments:**
@@ -307,17 +308,17 @@ def ventilation(
 
     **Arguments:**
 
-    - `dynamics`: the dynamics of the lung, which observe the pressure of the airway and
-        take the controls (u_in, u_out).
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]. The default rises to
-        35 cmH2O, 20 times a minute.
+    - `dynamics`: the dynamics of the lung, whose observation is the pressure of the
+        airway and whose controls are (u_in, u_out).
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]. The default waveform
+        rises to 35 cmH2O, 20 times a minute.
     - `resting_state`: the first state of the dynamics; zero by default.
     - `sensor_delay`: the number of steps until a pressure is observed, 0 by default.
     - `noise`: the standard deviation of the noise of the sensor [cmH2O], 0 by default.
     - `expiration_weight`, `limit`: arguments of the cost; 0 and none by default.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: other arguments of [`delucax.Environment`][], which replace those of
-        the task.
+    - `**options`: other arguments of [`delucax.Environment`][], which replace the
+        values that the task gives them.
 
     **Returns:** an [`delucax.Environment`][].
 

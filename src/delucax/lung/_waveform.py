@@ -57,8 +57,8 @@ class BreathWaveform(eqx.Module):
     - `keypoints`: increasing shares of a period, from 0 to 1; `(0, 1/3, 1/2, 1)` by
         default. The pressure may jump from the end of a breath to the next breath.
     - `levels`: the level of the target at each keypoint, from PEEP (0) to PIP (1);
-        `(1, 1, 0, 0)` by default. The target is then at PIP for 1 s, and falls to PEEP
-        in 0.5 s.
+        `(1, 1, 0, 0)` by default. With the default keypoints and rate, the target is
+        then at PIP for 1 s, and falls to PEEP in 0.5 s.
     - `inspiration`: the share of the inspiratory phase in a period, 1/3 by default.
 
     **Raises:** `ValueError` if a number is not finite, PIP is below PEEP, the rate is

@@ -107,8 +107,8 @@ def simulate(
     - `t0`, `t1`: start and end of the horizon, in units of time, with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
     - `hold`: `"zero"` (default) to hold the control over each interval. Pass `None` for
-        a control that is a function of time, or for continuous feedback $u = \pi(t,
-        h(t, x))$ by a controller that has no state.
+        a control that is a function of time, or for continuous feedback
+        $u = \pi(t, h(t, x))$ by a controller that has no state.
     - `dt`: the length of an interval, in units of time; `t1 - t0` must be a whole
         multiple of `dt`. By default it is `(t1 - t0) / T` if `controller_or_controls`
         or `w` is an array; otherwise `dt` is required.
@@ -120,7 +120,7 @@ def simulate(
     - `substeps`: the number of fixed steps per interval, 1 by default.
     - `adjoint`: `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()` or
-        `diffrax.BacksolveAdjoint()`. `diffrax.BacksolveAdjoint()` needs a
+        `diffrax.BacksolveAdjoint()`. Of these, `diffrax.BacksolveAdjoint()` needs a
         `stepsize_controller`, and does not work with a held controller, because the
         memory of a controller cannot run backwards. With `ts`,
         `diffrax.BacksolveAdjoint()` raises an error if you ask for a gradient with

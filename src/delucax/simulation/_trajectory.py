@@ -297,7 +297,8 @@ class Trajectory(eqx.Module):
 
         **Returns:** a `pandas.DataFrame`.
 
-        **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
+        **Raises:** `ImportError` if pandas is not installed
+        (`pip install "delucax[tables]"`).
         """
         pd = extra("pandas", "tables")
 
@@ -383,7 +384,8 @@ class Trajectory(eqx.Module):
 
         **Returns:** a `pandas.DataFrame`.
 
-        **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
+        **Raises:** `ImportError` if pandas is not installed
+        (`pip install "delucax[tables]"`).
         """
         pd = extra("pandas", "tables")
 

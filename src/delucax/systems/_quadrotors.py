@@ -157,7 +157,7 @@ class Quadrotor(AbstractSystem):
     - `inputs`: `"rotors"` (default) or `"wrench"`.
 
     **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
-    not finite or `inputs` is neither `"thrusts"` nor `"wrench"`.
+    not finite or `inputs` is neither `"rotors"` nor `"wrench"`.
 
     Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016
     (RotorS), for the constants of the Hummingbird.

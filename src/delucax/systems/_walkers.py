@@ -22,9 +22,9 @@ class SimplestWalker(AbstractHybridSystem):
     Here $\theta$ is the angle of the stance leg, $\phi$ the angle of the swing leg from
     the stance leg and $\tau$ the torque at the hip. Lengths are in units of the leg,
     times in units of $\sqrt{l / g}$. The swing foot strikes at $\phi = 2 \theta$, once
-    the stance leg has passed the normal of the slope. The legs also have $\phi = 2
-    \theta$ earlier in the step, when they pass each other; this is not an event. The
-    state is (stance, stance rate, swing, swing rate), the control is (torque).
+    the stance leg has passed the normal of the slope. Before that, $\phi = 2 \theta$
+    also holds when the legs pass each other, but this is not an event. The state is
+    (stance, stance rate, swing, swing rate), the control is (torque).
 
     **Arguments:**
 
