@@ -22,8 +22,8 @@ from .._typing import RealScalar
 class RK4(diffrax.AbstractERK):
     """The classical Runge-Kutta method of order 4, as a Diffrax solver.
 
-    It has no error estimate, so it takes fixed steps. For dense output it uses cubic
-    Hermite interpolation.
+    The method has no error estimate, so it takes fixed steps. For dense output it uses
+    cubic Hermite interpolation.
 
     **Arguments:**
 

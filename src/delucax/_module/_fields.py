@@ -203,9 +203,9 @@ def parameter(
     """Declare a field that holds a physical constant.
 
     A number in such a field becomes a floating-point array leaf. You can differentiate
-    with respect to it, batch it under `jax.vmap`, and change it without compiling
-    again. A plain `float` field would be static under `eqx.filter_jit`: each new value
-    would compile again, and its gradient would be `None`.
+    with respect to this leaf, batch it under `jax.vmap`, and change it without
+    compiling again. A plain `float` field would be static under `eqx.filter_jit`: each
+    new value would compile again, and its gradient would be `None`.
 
     **Arguments:**
 

@@ -38,7 +38,7 @@ _PARTIALS: dict[str, Any] = {
 
 
 def save(path: str | os.PathLike, obj: Any) -> None:
-    """Save a module, a trajectory, or any pytree of these to a file.
+    """Save a module, a trajectory, or any pytree of modules and trajectories to a file.
 
     The file holds the name of the class of every module, its fields, and the bytes of
     its arrays. Functions are saved by name. If writing fails, no partial file is left.
@@ -49,8 +49,8 @@ def save(path: str | os.PathLike, obj: Any) -> None:
     - `obj`: a module, trajectory, array, number or string, or a tuple, list or
         dictionary of these.
 
-    **Raises:** `ValueError` if something has no name, such as a lambda; the message
-    says where it is. `OSError` if the file cannot be written.
+    **Raises:** `ValueError` if a function or class in `obj` has no name, such as a
+    lambda; the message says where it is. `OSError` if the file cannot be written.
 
     !!! example
 
@@ -102,8 +102,8 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     precision, arrays in double precision are rounded, with a warning.
 
     **Raises:** `ValueError` if the file is damaged, not from delucax or from a newer
-    version, or if it names something that is not trusted, does not exist or has other
-    fields now. `OSError` if it cannot be read.
+    version, or if the file names a class or function that is not trusted, does not
+    exist or has other fields now. `OSError` if it cannot be read.
 
     !!! example
 

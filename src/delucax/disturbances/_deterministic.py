@@ -249,7 +249,7 @@ class FromArray(AbstractDisturbance):
     - `values`: shape `(steps, size)`, with at least as many steps as the horizon.
 
     **Raises:** `ValueError` at construction if `values` is not a matrix of finite
-    numbers, and in `sequence` if it has fewer steps than the horizon.
+    numbers, and in `sequence` if `values` has fewer steps than the horizon.
 
     !!! example
 

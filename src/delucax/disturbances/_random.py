@@ -166,7 +166,8 @@ class Brownian(AbstractDisturbance):
     r"""Brownian increments for a system with a diffusion,
     $w_k \sim \mathcal{N}(0, \Delta t / \mathrm{substeps})$.
 
-    It is the default disturbance of an environment whose system has a diffusion.
+    Brownian increments are the default disturbance of an environment whose system has a
+    diffusion.
 
     **Arguments:**
 

@@ -309,10 +309,10 @@ class AbstractDiscretization(Forwarding):
     system, and the dynamics have the names, units, sensor and equilibrium of the
     system.
 
-    Subclass it, declare the fields `system` and `dt`, and write `advance`. In
-    `advance`, the disturbance `w` must act as the property `noise` of the system says.
-    You rarely need your own subclass, because [`delucax.Discretized`][] takes any
-    system and any solver.
+    Subclass `AbstractDiscretization`, declare the fields `system` and `dt`, and write
+    `advance`. In `advance`, the disturbance `w` must act as the property `noise` of the
+    system says. You rarely need your own subclass, because [`delucax.Discretized`][]
+    takes any system and any solver.
 
     !!! example
 
@@ -357,9 +357,9 @@ class AbstractWrapper(Forwarding):
     """Dynamics around other dynamics. The field `dynamics` holds the wrapped dynamics,
     and everything that a subclass does not override is taken from them.
 
-    Subclass it, declare the field `dynamics`, and write `advance`. If the wrapper adds
-    entries to the state, also give `state_names`, `observe`, `difference` and
-    `equilibrium`.
+    Subclass `AbstractWrapper`, declare the field `dynamics`, and write `advance`. If
+    the wrapper adds entries to the state, also give `state_names`, `observe`,
+    `difference` and `equilibrium`.
 
     **Raises:** `ValueError` at construction if `dynamics` is not an
     [`delucax.AbstractDynamics`][].

@@ -221,7 +221,8 @@ class TransportDelay(_AbstractDelay):
         steps; by default as long as the given delays need.
 
     **Raises:** `ValueError` if `dynamics` is not the discretisation of a system or has
-    a diffusion, or a delay is negative, not finite, or longer than its memory.
+    a diffusion, or if a delay is negative, not finite, or longer than `control_memory`
+    or `sensor_memory` allows.
 
     Source: Åström and Wittenmark, 1997, section 2.3.
 

@@ -234,8 +234,8 @@ class Discretized(AbstractDiscretization):
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`: that of the system; with a diffusion, the number of Brownian
-        motions times the substeps.
+        """The size of the disturbance `w`: the `disturbance_size` of the system; with a
+        diffusion, this number times the number of substeps.
         """
         return self.system.disturbance_size * (self.increments or 1)
 
@@ -290,8 +290,8 @@ class Discretized(AbstractDiscretization):
         **Arguments:** `t`, `x`, `u`, `w`: as in `advance`. `event`: an index in
             `event_names`.
 
-        **Returns:** the state at the event or at the end of the interval, the time
-        there, and whether it is at the event.
+        **Returns:** the state at the event or at the end of the interval, the time of
+        this state, and whether the event happened.
         """
         _, held, _ = self._parts_of(x, w)
         args = self._args(t, x, u, held)

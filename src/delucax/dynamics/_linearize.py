@@ -20,8 +20,9 @@ from ._linear import LinearDynamics
 class OperatingPoint(eqx.Module):
     r"""An operating point: a state and a control at which a system or dynamics rest.
 
-    [`delucax.trim`][] computes it. Pass it to [`delucax.linearize`][] or
-    [`delucax.controllers.LQR`][] as it is. Print it to see its numbers.
+    [`delucax.trim`][] computes it. You can pass an operating point directly to
+    [`delucax.linearize`][] or [`delucax.controllers.LQR`][]. Print it to see its
+    numbers.
 
     **Attributes:**
 

@@ -43,9 +43,9 @@ def trim(
 
     Disturbances are zero. The point is a solution near the guess, but not always the
     nearest one. If there are more unknowns than equations, there are many solutions
-    close to each other; you get the one with the smallest change from the guess, to
-    first order. If there is no solution, you get a point of smallest residual, and
-    `result` says so.
+    close to each other; `trim` returns the solution with the smallest change from the
+    guess, to first order. If there is no solution, `trim` returns a point where the
+    residual is smallest, and `result` says so.
 
     Changes and residuals are measured in units that follow from the guess:
 
@@ -78,7 +78,7 @@ def trim(
         model. You may pass an `OperatingPoint` as `x`: it holds both the state and the
         control.
     - `fix`: the states and controls to hold at the guess: a name, several names, or a
-        dictionary from names to values, which replace those of the guess. None by
+        dictionary from names to values, which replace the values of the guess. None by
         default.
     - `throw`: whether to raise if there is no operating point, true by default. With
         `throw=False`, look at `result`.

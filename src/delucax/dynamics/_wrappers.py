@@ -19,17 +19,18 @@ class WorstCase(AbstractWrapper):
 
     $$x_{k+1} = F(t_k, x_k, u_k, w_k + L (x_k - x_\mathrm{ref}))$$
 
-    Here $x_\mathrm{ref}$ is the equilibrium of the dynamics, and their `difference`
-    measures the deviation. If `L` is the gain of [`delucax.controllers.HInfinity`][] or
-    of [`delucax.riccati.hinf_dare`][], the adversary plays the worst disturbance of the
-    H-infinity game. Use `bound` to keep it realistic.
+    Here $x_\mathrm{ref}$ is the equilibrium of the dynamics, and `difference` is the
+    method of the dynamics that gives the deviation of a state. If `L` is the gain of
+    [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][], the
+    adversary plays the worst disturbance of the H-infinity game. Use `bound` to keep it
+    realistic.
 
     **Arguments:**
 
     - `dynamics`: the plant, an [`delucax.AbstractDynamics`][] with an `equilibrium`.
     - `L`: the gain of the adversary, shape `(k, n)`.
-    - `bound`: the largest Euclidean norm of the adversary's disturbance; a larger one
-        is scaled back. None by default.
+    - `bound`: the largest Euclidean norm of the adversary's disturbance; a larger
+        disturbance is scaled back to this norm. None by default.
 
     **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics` or has no
     equilibrium, `L` does not fit it, or `bound` is not positive.

@@ -23,7 +23,7 @@ def pendulum_features(x: State) -> Vector:
 @task(Pendulum, gym=GymPendulum, dt=0.05, horizon=200)
 def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Limit = 2.0) -> Fields:
     r"""Swing up a pendulum and hold it upright, with a torque that is too weak to lift
-    it in one go.
+    it without swinging.
 
     - *State:* angle [rad], 0 upright; velocity [rad/s]. *Control:* torque [N m].
     - *Start:* the angle uniform over the circle, the velocity in +-1 rad/s.

@@ -108,8 +108,8 @@ def cartpole_swing_up(
         hanging, the velocity and the spin in +-0.1.
     - *Cost:* `0.1 position^2 + 2 (1 - cos(angle)) + 0.01 (velocity^2 + spin^2) +
         0.001 force^2` per step.
-    - *End:* when the cart leaves the track. This costs `exit_cost`, more than a whole
-        episode of hanging.
+    - *End:* when the cart leaves the track. Leaving the track costs `exit_cost`, which
+        is more than the cost of a whole episode of hanging.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
     The largest force is smaller than the weight of cart and pole, so a swing-up takes
@@ -153,8 +153,8 @@ def double_pendulum_cart(
         rad of hanging.
     - *Cost:* `0.1 position^2 + 2 (1 - cos(angle_1)) + 2 (1 - cos(angle_2)) +
         0.01 (velocity^2 + spin_1^2 + spin_2^2) + 0.0003 force^2` per step.
-    - *End:* when the cart leaves the track. This costs `exit_cost`, more than a whole
-        episode of hanging.
+    - *End:* when the cart leaves the track. Leaving the track costs `exit_cost`, which
+        is more than the cost of a whole episode of hanging.
     - *Features:* `encode` replaces each angle by its cosine and sine.
 
     A planner with a horizon of one second swings the rods up within 1.5 seconds. A
@@ -375,12 +375,12 @@ def reactor_start_up(
         the feed reacted, the temperature in [295, 305] K.
     - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
         step. The stars are the equilibrium at `concentration`.
-    - *End:* above `max_temperature`. This costs `shutdown_cost`, more than a whole
-        episode of doing nothing.
+    - *End:* above `max_temperature`. A shutdown costs `shutdown_cost`, which is more
+        than the cost of a whole episode of doing nothing.
 
     The plant is that of [`delucax.environments.cstr`][], but the jacket must heat
-    first, and the linear model at the goal has two unstable poles. Without enough heat
-    the reaction never starts; with too much it runs away.
+    first, and the linear model at the goal has two unstable poles. With too little heat
+    the reaction never starts; with too much heat the reaction runs away.
 
     **Arguments:**
 

@@ -190,8 +190,8 @@ def compass_gait(
 
     - *State:* swing [rad], stance [rad], swing rate [rad/s], stance rate [rad/s].
         *Control:* torque [N m].
-    - *Start:* near the start of a step of the passive gait on a slope of 3 degrees, the
-        angles within 0.01 rad and the rates within 0.03 rad/s of it.
+    - *Start:* near the start of a step of the passive gait on a slope of 3 degrees,
+        with the angles within 0.01 rad and the rates within 0.03 rad/s of this point.
     - *Cost:* `(v - speed)^2 + 0.001 torque^2` per step, where `v` is the speed of the
         hip along the slope.
     - *End:* when the walker trips (the swing foot is still below the ground after the
@@ -199,7 +199,7 @@ def compass_gait(
         from the normal of the slope. This costs `fall_cost`.
 
     On the default slope of 3 degrees the walker walks on without control. On level
-    ground (`slope=0.0`) it slows down and falls.
+    ground (`slope=0.0`) the walker slows down and falls.
 
     The cost and the condition of termination use the parameters of the walker too. To
     change these parameters, call this function again (under `jax.vmap` for a batch),

@@ -142,9 +142,9 @@ def lds(
         their entries are standard normal, and `A` is scaled to `spectral_radius`.
     - `system`: a [`delucax.LinearDynamics`][] or a [`delucax.systems.LinearSystem`][],
         in place of the matrices. A `LinearSystem` is converted exactly to discrete time
-        with the step `dt`. `delucax.interop.from_control` makes one from a
-        python-control object, `delucax.interop.read_linear` from a file, and
-        [`delucax.linearize`][] from any system.
+        with the step `dt`. A linear model can be made from a python-control object by
+        `delucax.interop.from_control`, from a file by `delucax.interop.read_linear`,
+        and from any system by [`delucax.linearize`][].
     - `dt`: the time step, in units of time; 1 by default. `dt` is required for a
         `system` in continuous time, and must be left out for a `system` in discrete
         time.

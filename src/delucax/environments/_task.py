@@ -34,7 +34,7 @@ from ._environment import Environment
 class UniformState(eqx.Module):
     """An initial state that is drawn uniformly from a box.
 
-    Pass it as `initial_state` of a [`delucax.Environment`][].
+    Pass a `UniformState` as the `initial_state` of a [`delucax.Environment`][].
 
     **Arguments:**
 

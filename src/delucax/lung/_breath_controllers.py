@@ -31,8 +31,8 @@ class Breathing(AbstractController):
     $u_e (1 - e^{-5 s})$ in the second half of each period, where $s$ is the time since
     the middle of the period [s]. This flow keeps the airway open in spite of a leak.
 
-    The inspiratory controller is reset at the start of each breath. Its state does not
-    change in the expiratory phase.
+    The inspiratory controller is reset at the start of each breath. The state of the
+    inspiratory controller does not change in the expiratory phase.
 
     **Arguments:**
 
@@ -40,8 +40,8 @@ class Breathing(AbstractController):
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
     - `expiratory_opening`: $u_e$ [%], 0 by default; 5 in the code of Deluca.
-    - `valve`: a controller of the expiratory valve. By default its control is 0 in the
-        inspiratory phase and 1 in the expiratory phase.
+    - `valve`: a controller of the expiratory valve. By default the expiratory valve is
+        closed in the inspiratory phase and open in the expiratory phase.
 
     **Raises:** `ValueError` if `inspiratory` or `valve` is not a controller, or
     `waveform` is not a `BreathWaveform`.
@@ -117,7 +117,8 @@ def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
 
 
 class BangBang(AbstractController):
-    """Opens the valve fully below the target pressure, and closes it above.
+    """Opens the inspiratory valve fully below the target pressure, and closes the valve
+    above the target.
 
     **Arguments:**
 

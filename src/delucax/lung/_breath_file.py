@@ -34,10 +34,10 @@ def read_breaths(
 
     The file has the columns of the "Ventilator Pressure Prediction" data set: `id`,
     `breath_id`, `R` [cmH2O s/L], `C` [mL/cmH2O], `time_step` [s], `u_in` (0 to 100 %),
-    `u_out` (0 or 1) and `pressure` [cmH2O], in any order. The rows of a breath follow
-    each other. An inspiration ends when `u_out` is first 1. The steps of the file are
-    uneven, so each inspiration is sampled again every `dt`: the pressure is
-    interpolated linearly, and the controls are held.
+    `u_out` (0 or 1) and `pressure` [cmH2O], in any order. All rows of a breath must
+    follow each other in the file. An inspiration ends when `u_out` is first 1. The
+    steps of the file are uneven, so each inspiration is sampled again every `dt`: the
+    pressure is interpolated linearly, and the controls are held.
 
     Numbers may be quoted and blank lines are ignored. Comments are not allowed.
 

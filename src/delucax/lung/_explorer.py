@@ -130,7 +130,7 @@ def explore(
 
     Each breath begins at the start of the task. Breaths whose pressure exceeds the
     abort limit are left out, because a real machine would not finish them. Other
-    breaths are drawn in their place.
+    breaths are drawn in place of those that are left out.
 
     **Arguments:**
 

@@ -43,7 +43,7 @@ def _moments(breaths: Breaths) -> tuple[Array, ...]:
 class LearnedLung(AbstractDynamics):
     r"""A lung learned from breaths: a network of the last controls and pressures.
 
-    There are extra networks for the first steps of an inspiration. At step $k$ of an
+    Each of the first steps of an inspiration has an extra network. At step $k$ of an
     inspiration, the normalised pressure is predicted as
 
     $$p_{k + 1} = p_k + \ell^\top z + \mathrm{network}(z)
@@ -64,8 +64,8 @@ class LearnedLung(AbstractDynamics):
 
     The networks of the first steps have 16 hidden units each and are stacked in one
     array. While `u_out` is above 1/2, the state is reset to the state before an
-    inspiration. The state is (the controls, the pressures, both newest first, and the
-    number of steps). The observation is the pressure [cmH2O].
+    inspiration. The state is the last controls and the last pressures, both with the
+    newest first, and the number of steps. The observation is the pressure [cmH2O].
 
     **Arguments:**
 

@@ -79,8 +79,8 @@ def fit_lungs(
     **Arguments:**
 
     - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
-        several stacked in one module, as `equinox.filter_vmap` returns them: each array
-        has a leading axis over the models.
+        several stacked in one module, as `equinox.filter_vmap` returns models: each
+        array has a leading axis over the models.
     - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`, or of shape
         `(models, B, T)` for several models.
     - `key`: a random key, for the batches.
@@ -314,8 +314,8 @@ def train_controllers(
         the tasks. `equinox.filter_vmap(learned_lung)(models)` makes them from stacked
         models. See the example for tasks with several resistances.
     - `controllers`: controllers of the inspiratory valve, stacked over seeds and then
-        over lungs: leaves have the shape `(seeds, lungs, ...)`. With `shared` they have
-        the shape `(seeds, ...)`.
+        over lungs: leaves have the shape `(seeds, lungs, ...)`. With `shared` the
+        leaves have the shape `(seeds, ...)`.
     - `key`: a random key, for the noise.
     - `shared`: whether all lungs share one controller; `False` by default.
     - `steps`: the number of steps, 400 by default.
@@ -325,9 +325,9 @@ def train_controllers(
     - `trainable`, `progress`, `checkpoint`: as in [`delucax.training.fit`][]; the
         weights, no bar and no file by default.
     - `throw`: whether to raise an error if a loss or its gradient is not finite; `True`
-        by default. If `False`, the gradient of such a controller is replaced by 0, the
-        others are unaffected, and `history["diverged"]` counts such controllers at each
-        step.
+        by default. If `throw` is `False`, a gradient that is not finite is replaced by
+        0, the other controllers are unaffected, and `history["diverged"]` counts the
+        controllers with such a gradient at each step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 

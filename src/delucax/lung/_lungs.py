@@ -149,9 +149,10 @@ class SingleCompartment(_AbstractCompartment):
     volume $V$ [L]). The vector field is not smooth at an opening of 0.
 
     If the opening of the inspiratory valve is held, the pressure settles. With the
-    expiratory valve closed and a leak $G$, it settles at $q(u_\mathrm{in}) / G$, where
-    $q$ is the flow of the valve. With the expiratory valve open and no leak, it settles
-    at `peep + flow(u_in) * expiratory_resistance`.
+    expiratory valve closed and a leak $G$, the pressure settles at
+    $q(u_\mathrm{in}) / G$, where $q$ is the flow of the valve. With the expiratory
+    valve open and no leak, the pressure settles at
+    `peep + flow(u_in) * expiratory_resistance`.
 
     **Arguments:**
 
@@ -347,10 +348,10 @@ class DelayLung(AbstractLung):
     $$C_p \dot p = q_\mathrm{in} - \frac{p - P(V)}{R} - q_\mathrm{out}, \qquad
     \dot V = \frac{p - P(V)}{R}$$
 
-    The elastic pressure $P(V)$ is that of [`delucax.lung.BalloonLung`][]. The pipe
-    stores air, so the pressure $p$ in the pipe, which the sensor reads, is a state. The
-    state is (inflow $q_\mathrm{in}$ [L/s], opening, pipe pressure $p$ [cmH2O], volume
-    $V$ [L]). The task `lung/delay_lung` adds the transport delay, with
+    The elastic pressure $P(V)$ is the same as in [`delucax.lung.BalloonLung`][]. The
+    pipe stores air, so the pressure $p$ in the pipe, which the sensor reads, is a
+    state. The state is (inflow $q_\mathrm{in}$ [L/s], opening, pipe pressure $p$
+    [cmH2O], volume $V$ [L]). The task `lung/delay_lung` adds the transport delay, with
     [`delucax.dynamics.Delayed`][].
 
     **Arguments:**

@@ -55,8 +55,8 @@ class PublishedLung(AbstractDynamics):
     Under the conditions of the authors' notebook, the model has the same errors as in
     the notebook; see [the comparison](../../ventilator.md#the-published-simulator).
 
-    The state is (the controls, the pressures, both scaled and newest first, and the
-    number of steps). The observation is the pressure [cmH2O].
+    The state is the last controls and the last pressures, both scaled and with the
+    newest first, and the number of steps. The observation is the pressure [cmH2O].
 
     **Arguments:**
 

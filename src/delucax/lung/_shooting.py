@@ -24,10 +24,10 @@ class ShootingMPC(AbstractController):
 
     The controller simulates the learned lung in parallel to the true lung, with the
     same controls. A fixed gain corrects the pressure of the learned lung towards the
-    measured pressure. At each step, some iterations of Adam improve the plan, which
-    minimises the error to the target, and the first control of the plan is applied. The
-    controls are $u = 100 \, \sigma(z)$ of free variables $z$, so they keep the bounds
-    of the valve.
+    measured pressure. At each step, some iterations of Adam improve the plan so that
+    the predicted pressure follows the target, and the first control of the plan is
+    applied. The controls of the plan are $u = 100 \, \sigma(z)$, where the variables
+    $z$ are free, so the controls keep the bounds of the valve.
 
     **Arguments:**
 

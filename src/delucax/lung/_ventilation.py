@@ -19,7 +19,7 @@ from ._waveform import BreathWaveform, check_waveform
 
 
 class Valves(eqx.Module):
-    r"""A proportional valve that lets air in, and a valve that lets it out to PEEP.
+    r"""A proportional valve that lets air in, and a valve that lets air out to PEEP.
 
     The steady flow of the inspiratory valve is a smooth S-curve of its opening
     $u_\mathrm{in}$ [%]:
@@ -51,7 +51,7 @@ class Valves(eqx.Module):
     - `leak`: $G$, the conductance of the leak to the room [L/s/cmH2O], 0 by default.
 
     **Raises:** `ValueError` if `peep` or `leak` is negative, or if a number other than
-    these and `midpoint` is not positive.
+    `peep`, `leak` and `midpoint` is not positive.
 
     !!! example
 
@@ -159,7 +159,7 @@ class PressureSensor(AbstractWrapper):
     A cost can then read the pressure without knowing the lung. For a sensor delay, wrap
     the `PressureSensor` in [`delucax.dynamics.Delayed`][].
 
-    **Arguments:** `dynamics`: the dynamics of a lung, which observe one number.
+    **Arguments:** `dynamics`: the dynamics of a lung, whose observation is one number.
 
     **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or does not
     observe exactly one number.
@@ -302,9 +302,10 @@ def ventilation(
     """The task to ventilate a lung, so that the pressure tracks a waveform.
 
     The controls are (u_in [%], u_out). The observation is the pressure of the airway
-    [cmH2O]. The state holds this pressure too; see [`delucax.lung.PressureSensor`][].
-    The cost of a step is the absolute error of the pressure in the inspiratory phase;
-    see [`delucax.lung.BreathCost`][]. The task never terminates.
+    [cmH2O]. The state holds the pressure of the airway too; see
+    [`delucax.lung.PressureSensor`][]. The cost of a step is the absolute error of the
+    pressure in the inspiratory phase; see [`delucax.lung.BreathCost`][]. The task never
+    terminates.
 
     **Arguments:**
 

@@ -128,8 +128,8 @@ class BreathWaveform(eqx.Module):
 
         **Arguments:** `t`: time [s].
 
-        **Returns:** the share, of the shape of `t`. It is 0 if rounding puts `t` just
-        before the beginning of a breath.
+        **Returns:** the share, of the shape of `t`. The share is 0 if rounding puts `t`
+        just before the beginning of a breath.
         """
         breaths = as_float_array(t) / self.period
         # `mod` would give almost 1 if rounding puts `k dt` just before a breath.

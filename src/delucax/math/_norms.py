@@ -57,7 +57,7 @@ def within_ball(x: Array, radius: ArrayLike) -> Array:
 def clip(x: ArrayLike, low: Any, high: Any) -> Array:
     """Clip `x` to the range from `low` to `high`, either of which may be infinite.
 
-    On CPU it is faster than `jnp.clip` for a batch, because it uses comparisons.
+    On CPU, `clip` is faster than `jnp.clip` for a batch, because it uses comparisons.
     `jnp.clip` must also propagate NaN limits, and in a step of the pendulum this takes
     as long as everything else. Here NaN limits are ignored. A NaN in `x` stays NaN. The
     gradient goes to `x` if `x` is within the limits or equal to one of them, and to the

@@ -27,9 +27,9 @@ def products_whole() -> Iterator[None]:
 def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
     """The product `matrix @ vector`, computed entry by entry if the matrix is small.
 
-    For a feedback gain with a few entries this is about 1.5 times faster in a
-    simulation loop. Under `jax.vmap`, XLA fuses the product with the operations around
-    it.
+    For a feedback gain with a few entries, `matvec` is about 1.5 times faster than `@`
+    in a simulation loop. Under `jax.vmap`, XLA fuses the product with the operations
+    around it.
 
     **Arguments:**
 

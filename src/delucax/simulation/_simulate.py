@@ -81,8 +81,8 @@ def simulate(
 
     The horizon is cut into $T$ equal intervals. With `hold="zero"`, the control is held
     constant over each interval and switches between intervals. The solve is exact at
-    the switches: no step crosses a switch, all stages of a step use the control of its
-    interval, and a step that starts at a switch uses no slope from before.
+    the switches: no step crosses a switch, all stages of a step use the control of the
+    same interval, and a step that starts at a switch uses no slope from before.
 
     A large `t0` costs no precision, because the solve counts its time in intervals from
     `t0`. In single precision, switches are rounded to about `1e-7 (t1 - t0)`, however
@@ -106,8 +106,8 @@ def simulate(
 
     - `t0`, `t1`: start and end of the horizon, in units of time, with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
-    - `hold`: `"zero"` (default) to hold the control over each interval. Pass `None` for
-        a control that is a function of time, or for continuous feedback
+    - `hold`: `"zero"` (default) holds the control constant over each interval. Pass
+        `None` for a control that is a function of time, or for continuous feedback
         $u = \pi(t, h(t, x))$ by a controller that has no state.
     - `dt`: the length of an interval, in units of time; `t1 - t0` must be a whole
         multiple of `dt`. By default it is `(t1 - t0) / T` if `controller_or_controls`
@@ -128,8 +128,8 @@ def simulate(
     - `max_steps`: the largest number of adaptive steps over the horizon; by default
         4096, or 64 per interval if that is more.
     - `ts`: the times to save at, shape `(S + 1,)`, increasing and between `t0` and
-        `t1`. By default the `T + 1` ends of the intervals; the states there are not
-        interpolated.
+        `t1`. By default the times are the `T + 1` ends of the intervals, where the
+        states are not interpolated.
     - `key`: a random key for the controller's `init`; none by default.
     - `progress_meter`: a progress meter of Diffrax, such as
         `diffrax.TqdmProgressMeter()`; none by default.

@@ -217,8 +217,8 @@ class NeuralSystem(AbstractSystem):
 
     $$\dot x = \mathrm{network}(x, u)$$
 
-    The network is fully connected and as smooth as its activation. It is trainable:
-    `delucax.training.fit` changes the network and nothing else.
+    The network is fully connected and as smooth as its activation. The network is
+    trainable: [`delucax.training.fit`][] changes the network and nothing else.
 
     **Arguments:**
 

@@ -19,9 +19,9 @@ class BouncingBall(AbstractHybridSystem):
     Here $h$ is the height and $F$ the force. The state is (height [m], velocity [m/s]),
     the control is (force [N]).
 
-    If bounces lose energy, infinitely many of them happen in finite time. The control
-    interval in which they accumulate ends with `RESULTS.too_many_events`, with the ball
-    on the ground.
+    If bounces lose energy, infinitely many bounces happen in finite time. The control
+    interval in which the bounces accumulate ends with `RESULTS.too_many_events`, with
+    the ball on the ground.
 
     **Arguments:**
 

@@ -20,13 +20,14 @@ class AbstractHybridSystem(AbstractSystem):
     $g_i(t, x, u)$ crosses zero while the event is enabled. The state then becomes
     $x^+ = r_i(t, x^-, u)$.
 
-    Subclass it, name the events, and write `vector_field`, `guards` and `resets`.
-    [`delucax.Discretized`][] computes the steps of a hybrid system like those of any
-    other system, so environments, planners and controllers take hybrid systems too.
+    Subclass `AbstractHybridSystem`, name the events, and write `vector_field`, `guards`
+    and `resets`. [`delucax.Discretized`][] computes the steps of a hybrid system like
+    those of any other system, so environments, planners and controllers take hybrid
+    systems too.
 
     Think of a guard as a distance, such as the height of a ball: the guard is normally
-    positive, and the event fires when the guard falls to zero. If the state is on the
-    guard and moves beyond it, the event fires at once. If the state is already beyond
+    positive, and the event fires when the guard falls to zero. If the guard is zero and
+    the state moves beyond it, the event fires at once. If the state is already beyond
     an enabled guard at the start of an interval or after a reset, the model is wrong,
     and the status is `RESULTS.beyond_guard`. An urgent event fires instead.
 
@@ -34,12 +35,12 @@ class AbstractHybridSystem(AbstractSystem):
 
     - `event_names`: a tuple of strings.
     - `event_directions`: for each event, -1 if it fires when its guard falls through
-        zero (the default), +1 if it fires when the guard rises, or 0 for both. With 0,
-        the state may be on either side of the guard.
+        zero (the default), +1 if it fires when the guard rises, or 0 for both. With the
+        direction 0, the state may be on either side of the guard.
     - `urgent_events`: the events that also fire when the state is already beyond their
         guard at the start of an interval or after a reset; none by default. List an
-        event here if its guard depends on the control, because the control may jump
-        between intervals.
+        event in `urgent_events` if its guard depends on the control, because the
+        control may jump between intervals.
     - `crossing_events`: the events that only report that their guard crosses zero, such
         as the tick of a clock or the top of a flight. They need a direction. The state
         may be on either side of the guard, before and after the reset. None by default.

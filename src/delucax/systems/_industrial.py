@@ -124,9 +124,9 @@ class TwoTank(AbstractSystem):
     [cm^3/s]).
 
     Torricelli's law has $r(h) = \sqrt h$, which has an infinite slope at an empty tank
-    and no value below. The $r$ used here is odd and smooth everywhere. Its relative
-    error is about $(s / h)^2 / 4$: with the default $s$, 2.5e-5 at a level of 1 cm.
-    With a smaller $s$, the equations of an empty tank are stiffer.
+    and no value below. The $r$ used here is odd and smooth everywhere. The relative
+    error of this $r$ is about $(s / h)^2 / 4$: with the default $s$, 2.5e-5 at a level
+    of 1 cm. With a smaller $s$, the equations of an empty tank are stiffer.
 
     **Arguments:**
 
@@ -204,8 +204,8 @@ class PermanentMagnetMotor(AbstractSystem):
     J \dot\omega &= \tfrac32 p (\psi i_q + (L_d - L_q) i_d i_q) - b \omega - \tau
     \end{aligned}$$
 
-    The state is (i_d [A], i_q [A], speed [rad/s]), where the speed $\omega$ is that of
-    the shaft. The control is (v_d [V], v_q [V]). The disturbance is (load [N m]), the
+    The state is (i_d [A], i_q [A], speed [rad/s]), where $\omega$ is the speed of the
+    shaft. The control is (v_d [V], v_q [V]). The disturbance is (load [N m]), the
     torque $\tau$ that brakes the shaft. The vector field is smooth.
 
     **Arguments:**

@@ -128,8 +128,8 @@ class FurutaPendulum(AbstractSystem):
     the direction of positive arm rates. The vector field is smooth.
 
     The default constants are those of Quanser's QUBE-Servo 2: an arm of 95 g and 85 mm,
-    and a rod of 24 g and 129 mm. Their inertias are those of thin rods about their
-    ends.
+    and a rod of 24 g and 129 mm. The inertias of arm and rod are those of thin rods
+    about their ends.
 
     **Arguments:**
 

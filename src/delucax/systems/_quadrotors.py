@@ -88,7 +88,8 @@ class PlanarQuadrotor(AbstractSystem):
         return jnp.stack([x[3], x[4], x[5], ax, ay, turn])
 
     def equilibrium(self) -> tuple[State, Control]:
-        """Hovering at the origin, leaning against the wind that blows there at time 0.
+        """Hovering at the origin, leaning against the wind that blows at the origin at
+        time 0.
 
         If the wind changes with time, the quadrotor does not stay at this point.
 
@@ -132,18 +133,18 @@ class Quadrotor(AbstractSystem):
     l (u_\mathrm{back} - u_\mathrm{front}),\
     k (u_\mathrm{left} + u_\mathrm{right} - u_\mathrm{front} - u_\mathrm{back})\right)$$
 
-    With `inputs="wrench"` the control is the thrust and the torque themselves, (thrust
-    [N], torque_x [N m], torque_y [N m], torque_z [N m]). The vector field is smooth.
-    Thrusts may have either sign.
+    With `inputs="wrench"` the control is the total thrust and the three torques,
+    (thrust [N], torque_x [N m], torque_y [N m], torque_z [N m]). The vector field is
+    smooth. Thrusts may have either sign.
 
     `project` normalises the quaternion after each control interval. `difference` uses
     $q$ or $-q$, whichever is closer to the reference.
 
     To design a regulator, linearise [`delucax.Discretized`][] dynamics, not the system
-    itself, and give the regulator this `difference`. The length of the quaternion is
-    not controllable. The discrete-time dynamics project this length to 1 in every step.
-    In the linearised system the length is a marginal mode, for which no regulator
-    exists.
+    itself, and pass the `difference` of the system to the regulator. The length of the
+    quaternion is not controllable. The discrete-time dynamics project this length to 1
+    in every step. In the linearised system the length is a marginal mode, for which no
+    regulator exists.
 
     **Arguments:**
 

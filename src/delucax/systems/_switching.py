@@ -309,7 +309,8 @@ class ValveWithStops(AbstractHybridSystem):
 
     @host_unless_traced
     def equilibrium(self) -> tuple[State, Control]:
-        """The position where the spring is relaxed, or the stop that it pushes towards.
+        """The position where the spring is relaxed, or the stop towards which the
+        spring pushes.
 
         **Returns:** the state, shape `(3,)`, and a zero control, shape `(1,)`.
         """

@@ -132,12 +132,12 @@ class DriftingCar(AbstractSystem):
 
     The state is (vx [m/s], vy [m/s], rate $r$ [rad/s]), where vx and vy are the
     velocities of the centre of mass along and across the car. The control is (force $F$
-    [N], steering $\delta$ [rad]), where the force is that of the rear tyre along the
-    car. The derivative of the vector field is continuous, except where the force takes
-    all of the rear tyre's grip.
+    [N], steering $\delta$ [rad]), where the force acts on the rear tyre along the car.
+    The derivative of the vector field is continuous, except where the force takes all
+    of the rear tyre's grip.
 
-    In a drift the rear tyre slides, and the car turns against its steering. This
-    equilibrium is unstable: only feedback holds it.
+    In a drift the rear tyre slides, and the car turns against its steering. The
+    equilibrium of a drift is unstable: only feedback holds the car in it.
 
     Two changes keep the model defined everywhere. First, the slip angle of a tyre is
     not defined at rest, so its tangent is computed as $z = v / \sqrt{w^2 + v_0^2}$,

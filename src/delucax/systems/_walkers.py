@@ -94,8 +94,8 @@ class CompassGait(AbstractHybridSystem):
     - `leg_mass`: mass of a leg [kg], 5 by default, at the distance `lower` from the
         foot.
     - `hip_mass`: mass at the hip [kg], 10 by default.
-    - `lower`, `upper`: distances from the foot to the leg's mass and from there to the
-        hip [m], 0.5 by default.
+    - `lower`, `upper`: distances from the foot to the leg's mass and from this mass to
+        the hip [m], 0.5 by default.
     - `gravity`: [m/s^2], 9.81 by default. The numbers in the source are for a gravity
         of 9.8.
     - `slope`: $\gamma$ [rad], 3 degrees by default.
