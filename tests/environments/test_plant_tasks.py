@@ -246,7 +246,7 @@ def test_the_signature_of_a_task_has_its_options():
     assert list(parameters) == ["system", *options, "others"]
     assert parameters["horizon"].default == 100
     documented = inspect.getdoc(dlx.environments.planar_quadrotor)
-    assert "`horizon`: steps per episode, 100 by default." in documented
+    assert "`horizon`: the number of steps per episode, 100 by default." in documented
     assert "solver, `diffrax.Euler()` by default." in documented
     with user_error(match="make: no task is called 'planar'; did you mean"):
         dlx.make("planar")

@@ -22,8 +22,8 @@ class Arrival(AbstractCost):
     **Arguments:**
 
     - `reached`: a function `(t, x) -> bool` that says whether the state is a goal.
-        Usually `reached` is the `terminated` function of the environment. Never by
-        default.
+        Usually `reached` is the `terminated` function of the environment. By default no
+        state is a goal.
     - `step_cost`: $a$, 1 by default.
     - `control_weight`: $b$, 0 by default.
     - `arrival_cost`: $c$, 0 by default. Pass a negative number to reward the arrival.

@@ -58,9 +58,9 @@ class AbstractDynamics(AbstractPlant):
 
     @property
     def increments(self) -> int:
-        """The number of Brownian increments that `w` holds, one after the other. They
-        have the same variance. Each has `disturbance_size / increments` entries. By
-        default, the number is 1 if `noise` is `"brownian"`, else 0.
+        """The number of Brownian increments that `w` holds, one after the other. The
+        increments have the same variance. Each has `disturbance_size / increments`
+        entries. By default, the number is 1 if `noise` is `"brownian"`, else 0.
         """
         return 1 if self.noise == "brownian" else 0
 

@@ -97,8 +97,8 @@ class Discretized(AbstractDiscretization):
         cross at once, the event that is first in `event_names` fires; the other events
         are checked after the reset of the first one.
     - *Derivatives* are the exact derivatives of the computed trajectory, in forward and
-        reverse mode and to any order. They take into account that the time of an event
-        changes with the state (the saltation matrix).
+        reverse mode and to any order. The derivatives take into account that the time
+        of an event changes with the state (the saltation matrix).
 
     If something goes wrong, the status says so:
 

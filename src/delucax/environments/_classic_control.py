@@ -210,8 +210,8 @@ def mountain_car_discrete(
 ) -> Fields:
     r"""Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
 
-    It differs from [`delucax.environments.mountain_car`][] in a weaker motor, a farther
-    goal and the cost:
+    The task differs from [`delucax.environments.mountain_car`][] in a weaker motor, a
+    farther goal and the cost:
 
     - *Control:* the integer actions 0, 1 and 2 are the pushes -1, 0 and 1. A push in
         between works too.

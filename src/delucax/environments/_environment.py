@@ -106,7 +106,7 @@ class Environment(eqx.Module):
         Gymnasium users get, such as the cosine and sine of an angle; the identity by
         default. Controllers get the observation itself.
     - `observation_bounds`: `(low, high)`, each a number or a vector: the bounds of
-        `encode(y)` that define the observation space of Gymnasium. They are not
+        `encode(y)` that define the observation space of Gymnasium. These bounds are not
         enforced. None by default.
 
     **Raises:** `ValueError` if sizes do not fit each other, or `low` is above `high`.
@@ -254,8 +254,8 @@ class Environment(eqx.Module):
 
         **Returns:** a [`delucax.dynamics.OperatingPoint`][].
 
-        **Raises:** `ValueError` if neither the cost nor the dynamics define a guess. It
-        also raises the errors of [`delucax.trim`][].
+        **Raises:** `ValueError` if neither the cost nor the dynamics define a guess.
+        The method also raises the errors of [`delucax.trim`][].
 
         !!! example
 

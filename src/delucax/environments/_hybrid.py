@@ -65,8 +65,9 @@ def bouncing_ball(
     - *Cost:* `(peak - height)^2 + 0.01 force^2` per step, where `height` is the
         argument and `peak` is the height to which the energy of the ball would lift it:
         its height plus `velocity^2 / (2 gravity)`.
-    - *End:* when the peak is below 0.05 m. This costs `rest_cost`. Bounces do not
-        accumulate before the episode ends, unless the restitution is below 0.2.
+    - *End:* when the peak is below 0.05 m. The end of the bouncing costs `rest_cost`.
+        Bounces do not accumulate before the episode ends, unless the restitution is
+        below 0.2.
 
     The cost and the condition of termination use the parameters of the ball too. To
     change these parameters, call this function again (under `jax.vmap` for a batch),
@@ -119,7 +120,7 @@ def rimless_wheel(
     - *Start:* the angle uniformly random in +-0.2 rad about the vertical, the velocity
         in [0.8, 1.6] rad/s.
     - *Cost:* `(velocity - speed)^2 + 0.1 torque^2` per step.
-    - *End:* when the wheel rolls back. This costs `stall_cost`.
+    - *End:* when the wheel rolls back. Rolling back costs `stall_cost`.
 
     **Arguments:**
 
@@ -196,7 +197,7 @@ def compass_gait(
         hip along the slope.
     - *End:* when the walker trips (the swing foot is still below the ground after the
         legs have passed each other), or when the stance leg leans by more than 0.8 rad
-        from the normal of the slope. This costs `fall_cost`.
+        from the normal of the slope. A fall costs `fall_cost`.
 
     On the default slope of 3 degrees the walker walks on without control. On level
     ground (`slope=0.0`) the walker slows down and falls.

@@ -133,7 +133,7 @@ def lds(
     c = x^\top x + u^\top u$$
 
     Define the system in one of three ways: with matrices, with a linear model `system`,
-    or with a random `key`. The first state is zero. It never terminates.
+    or with a random `key`. The first state is zero. The task never terminates.
 
     **Arguments:**
 
@@ -151,8 +151,8 @@ def lds(
     - `key`: a random key, for random matrices.
     - `states`, `controls`: `n` and `m` of random matrices, 2 and 1 by default.
     - `observations`: `p` of a random `C`; by default `C` is the identity.
-    - `spectral_radius`: the spectral radius of a random `A`, 0.9 by default. Below 1 it
-        is stable.
+    - `spectral_radius`: the spectral radius of a random `A`, 0.9 by default. The system
+        is stable if the spectral radius is below 1.
     - `horizon`: the number of steps per episode, 200 by default.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.

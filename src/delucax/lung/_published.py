@@ -250,8 +250,8 @@ def read_published(
 ) -> Published:
     """Read the learned lung and the deep controller from a file of published weights.
 
-    The file is a NumPy `.npz` with the arrays of the two pickles of deluca-lung. Their
-    names and shapes are
+    The file is a NumPy `.npz` with the arrays of the two pickles of deluca-lung. The
+    names and shapes of these arrays are
 
     - `sim/params/0/shallow_fc1_model1/kernel` (10, 100), and `kernel` (100, 1) and
         `bias` (1,) of `shallow_fc2_model1`. Each of the first five steps has such

@@ -45,7 +45,8 @@ class BreathWaveform(eqx.Module):
     inspiratory phase lasts while $s \le \mathrm{inspiration}$. The keypoints are shares
     of the period, so they scale with the rate.
 
-    The waveform can be used like any other reference. Its numbers are leaves.
+    The waveform can be used like any other reference. The numbers of the waveform are
+    leaves.
 
     **Arguments:**
 

@@ -96,8 +96,8 @@ _cos32.defjvp(lambda p, t: (_cos32(*p), -_sin32(*p) * t[0]))
 def sin(x: ArrayLike) -> Array:
     """The sine, faster than `jnp.sin` on CPU in float32.
 
-    It is differentiable to any order. In other precisions than float32, `sin` calls
-    `jnp.sin`.
+    The function is differentiable to any order. In other precisions than float32, `sin`
+    calls `jnp.sin`.
 
     **Arguments:**
 
@@ -128,8 +128,8 @@ def sin(x: ArrayLike) -> Array:
 def cos(x: ArrayLike) -> Array:
     """The cosine, faster than `jnp.cos` on CPU in float32.
 
-    It is differentiable to any order. In other precisions than float32, `cos` calls
-    `jnp.cos`.
+    The function is differentiable to any order. In other precisions than float32, `cos`
+    calls `jnp.cos`.
 
     **Arguments:**
 

@@ -116,16 +116,17 @@ def rollout(
         over a long, unstable horizon. To let the gradient decay with the time constant
         `tau`, whatever `dt` is, use `exp(-dt / tau)`.
     - `truncate`: cut the gradient before every `truncate`-th step, in the state and in
-        the memory of the controller (truncated back-propagation). Never by default.
+        the memory of the controller (truncated back-propagation). By default the
+        gradient is never cut.
     - `throw`: whether to raise if a step fails, the states become NaN or infinite, or a
         learning controller refuses an update; true by default. With `throw=False`,
         check `trajectory.result` yourself.
 
-    **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first of these that
-    applies: the first failure of a step; `diverged`; `update_refused`, if the update of
-    a learning controller was not finite; `plan_failed`, `estimate_failed` or
-    `filter_failed`, if a plan, an estimate or a safety filter of the controller did not
-    succeed; success. `throw` does not raise an error for `plan_failed`,
+    **Returns:** a [`delucax.Trajectory`][]. The `result` of the trajectory is the first
+    of these that applies: the first failure of a step; `diverged`; `update_refused`, if
+    the update of a learning controller was not finite; `plan_failed`, `estimate_failed`
+    or `filter_failed`, if a plan, an estimate or a safety filter of the controller did
+    not succeed; success. `throw` does not raise an error for `plan_failed`,
     `estimate_failed` and `filter_failed`, because the controller handles them (see
     `throw=` of [`delucax.controllers.MPC`][]).
 

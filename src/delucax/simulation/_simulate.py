@@ -136,11 +136,11 @@ def simulate(
     - `throw`: whether to raise if the solve fails or the state becomes NaN or infinite;
         true by default. With `throw=False`, check `trajectory.result` yourself.
 
-    **Returns:** a [`delucax.Trajectory`][] at the saved times. Its `controls` and
-    `disturbances` are the values just before each saved time, without the first time.
-    With `hold=None`, its `controls` are the values just after each saved time, without
-    the last time. Its `observations` are the readings of the sensor at each saved time,
-    without the last time.
+    **Returns:** a [`delucax.Trajectory`][] at the saved times. The `controls` and
+    `disturbances` of the trajectory are the values just before each saved time, without
+    the first time. With `hold=None`, the `controls` are the values just after each
+    saved time, without the last time. The `observations` are the readings of the sensor
+    at each saved time, without the last time.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
     adjoint that does not fit, on a controller that learns from costs, and on more than

@@ -226,8 +226,8 @@ class Trajectory(eqx.Module):
 
         For a batch, `trajectory[i]` and `trajectory[2:5]` pick members. For one
         trajectory, `trajectory[start:stop]` holds the steps from `start` up to `stop`,
-        with the states at both ends. Its `total_cost` is the cost of these steps, and
-        includes the final cost if the last step is among them.
+        with the states at both ends. The `total_cost` of this part is the cost of its
+        steps, and includes the final cost if the last step is among them.
 
         **Arguments:** `index`: an integer or a slice.
 
@@ -337,7 +337,7 @@ class Trajectory(eqx.Module):
     def statistics(self) -> dict[str, Array]:
         """Statistics over a batch: of the total cost, and of how the episodes ended.
 
-        One trajectory counts as a batch of one. It works under `jax.jit`.
+        One trajectory counts as a batch of one. The method works under `jax.jit`.
 
         **Returns:** a dictionary to scalars. `"5%"`, `"25%"`, `"50%"`, `"75%"`, `"95%"`
         and `"mean"` are quantiles and the mean of the total cost, over the members

@@ -103,7 +103,8 @@ class AbstractPlant(eqx.Module):
 
     @property
     def observes_state(self) -> bool:
-        """Whether `observe` returns the state itself. It is traced to find out."""
+        """Whether `observe` returns the state itself, which is found out by tracing
+        `observe`."""
         shapes = (), (self.state_size,)
         t, x = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in shapes)
         traced = jax.make_jaxpr(self.observe)(t, x).jaxpr
@@ -171,8 +172,8 @@ class AbstractSystem(AbstractPlant):
     r"""A system in continuous time, $\dot x = f(t, x, u, w)$.
 
     To define your own system, subclass `AbstractSystem`, name the states and controls,
-    and write `vector_field`. States, controls and disturbances are vectors. Their sizes
-    follow from the names.
+    and write `vector_field`. States, controls and disturbances are vectors. The sizes
+    of these vectors follow from the names.
 
     **Class attributes** (or properties, if they depend on a field):
 
