@@ -60,7 +60,7 @@ class LearnedLung(AbstractDynamics):
     With `published=True` the model is that of the paper:
     $p_{k + 1} = \mathrm{network}(z)$, where $z$ holds the controls without $v$. For
     $k < \mathrm{boundary}$ there is only the last term, and the history before an
-    inspiration is zero.
+    inspiration is zero, except for the start pressure.
 
     The networks of the first steps have 16 hidden units each and are stacked in one
     array. While `u_out` is above 1/2, the state is reset to the state before an
