@@ -31,8 +31,8 @@ class AbstractController(eqx.Module):
     control and its cost.
 
     A controller that draws random numbers at each step keeps a random key in its state.
-    `init` puts it there, and each call splits it. A wrapper gives each part its own
-    key.
+    `init` stores the key in the state, and each call splits the key. A controller that
+    wraps other controllers gives each of them its own key.
 
     **Raises:** `ValueError` at construction if a [`delucax.parameter`][] or
     [`delucax.weight`][] is not finite or violates its constraint.
@@ -131,8 +131,9 @@ class AbstractController(eqx.Module):
     def learns_from_cost(self) -> bool:
         """Whether `applied` learns from the cost.
 
-        By default it does if a controller among the fields does. [`delucax.simulate`][]
-        has no cost, and refuses such a controller.
+        By default, a controller learns from the cost if one of the controllers in its
+        fields does. [`delucax.simulate`][] has no cost, so it raises an error for a
+        controller that learns from the cost.
         """
         return any(p.learns_from_cost for p in parts_of(self, AbstractController))
 
@@ -140,8 +141,8 @@ class AbstractController(eqx.Module):
 class AbstractLearner(AbstractController):
     """A controller that learns online, with a counterfactual loss of its policy.
 
-    A counterfactual loss is the cost that the policy of now would have had, if it had
-    acted in the past steps too. Meta-controllers such as
+    A counterfactual loss is the cost that the current policy would have had if it had
+    also acted in the past steps. Meta-controllers such as
     [`delucax.controllers.Adaptive`][] call `loss` and `fresh`. [`delucax.rollout`][]
     does not.
 
@@ -195,7 +196,7 @@ class AbstractStochasticPolicy(AbstractController):
     """A stochastic policy whose log-probability can be computed.
 
     [`delucax.training.PPO`][], [`delucax.training.LikelihoodRatio`][] and
-    [`delucax.training.scored_cost`][] train such controllers.
+    [`delucax.training.scored_cost`][] train stochastic policies.
 
     !!! example
 
@@ -250,8 +251,9 @@ class AbstractStochasticPolicy(AbstractController):
         - `y`: observation, shape `(p,)`.
         - `state`: the controller's state, before the call.
 
-        **Returns:** a scalar; or `None` (the default) if there is no closed form.
-        Callers then use `-log_prob` of the drawn control.
+        **Returns:** a scalar, or `None` (the default) if the entropy has no closed
+        form. If it is `None`, callers estimate the entropy by `-log_prob` of the drawn
+        control.
         """
         del t, y, state
         return None

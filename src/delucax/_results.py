@@ -23,8 +23,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     Test for success with `result == RESULTS.successful`. Read the message with
     `RESULTS[result]`; it is empty for a success.
 
-    It extends `diffrax.RESULTS`, which extends those of Optimistix and Lineax, so that
-    the message of a nested failure is kept.
+    `delucax.RESULTS` extends `diffrax.RESULTS`, which extends the `RESULTS` of
+    Optimistix and Lineax, so that the message of a nested failure is kept.
     """
 
     diverged = "The states or costs became NaN or infinite."

@@ -19,7 +19,7 @@ class DiskMargin(eqx.Module):
     - `margin`: the radius $\alpha$ of the disk; zero if the closed loop is not stable.
     - `frequency`: the critical frequency, in radians per unit of time.
     - `gain_low`, `gain_high`: the loop stays stable if its gain is multiplied by a real
-        factor between these two.
+        factor between `gain_low` and `gain_high`.
     - `phase`: the phase change, of either sign, that the loop tolerates, in radians.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
@@ -72,8 +72,8 @@ def disk_margin(
     |\delta| < \alpha.$$
 
     The loop $L$ is the linear model from $u$ to $y$, closed by $u = -y$. Several
-    channels are perturbed at once, by one full matrix $\delta$. For independent factors
-    in each channel this is conservative.
+    channels are perturbed at once, by one full matrix $\delta$. The disk margin is
+    conservative if each channel is perturbed by an independent factor.
 
     **Arguments:**
 
@@ -81,15 +81,15 @@ def disk_margin(
         [`delucax.LinearDynamics`][], with as many controls as outputs.
     - `skew`: $\sigma$, a number. 0 (default) balances the sensitivity $S$ and the
         complementary sensitivity $T = I - S$. 1 uses $S$, and -1 uses $T$.
-    - `channel`: the index of the only channel that is perturbed, with the others
-        closed; by default all channels are.
+    - `channel`: the index of the channel that is perturbed, while the other channels
+        stay closed without a perturbation. By default all channels are perturbed.
     - `throw`: raise an error if the search does not converge (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.analysis.DiskMargin`][].
 
     **Raises:** `ValueError` if `loop` is not linear, is time-varying or is not square,
-    or if there is no such `channel`. With `throw`, an error at run time if the search
+    or if `channel` is out of range. With `throw`, an error at run time if the search
     does not converge.
 
     Source: Seiler, Packard and Gahinet, 2020.

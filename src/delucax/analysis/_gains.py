@@ -34,9 +34,9 @@ def frequency_response(
 
     $$G(s) = C (s I - A)^{-1} B$$
 
-    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. It is infinite if
-    there is a pole at the frequency. It is differentiable with respect to the model and
-    to `omega`.
+    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. The response is
+    infinite at a frequency at which the model has a pole. It is differentiable with
+    respect to the model and to `omega`.
 
     **Arguments:**
 
@@ -97,8 +97,8 @@ def dcgain(
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][]. It need not be stable.
     - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
-    - `throw`: raise an error if there is a pole at frequency zero, an integrator
-        (default). If false, return infinity.
+    - `throw`: raise an error if the model has an integrator, which is a pole at
+        frequency zero (default). If false, return infinity.
 
     **Returns:** the gain, shape `(p, m)`.
 
@@ -154,7 +154,7 @@ class PeakGain(eqx.Module):
 
     - `gain`: the H-infinity norm; infinite if the model is not stable.
     - `frequency`: the frequency of the largest gain, in radians per unit of time. If
-        the model is not stable, it is the frequency of the least stable pole.
+        the model is not stable, `frequency` is the frequency of the least stable pole.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     `gain` and `frequency` are differentiable.
@@ -191,7 +191,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 
     with the controllability Gramian $W$. Its square is also the energy of the outputs
     after a unit impulse, summed over the inputs. The norm is infinite if the model is
-    not stable. It is differentiable to any order, in either mode.
+    not stable. It is differentiable to any order, in forward and reverse mode.
 
     **Arguments:**
 
@@ -244,13 +244,13 @@ def hinf_norm(
     the model is not stable.
 
     The frequencies at which the gain crosses a level are eigenvalues of a Hamiltonian
-    matrix. The search takes a level just above the largest gain so far, and evaluates
-    the gain at the midpoints between crossings, until there is no crossing. Newton
-    steps then refine the peak.
+    matrix. The search sets a level just above the largest gain found so far, and
+    evaluates the gain at the midpoints between the crossings of this level. It stops
+    when the gain does not cross the level. Newton steps then refine the peak.
 
-    The norm has first and second derivatives, in either mode, if it is attained at one
-    frequency and in one direction only. Otherwise you get the derivatives of one
-    maximiser.
+    The norm has first and second derivatives, in forward and reverse mode, if it is
+    attained at one frequency and in one direction only. If it is attained at several,
+    the derivatives belong to one of them.
 
     **Arguments:**
 

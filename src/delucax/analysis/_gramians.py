@@ -53,8 +53,8 @@ def controllability_matrix(
 def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
     r"""The observability matrix $[C;\; C A;\; \dots;\; C A^{n-1}]$.
 
-    Its rank is $n$ if the model is observable. With more than a few states it is
-    ill-conditioned: use [`delucax.analysis.is_observable`][] instead.
+    Its rank is $n$ if the model is observable. With more than a few states the matrix
+    is ill-conditioned: use [`delucax.analysis.is_observable`][] instead.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
     [`delucax.LinearDynamics`][].
@@ -99,15 +99,15 @@ def controllability_gramian(
     The horizon $T$ is infinite by default. The white noise acts at the inputs and has
     unit intensity (unit covariance in discrete time). The minimal energy of inputs that
     reach $x$ from rest is $x^\top W^{-1} x$. $W$ is differentiable to any order, in
-    either mode.
+    forward and reverse mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
     - `horizon`: $T$: in continuous time a positive number, in units of time; in
-        discrete time a number of steps. Infinite by default, which needs a stable
-        model.
+        discrete time a number of steps. By default the horizon is infinite, which
+        requires a stable model.
     - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
     - `throw`: raise an error if there is no horizon and the model is not stable
         (default). If false, return infinity.
@@ -118,7 +118,7 @@ def controllability_gramian(
     is not positive, or if `inputs` is unknown. With `throw`, an error at run time if
     there is no horizon and the model is not stable.
 
-    Source: Van Loan, 1978 (over a horizon).
+    Source: Van Loan, 1978 (finite horizon).
 
     !!! example
 
@@ -142,23 +142,23 @@ def controllability_gramian(
 def observability_gramian(
     model: LinearModel, horizon: RealScalar | None = None, *, throw: bool = True
 ) -> Float[Array, "n n"]:
-    r"""The observability Gramian: it gives the energy of the outputs after a start.
+    r"""The observability Gramian: the output energy from an initial state.
 
     $$W = \int_0^T e^{A^\top t} C^\top C e^{A t} \,\mathrm{d}t, \quad
     \text{or in discrete time} \quad
     W = \sum_{k=0}^{T-1} (A^\top)^k C^\top C A^k$$
 
     The horizon $T$ is infinite by default. From the state $x$ and without inputs, the
-    energy of the outputs is $x^\top W x$. $W$ is differentiable to any order, in either
-    mode.
+    energy of the outputs is $x^\top W x$. $W$ is differentiable to any order, in
+    forward and reverse mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
     - `horizon`: $T$: in continuous time a positive number, in units of time; in
-        discrete time a number of steps. Infinite by default, which needs a stable
-        model.
+        discrete time a number of steps. By default the horizon is infinite, which
+        requires a stable model.
     - `throw`: raise an error if there is no horizon and the model is not stable
         (default). If false, return infinity.
 
@@ -168,7 +168,7 @@ def observability_gramian(
     `horizon` is not positive. With `throw`, an error at run time if there is no horizon
     and the model is not stable.
 
-    Source: Van Loan, 1978 (over a horizon).
+    Source: Van Loan, 1978 (finite horizon).
 
     !!! example
 

@@ -24,21 +24,23 @@ class Margins(eqx.Module):
     **Attributes:**
 
     - `gain_margin`: the smallest factor above 1 on the loop gain that moves a pole to
-        the boundary of stability; infinite if there is none.
-    - `gain_reduction`: the largest factor below 1 that moves a pole to the boundary;
-        zero if there is none.
+        the boundary of stability; infinite if no factor does.
+    - `gain_reduction`: the largest factor below 1 that moves a pole to the boundary of
+        stability; zero if no factor does.
     - `phase_margin`: the smallest phase change, of either sign, that moves a pole to
-        the boundary, in radians; infinite if there is none.
-    - `delay_margin`: the smallest delay that moves a pole to the boundary, in units of
-        time; infinite if there is none.
+        the boundary of stability, in radians; infinite if no phase change does.
+    - `delay_margin`: the smallest delay that moves a pole to the boundary of stability,
+        in units of time; infinite if no delay does.
     - `gain_margin_frequency`, `gain_reduction_frequency`, `phase_margin_frequency`,
         `delay_margin_frequency`: the critical frequencies, in radians per unit of time;
-        NaN if there is none.
-    - `disk`, `disk_s`, `disk_t`: disk margins, each a
-        [`delucax.analysis.DiskMargin`][]: with $S$ and $T$ balanced, of the sensitivity
-        $S = 1 / (1 + L)$, and of the complementary sensitivity $T = L / (1 + L)$.
-    - `is_stable`: whether the closed loop is stable. If it is not, it has no margins:
-        the two factors are 1, the other margins 0, and the frequencies NaN.
+        NaN if the loop has no such margin.
+    - `disk`, `disk_s`, `disk_t`: the disk margins, each a
+        [`delucax.analysis.DiskMargin`][]. `disk_s` is the margin of the sensitivity
+        $S = 1 / (1 + L)$, `disk_t` is the margin of the complementary sensitivity
+        $T = L / (1 + L)$, and `disk` balances $S$ and $T$.
+    - `is_stable`: whether the closed loop is stable. If it is not stable, `gain_margin`
+        and `gain_reduction` are 1, the other margins are 0, and the frequencies are
+        NaN.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     All attributes except `is_stable` and `result` are differentiable.
@@ -86,10 +88,10 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     The loop $L$ is the linear model from $u$ to $y$, closed by $u = -y$. For a state
     feedback $u = -K x$, take $A$ and $B$ of the plant and $C = K$.
 
-    The frequencies at which $L$ is real, and those at which $|L| = 1$, are eigenvalues
-    of matrices. Sign changes between them show which are crossings, and each crossing
-    is refined to rounding. The margins have first and second derivatives, in either
-    mode: those of the critical crossing.
+    The frequencies at which $L$ is real or $|L| = 1$ are computed as eigenvalues of
+    matrices. Signs between these frequencies show which of them are crossings, and each
+    crossing is refined to rounding error. The margins have first and second derivatives
+    in forward and reverse mode, which are the derivatives at the critical crossing.
 
     **Arguments:**
 

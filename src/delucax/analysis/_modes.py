@@ -21,11 +21,11 @@ class ModalTest(eqx.Module):
     **Attributes:**
 
     - `modes`: the eigenvalues $\lambda$ of $A$, shape `(n,)`, complex.
-    - `distances`: the smallest singular value of
-        $[(A - \lambda I) / |A|,\; B / |B|]$ for each mode, shape `(n,)`. For
-        observability $A^\top$ and $C^\top$ take the place of $A$ and $B$. It is the
-        relative change of the matrices that makes the mode uncontrollable, and zero if
-        the mode is uncontrollable.
+    - `distances`: the smallest singular value of $[(A - \lambda I) / |A|,\; B / |B|]$
+        for each mode, shape `(n,)`. For observability $A^\top$ and $C^\top$ take the
+        place of $A$ and $B$. The distance is the smallest relative change of the
+        matrices that makes the mode uncontrollable, so it is zero for a mode that is
+        uncontrollable already.
     - `unstable`: which modes are on or outside the boundary of stability, shape `(n,)`.
     - `tolerance`: a distance up to this number counts as zero.
 
@@ -287,8 +287,8 @@ def poles(model: LinearModel) -> Complex[Array, " n"]:
 
     A [`delucax.systems.LinearSystem`][] is stable if all poles have a negative real
     part. [`delucax.LinearDynamics`][] are stable if all poles have a modulus below 1.
-    Simple poles have first derivatives, in either mode. The order of the poles is not
-    defined.
+    Simple poles have first derivatives, in forward and reverse mode. The order of the
+    poles is not defined.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
     [`delucax.LinearDynamics`][].
@@ -371,8 +371,9 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
     $$\begin{bmatrix} A - z I & B \\ C & 0 \end{bmatrix}$$
 
     The algorithm removes the states that the outputs observe directly. It then does the
-    same for the transposed system. The poles of the remaining system are the zeros.
-    Their number depends on the values of the matrices, so these cannot be traced.
+    same for the transposed system. The poles of the remaining system are the zeros. The
+    number of zeros depends on the values of the matrices, so the matrices cannot be
+    traced.
 
     **Arguments:**
 

@@ -35,7 +35,7 @@ class Return(eqx.Module):
     - `state`: the state just after the next event, shape `(n,)`.
     - `time`: the time until the event, a scalar.
     - `result`: success; `RESULTS.not_converged` if the event did not fire within
-        `max_steps`; else the failure of a step.
+        `max_steps`; otherwise the reason why a step failed.
 
     !!! example
 
@@ -68,8 +68,8 @@ class PeriodicOrbit(eqx.Module):
     - `period`: the period, in units of time, a scalar.
     - `jacobian`: the Jacobian of the map from event to event, shape `(n, n)`.
     - `multipliers`: the eigenvalues of `jacobian`, shape `(n,)`, complex, the largest
-        first. The orbit is stable if all of them are inside the unit circle. The
-        multiplier of a direction that leaves the surface of the event is zero.
+        first. The orbit is stable if all of them are inside the unit circle. At least
+        one multiplier is zero, because every event happens on the same surface.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     !!! example
@@ -102,12 +102,12 @@ def poincare_map(
     max_steps: int = 1000,
     throw: bool = True,
 ) -> Return:
-    """The Poincare map: from a state after an event to the state after the next one.
+    """The Poincare map: from the state after one event to the state after the next.
 
-    Other events on the way are applied too. The dynamics determine how the system is
-    integrated, in intervals of `dt`, with the same control in all of them. The event
-    may be at any time within an interval. The map is differentiable with respect to
-    every array.
+    Other events that fire before the next one are applied too. The system is integrated
+    by `dynamics` in intervals of `dt`, with the same control in all intervals. The
+    event may be at any time within an interval. The map is differentiable with respect
+    to every array.
 
     **Arguments:**
 
@@ -203,7 +203,7 @@ def periodic_orbit(
 
     - `dynamics`, `event`, `u`, `max_steps`, `throw`: as in
         [`delucax.analysis.poincare_map`][]. Dynamics with a `stepsize_controller` need
-        an `adjoint` with a forward mode, for example `diffrax.DirectAdjoint()`.
+        an `adjoint` that supports forward mode, for example `diffrax.DirectAdjoint()`.
     - `x0`: the guess, a state just after the event, shape `(n,)`.
     - `tolerance`: the absolute and relative tolerance of the state; 1e-10 by default,
         and at least 8 times machine epsilon.

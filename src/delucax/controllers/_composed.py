@@ -22,13 +22,13 @@ class Scheduled(AbstractController):
 
     At time `t`, the controller with index `round(t / dt)` acts. After the end of the
     sequence, the last controller acts. Before the start the control is NaN, which a
-    rollout reports. All controllers share one state, so it must have the same structure
-    and meaning for each of them.
+    rollout reports. All controllers share one state, so the state must have the same
+    structure and meaning for all controllers.
 
     **Arguments:**
 
-    - `controllers`: controllers of one kind in one module, whose arrays have a leading
-        time axis. `eqx.filter_vmap` makes such a module.
+    - `controllers`: one controller module whose arrays have a leading time axis, with
+        one entry for each time step. `eqx.filter_vmap` makes such a module.
     - `dt`: the time between one controller and the next.
 
     **Raises:** `ValueError` if `controllers` is not a controller, its arrays do not
@@ -107,8 +107,8 @@ class History(AbstractController):
 
     **Arguments:**
 
-    - `base`: $\pi$, the controller that acts on the window. Its observation is a vector
-        with `size * (n + 1) + controls * n` entries.
+    - `base`: $\pi$, the controller that acts on the window. The observation of `base`
+        is a vector with `size * (n + 1) + controls * n` entries.
     - `size`: the size of the features $z$.
     - `controls`: the number of controls.
     - `length`: $n$, the number of past steps; 1 by default.
@@ -116,7 +116,7 @@ class History(AbstractController):
         observation itself by default.
 
     **Raises:** `ValueError` if `base` is not a controller or a size is below 1; at run
-    time, if the features have another size.
+    time, if the features do not have `size` entries.
 
     !!! example
 

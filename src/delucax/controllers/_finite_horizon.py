@@ -33,9 +33,9 @@ class FiniteHorizonLQR(AbstractController):
     $$\sum_{k < T} \left( e_k^\top Q e_k + 2 e_k^\top S v_k + v_k^\top R v_k \right) +
     e_T^\top Q_f e_T, \qquad e = \mathrm{difference}(x, r), \quad v = u - u_r$$
 
-    The feed-forward control $\kappa$ takes the whole reference and the whole known
-    disturbance into account. It is zero if the dynamics go from each $r_k$ to $r_{k+1}$
-    under $u_{r,k}$, for example along a planned trajectory.
+    The feed-forward control $\kappa$ takes the reference and the known disturbance of
+    all steps into account. The feed-forward is zero if the dynamics go from each $r_k$
+    to $r_{k+1}$ under $u_{r,k}$, for example along a planned trajectory.
 
     **Arguments:**
 
@@ -49,8 +49,9 @@ class FiniteHorizonLQR(AbstractController):
         `dynamics`.
     - `reference`: $r$, the state to follow, a vector of shape `(n,)` or a function of
         time; the operating points by default.
-    - `control_reference`: $u_r$, the control that costs nothing, a vector of shape
-        `(m,)` or a function of time; the control of the operating points by default.
+    - `control_reference`: $u_r$, the control at which the control cost is zero, a
+        vector of shape `(m,)` or a function of time; the control of the operating
+        points by default.
     - `disturbance`: a disturbance known in advance, a vector of shape `(k,)` or a
         function of time; none by default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
@@ -64,8 +65,8 @@ class FiniteHorizonLQR(AbstractController):
     step `T` on the control is NaN, which a rollout reports.
 
     **Raises:** `ValueError` if `dynamics` is not linear or does not observe its state,
-    there is no horizon, or a weight or signal does not fit; an error at run time if the
-    cost of a step has no minimum.
+    no horizon is known, or a weight or signal has the wrong shape; an error at run time
+    if the cost of a step has no minimum.
 
     Source: Kalman, 1960; Anderson and Moore, 1990 (tracking).
 

@@ -33,8 +33,8 @@ class HInfinity(AbstractController):
     sums run over all time, or over a finite horizon. With a horizon the gain varies in
     time, and the left side includes the final cost.
 
-    By default $\gamma$ is the smallest level that a controller can attain. A larger one
-    improves the average at the expense of the worst case.
+    By default $\gamma$ is the smallest level that a controller can attain. A larger
+    $\gamma$ improves the average performance at the expense of the worst case.
 
     **Arguments:**
 
@@ -44,10 +44,10 @@ class HInfinity(AbstractController):
         operating point to the next.
     - `Q`: state weight, shape `(n, n)`, symmetric; with a horizon also `(T, n, n)`.
     - `R`: control weight, shape `(m, m)`, symmetric; with a horizon also `(T, m, m)`.
-    - `gamma`: the level $\gamma$, a positive number; the smallest attainable one by
-        default.
-    - `horizon`: the number of steps `T`. By default the length of time-varying
-        `dynamics`, and otherwise infinite.
+    - `gamma`: the level $\gamma$, a positive number; by default the smallest level that
+        a controller can attain.
+    - `horizon`: the number of steps `T`. By default the horizon is the length of
+        time-varying `dynamics`, and infinite for time-invariant `dynamics`.
     - `final`: final weight, shape `(n, n)`, symmetric, only with a horizon; zero by
         default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
@@ -60,8 +60,8 @@ class HInfinity(AbstractController):
     and from step `T` on, which a rollout reports.
 
     **Raises:** `ValueError` if `dynamics` is not linear, does not rest at its operating
-    point or does not observe its state, or if an argument does not fit; an error at run
-    time if no controller attains `gamma`.
+    point or does not observe its state, or if an argument has the wrong shape or value;
+    an error at run time if no controller attains `gamma`.
 
     Source: Basar and Bernhard, 1995.
 

@@ -38,8 +38,8 @@ class LQR(AbstractController):
     \delta u^\top R\, \delta u$$
 
     where $\delta x$ and $\delta u$ are the deviations from the operating point. The
-    minimum from a deviation $\delta x$ is $\delta x^\top P\, \delta x$. Under white
-    noise of unit covariance on the state, the average cost per step is
+    minimal cost from a deviation $\delta x$ is $\delta x^\top P\, \delta x$. Under
+    white noise of unit covariance on the state, the average cost per step is
     $\operatorname{tr} P$.
 
     With a `reference` $r(t)$, a `control_reference` $u_r(t)$ or a known `disturbance`
@@ -52,28 +52,30 @@ class LQR(AbstractController):
     Here $d_k = F(r_k, u_{r,k}, w_k) - r_{k+1}$ is the error after one step $F$ of the
     linear dynamics from the reference. The feed-forward is optimal if the signals are
     known `preview` steps ahead and are constant after that. The state reaches a
-    constant $r$ exactly only if $u_r$ holds it there, because the cost charges any
-    other control. [`delucax.controllers.LQI`][] reaches it without knowing $u_r$.
+    constant $r$ exactly only if $u_r$ holds it there, because the cost penalises any
+    control other than $u_r$. [`delucax.controllers.LQI`][] reaches it without knowing
+    $u_r$.
 
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
         and whose state is observed, for example from [`delucax.linearize`][]; or any
         dynamics, if you give a `point`. The residual of the equilibrium must be below
-        1e-4 of the terms $|A - I|\,|x_\mathrm{ref}| + |B|\,|u_\mathrm{ref}|$.
+        1e-4 times $|A - I|\,|x_\mathrm{ref}| + |B|\,|u_\mathrm{ref}|$.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `reference`: $r$, the state to follow, a vector of shape `(n,)` or a function of
         time; the operating point by default.
-    - `control_reference`: $u_r$, the control that costs nothing, a vector of shape
-        `(m,)` or a function of time; the control of the operating point by default.
+    - `control_reference`: $u_r$, the control at which the control cost is zero, a
+        vector of shape `(m,)` or a function of time; the control of the operating point
+        by default.
     - `disturbance`: $w$, a disturbance known in advance, a vector of shape `(k,)` or a
         function of time; none by default.
     - `preview`: the number of steps ahead at which the signals are known, 0 by default.
     - `difference`: a function `(x, x_ref) -> deviation`, such as the `difference` of
-        the system that you linearised, which wraps angles. Subtraction by default; with
-        a `point`, the `difference` of nonlinear `dynamics`.
+        the system that you linearised, which wraps angles. By default it is subtraction
+        or, with a `point`, the `difference` of nonlinear `dynamics`.
     - `point`: the [`delucax.dynamics.OperatingPoint`][] about which to linearise
         `dynamics` at time 0, from [`delucax.trim`][]. Without it, `dynamics` must be
         linear.
@@ -82,8 +84,8 @@ class LQR(AbstractController):
     Riccati equation, shape `(n, n)`; `x_ref` and `u_ref`, the operating point.
 
     **Raises:** `ValueError` if `dynamics` is not linear, is time-varying, does not rest
-    at its operating point or does not observe its state, or if a weight or signal does
-    not fit; an error at run time if there is no stabilising gain.
+    at its operating point or does not observe its state, or if a weight or signal has
+    the wrong shape; an error at run time if there is no stabilising gain.
 
     Source: Kalman, 1960; Anderson and Moore, 1990 (tracking).
 
@@ -195,8 +197,8 @@ class LQI(AbstractController):
     $$u_k = u_\mathrm{ref} - K\, \mathrm{difference}(x_k, x_\mathrm{ref}) - K_i z_k,
     \qquad z_{k+1} = z_k + \Delta t\, (r(t_k) - C x_k)$$
 
-    It brings the outputs $C x$ to a constant reference $r$ under any constant
-    disturbance. The gains minimise the sum over all time of
+    The controller brings the outputs $C x$ to a constant reference $r$ under any
+    constant disturbance. The gains minimise the sum over all time of
 
     $$v^\top Q v + 2\, v^\top S\, \delta u + \delta u^\top R\, \delta u$$
 
@@ -204,7 +206,8 @@ class LQI(AbstractController):
 
     If the applied control differs from the one that the regulator asked for, for
     example because it was clipped, then back-calculation sets the integral to the value
-    that would have given the applied control. So the integral does not wind up.
+    that would have given the applied control. So the integral does not wind up when the
+    control is clipped.
 
     **Arguments:**
 
@@ -215,8 +218,8 @@ class LQI(AbstractController):
     - `S`: cross weight, shape `(n+p, m)`; zero by default.
     - `output`: $C$, the map from the state to the regulated outputs, shape `(p, n)`.
         There are at most as many outputs as controls.
-    - `reference`: $r$, a vector of shape `(p,)` or a function of time that returns one;
-        the outputs at the operating point by default.
+    - `reference`: $r$, a vector of shape `(p,)` or a function of time that returns such
+        a vector; the outputs at the operating point by default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
         subtraction by default. The outputs are `C x_ref` plus $C$ times the deviation.
 

@@ -43,15 +43,15 @@ class MLP(AbstractController):
     - `depth`: the number of hidden layers, 2 by default; 0 for a linear map.
     - `features`: $\phi$, a function of an observation, such as `env.encode`; the
         observation itself by default.
-    - `bounds`: `(low, high)`, each a finite number or vector, between which the control
-        is squashed; none by default.
+    - `bounds`: `(low, high)`, each a finite number or vector, to which the control is
+        limited by a smooth function; none by default.
     - `activation`: the activation function of the hidden layers, `jnp.tanh` by default.
     - `key`: a random key for the initial weights.
 
     **Attributes:** `network`, the network $f$, an `eqx.nn.MLP`, trainable.
 
     **Raises:** `ValueError` if a size is below 1, bounds are not finite or there is no
-    key; at run time, if the features have another size.
+    key; at run time, if the size of the features is not `in_size`.
 
     !!! example
 
@@ -152,8 +152,8 @@ def mlp_policy(
 ) -> AbstractController:
     """A fully connected network that fits an environment.
 
-    The network acts on `environment.encode(y)`. It squashes its controls between
-    `environment.control_bounds` if these are finite.
+    The network acts on `environment.encode(y)`. The network limits its controls to
+    `environment.control_bounds` by a smooth function, if these bounds are finite.
 
     **Arguments:**
 
@@ -229,7 +229,7 @@ class GRU(AbstractController):
     $A$ and $b$. Both are trainable.
 
     **Raises:** `ValueError` if a size is below 1, bounds are not finite or there is no
-    key; at run time, if the features have another size.
+    key; at run time, if the size of the features is not `in_size`.
 
     Source: Cho et al., 2014.
 

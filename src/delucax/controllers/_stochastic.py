@@ -66,10 +66,11 @@ class Gaussian(_AroundBase):
     `gaussian.base`. The draw is differentiable: analytic gradients pass through it,
     with the noise $e$ held fixed.
 
-    The log-probability belongs to the clipped control. Between the bounds it is the log
-    of the normal density. At a bound it is the log of the probability of all draws that
-    are clipped to it. If you pass the bounds of the environment, it is thus the
-    log-probability of the controls that a [`delucax.Trajectory`][] records.
+    The log-probability belongs to the clipped control. Between the bounds, the
+    log-probability is the log of the normal density. At a bound, it is the log of the
+    probability of all draws that are clipped to that bound. So if you pass the bounds
+    of the environment, `log_prob` gives the log-probability of the controls that a
+    [`delucax.Trajectory`][] records.
 
     **Arguments:**
 
@@ -134,10 +135,10 @@ class Gaussian(_AroundBase):
         """The log-probability with which `__call__(t, y, state)` returns `u`.
 
         **Arguments:** `t`, `y`, `state`: as in a call. `u`: a control, shape `(m,)`. A
-        control beyond a bound counts as the bound.
+        control beyond a bound counts as a control at that bound.
 
-        **Returns:** a scalar. It is the log of a density for the controls between their
-        bounds, times a probability for the controls at a bound.
+        **Returns:** a scalar. It is the log of a product: a density for the controls
+        between their bounds, times a probability for the controls at a bound.
         """
         mean, _ = self._mean(t, y, state)
         return self._log_prob(mean, u)
@@ -179,19 +180,20 @@ class Gaussian(_AroundBase):
 
         $$\sum_{k < \mathrm{length}} \log p(u_k \mid t_k, y_k, s_k)$$
 
-        Derivatives with respect to the weights hold the record fixed. The state of
-        `base` is computed again, and its derivatives count. A stochastic `base` is not
-        supported, because it would draw again.
+        Derivatives with respect to the weights hold the recorded observations, controls
+        and costs fixed. The state of `base` is computed again, and the gradient
+        includes the derivatives of this state. A stochastic `base` is not supported,
+        because it would draw other random numbers than in the run.
 
         **Arguments:** `trajectory`: one run of this controller, with its observations,
         controls and costs. Use `jax.vmap` for a batch. The bounds of this controller
         must be within the environment's bounds, otherwise the recorded controls are not
-        the drawn ones.
+        the controls that this controller drew.
 
         **Returns:** a scalar.
 
-        **Raises:** `ValueError` if the trajectory lacks one of these records, or is a
-        batch.
+        **Raises:** `ValueError` if the trajectory lacks its observations, controls or
+        costs, or is a batch.
         """
         where = "Gaussian.total_log_prob"
         if trajectory.batch_shape:
@@ -218,7 +220,7 @@ class Gaussian(_AroundBase):
 
 
 class Categorical(_AroundBase):
-    r"""A policy that draws one of several controls, with the probabilities of a base.
+    r"""A policy that draws one of several controls, with probabilities from a base controller.
 
     $$P(u = a_i) = \operatorname{softmax}(\ell)_i, \qquad \ell = \mathrm{base}(t, y)$$
 
@@ -232,7 +234,7 @@ class Categorical(_AroundBase):
     - `actions`: the controls $a_i$, shape `(actions, m)`, such as `env.actions`.
 
     **Raises:** `ValueError` if `base` is not a controller or `actions` is not a matrix;
-    at run time, if there is no random key or `base` gives another number of logits.
+    at run time, if there is no random key or `base` does not give one logit per action.
 
     Source: Williams, 1992.
 

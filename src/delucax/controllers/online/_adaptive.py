@@ -48,36 +48,37 @@ class AdaptiveState(NamedTuple):
 class Adaptive(AbstractController):
     r"""An online learner that adapts to a plant or disturbances that change.
 
-    Copies of `base`, the experts, run in parallel on the same observations. Every
-    `every` steps a new expert starts, which has learned nothing yet. The $i$-th expert
-    expires after `every` $(4 \cdot 2^k + 1)$ steps, where $2^k$ is the largest power of
-    two that divides $i$. So there is always an expert that started shortly after any
-    change. The first expert never expires. If no slot is free, the expert that would
-    expire next is dropped.
+    Copies of `base`, the experts, run in parallel on the same observations. After each
+    interval of `every` steps a new expert starts, which has learned nothing yet. The
+    $i$-th expert expires after `every` $(4 \cdot 2^k + 1)$ steps, where $2^k$ is the
+    largest power of two that divides $i$. So there is always an expert that started
+    shortly after any change. The first expert never expires. If no slot is free, the
+    expert that would expire next is dropped.
 
     The weights of the experts follow their counterfactual losses:
 
     $$p_i \leftarrow p_i \exp(-\mathrm{rate}\, (\ell_i - \bar \ell) / \sigma)$$
 
     Here $\bar \ell$ is the mean loss under the weights, and $\sigma$ the standard
-    deviation of the recent losses, so the scale of the losses does not matter. Then a
-    fraction `share` of the total weight is distributed evenly over all active experts,
-    so that any of them can rise quickly.
+    deviation of the recent losses, so the weights do not depend on the scale of the
+    losses. Then a fraction `share` of the total weight is distributed evenly over all
+    active experts, so that the weight of any expert can rise quickly.
 
-    With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` it is
-    the control of one expert. Another one is drawn only with the probability by which
-    the weight of this expert has fallen, so the expert seldom changes. With
-    [`delucax.controllers.gpc`][] as base, this is AdaGPC.
+    With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` the
+    control comes from a single expert. Another expert is drawn only with a probability
+    equal to the relative loss of weight of the current expert, so the expert seldom
+    changes. With [`delucax.controllers.gpc`][] as base, this is AdaGPC.
 
     **Arguments:**
 
-    - `base`: an [`delucax.AbstractLearner`][], such as [`delucax.controllers.gpc`][]
-        makes.
+    - `base`: an [`delucax.AbstractLearner`][], for example from
+        [`delucax.controllers.gpc`][].
     - `slots`: the largest number of active experts, 8 by default.
     - `every`: the number of steps between the starts of two experts, 64 by default.
-    - `rate`: the rate of the weights, 0.5 by default.
-    - `share`: the fraction that is distributed evenly at each step, above 0 and at most
-        1; 0.02 by default.
+    - `rate`: how fast the weights follow the losses, the $\mathrm{rate}$ above; 0.5 by
+        default.
+    - `share`: the fraction of the total weight that is distributed evenly at each step,
+        above 0 and at most 1; 0.02 by default.
     - `play`: `"mix"` (default) or `"switch"`.
 
     **Raises:** `ValueError` if `base` is not a learner or a number is out of its range;

@@ -47,32 +47,34 @@ class BPC(AbstractController):
 
     $$u_t = \mathrm{base}(y_t) + (\theta_t + \delta e_t)\, s_t$$
 
-    The direction $e_t$ is uniform on the unit sphere. The signal $s_t$ is the last
-    disturbances, or nature's outputs if the state is not observed. After each step,
-    theta moves against
+    The direction $e_t$ is uniform on the unit sphere. The signal $s_t$ consists of the
+    last `memory` disturbances, or of nature's outputs if the state is not observed.
+    After each step, theta moves against
 
     $$g_t = \frac{d}{\delta} (c_t - \bar c_t) \sum_{i < \mathrm{horizon}} e_{t-i}$$
 
-    This estimates the gradient of the cost that a fixed theta of dimension $d$ would
-    have had. $\bar c_t$ is the mean of the previous costs. It reduces the variance, and
-    does not change the expectation. The regret grows as $T^{3/4}$.
+    The vector $g_t$ estimates the gradient of the cost that a fixed theta of dimension
+    $d$ would have had. Here $\bar c_t$ is the mean of the previous costs: subtracting
+    it reduces the variance of the estimate, and does not change the expectation. The
+    regret grows as $T^{3/4}$.
 
     **Arguments:**
 
     - `dynamics`: the model, from which the disturbances are computed.
     - `base`: a controller that stabilises the dynamics, such as an
         [`delucax.controllers.LQR`][].
-    - `memory`: the number of past values of the signal, 5 by default. Each value adds
-        dimensions to the search.
-    - `horizon`: the number of past directions in the gradient, 5 by default.
-    - `delta`: $\delta$, the size of the directions. By default 0.2 divided by the size
-        of the first response of the observation to a unit of control.
-    - `learning_rate`: the scale of the optimiser's step; 0.05 divided by the same size
-        by default.
+    - `memory`: the number of past values of the signal, 5 by default. A longer memory
+        adds dimensions to the search.
+    - `horizon`: the number of past directions $e_{t-i}$ in the gradient estimate, 5 by
+        default.
+    - `delta`: $\delta$, the size of the random perturbation of theta. By default 0.2
+        divided by the norm of the first response of the observation to a unit control.
+    - `learning_rate`: the scale of the optimiser's step; by default 0.05 divided by the
+        same norm as for `delta`.
     - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
         default.
-    - `radius`: the largest Frobenius norm of theta; 50 divided by the same size by
-        default.
+    - `radius`: the largest Frobenius norm of theta; by default 50 divided by the same
+        norm as for `delta`.
 
     **Attributes:** `policy.start`, the initial theta, trainable; zero at first.
 

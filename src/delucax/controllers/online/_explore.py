@@ -54,20 +54,22 @@ class Explore(AbstractController):
 
     $$(A - B K)\, [N_0 \cdots N_{q-1}] = [N_1 \cdots N_q]$$
 
-    After that the control comes from the controller that `build` makes for
+    After these steps the control comes from the controller that `build` makes for
     $x_{t+1} = A x_t + B u_t$. With [`delucax.controllers.gpc`][] and `steps` near
     $T^{2/3}$, the regret over $T$ steps grows as $T^{2/3}$.
 
     **Arguments:**
 
-    - `build`: a function that makes a controller for a [`delucax.LinearDynamics`][]. It
-        is called under `jax.jit`, so a learner in it must be given its `horizon`.
+    - `build`: a function that makes a controller for a [`delucax.LinearDynamics`][].
+        The function is called under `jax.jit`, so an online learner that it makes must
+        be given its `horizon`.
     - `K`: a gain that stabilises the plant, shape `(m, n)`; zero if the plant is stable
         without control.
     - `steps`: the number of steps of exploration.
     - `scale`: $a$, the size of the random controls, 1 by default.
-    - `order`: $q$, the number of steps of the response that are compared. By default
-        `n`, which is enough to move the state anywhere.
+    - `order`: $q$, the number of matrices $N_j$ on each side of the least-squares
+        problem. By default `n`, because a controllable plant reaches any state in `n`
+        steps.
     - `dt`: the control interval, 1 by default.
 
     **Raises:** `ValueError` if `build` does not make a controller, `K` is not a matrix
