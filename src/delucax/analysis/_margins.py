@@ -89,9 +89,10 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     feedback $u = -K x$, take $A$ and $B$ of the plant and $C = K$.
 
     The frequencies at which $L$ is real or $|L| = 1$ are computed as eigenvalues of
-    matrices. Signs between these frequencies show which of them are crossings, and each
-    crossing is refined to rounding error. The margins have first and second derivatives
-    in forward and reverse mode, which are the derivatives at the critical crossing.
+    matrices. Sign changes of $\operatorname{Im} L$ and of $\log |L|$ show which of
+    these frequencies are crossings, and each crossing is refined to rounding error. The
+    margins have first and second derivatives in forward and reverse mode, which are the
+    derivatives at the critical crossing.
 
     **Arguments:**
 

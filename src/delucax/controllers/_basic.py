@@ -25,7 +25,7 @@ class Zero(AbstractController):
 
     **Arguments:** `control_size`: the number of controls $m$.
 
-    **Raises:** `ValueError` if it is below 0.
+    **Raises:** `ValueError` if `control_size` is below 0.
 
     !!! example
 
@@ -171,7 +171,7 @@ class Linear(AbstractController):
 class OpenLoop(AbstractController):
     """Open-loop control by a given sequence, $u_k = v_k$.
 
-    After the last entry, the controller repeats it.
+    After the last step of the sequence, the controller keeps applying the last control.
 
     **Arguments:** `values`: $v$, shape `(steps, m)`; trainable.
 

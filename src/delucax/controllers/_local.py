@@ -55,8 +55,9 @@ def local_model(
 ) -> LocalModel:
     """The linearised dynamics and the second-order cost of an environment.
 
-    Both are taken at the operating point of `environment.trim()`. They are what a
-    linear design such as [`delucax.controllers.LQR`][] needs.
+    Both the dynamics and the cost are expanded at the operating point of
+    `environment.trim()`. A linear design such as [`delucax.controllers.LQR`][] needs
+    this model.
 
     Linear designs need a positive definite cost. If the cost is flat or concave in some
     direction, that direction gets the weight `regularisation` times the largest weight.
@@ -69,9 +70,9 @@ def local_model(
     **Returns:** a [`delucax.controllers.LocalModel`][].
 
     **Raises:** `ValueError` if the environment has no target and no equilibrium, if the
-    cost is not twice differentiable there, or if the environment is traced (under
-    `jax.jit`, `jax.vmap` or `jax.grad`); an error at run time if there is no operating
-    point.
+    cost is not twice differentiable at the operating point, or if the environment is
+    traced (under `jax.jit`, `jax.vmap` or `jax.grad`); an error at run time if there is
+    no operating point.
 
     !!! example
 
@@ -161,9 +162,9 @@ def local_mpc(
     real_time: bool = False,
     throw: bool = True,
 ) -> MPC:
-    r"""The MPC of an environment: it plans with its model, its cost and its bounds.
+    r"""The MPC of an environment, with the model, cost and bounds of the environment.
 
-    With an `lqr`, each plan ends with the cost to go of that regulator,
+    With an `lqr`, the final cost of each plan is the cost to go of that regulator,
     $\delta x^\top P\, \delta x$.
 
     **Arguments:**

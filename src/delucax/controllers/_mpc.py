@@ -66,14 +66,14 @@ class MPC(AbstractController):
 
     1. the last plan, shifted by one step, under its feedback gains,
     2. the trajectory under an LQR about an operating point,
-    3. the trajectory under the control of that point.
+    3. the trajectory under the constant control of the operating point.
 
     The LQR keeps an unstable plant near the operating point. A plan of
-    [`delucax.planning.ILQR`][] without constraints costs at most as much as each of the
-    three. [`delucax.planning.Start.default`][] chooses the operating point and computes
-    the LQR once, when you make the controller. Give a `start` if you want to hold an
-    unstable plant far from that point, or if there is no LQR about it:
-    [`delucax.planning.Start.default`][] lists the reasons.
+    [`delucax.planning.ILQR`][] without constraints costs at most as much as each of
+    these three trajectories. [`delucax.planning.Start.default`][] chooses the operating
+    point and computes the LQR once, when you make the controller. Give a `start` if you
+    want to hold an unstable plant far from that point, or if no LQR exists about that
+    point: [`delucax.planning.Start.default`][] lists the reasons why it may not exist.
 
     **Status.** The state of the controller has
 
@@ -83,15 +83,16 @@ class MPC(AbstractController):
         in `incidents["failed_plan"]`,
     - `last`: the last plan, shifted by one step, a [`delucax.planning.Start`][].
 
-    A plan that ran out of iterations or found no descent is still used, because it is
-    the best so far. A plan is unusable if every start diverges or the constraints
-    cannot hold. `throw` and `fallback` decide what happens then.
+    If the planner runs out of iterations or finds no descent, the controller still uses
+    its plan, because it is the best plan so far. A plan is unusable if every start
+    diverges or the constraints cannot hold. `throw` and `fallback` decide what the
+    controller does without a usable plan.
 
     **Real time.** With `real_time` the planner does not iterate until it converges.
     Each step solves one quadratic program of [`delucax.planning.SQP`][] about the last
     plan, shifted by one step, and takes the full step. `prepare` sets up the program
     before the state is measured. `feedback` solves it with at most `max_qp_steps`
-    linear systems; `state.iterations` tells how many:
+    linear systems; `state.iterations` is the number of systems that it solved:
 
         state = mpc.init()
         while True:
@@ -99,51 +100,56 @@ class MPC(AbstractController):
             y = measure()
             u, state = mpc.feedback(t, y, state)
 
-    Calling the controller does both. The first program is about the first trajectory of
-    `start`, so give a converged plan there if you have one. If a program cannot be
-    solved, the next program is about the same plan, shifted by one more step.
+    Calling the controller does both. The first program is an expansion about the first
+    trajectory of `start`, so pass a converged plan as `start` if you have one. If a
+    program cannot be solved, the next program is an expansion about the same plan,
+    shifted by one more step.
 
-    **Derivatives.** They are the derivatives of the planner.
+    **Derivatives.** The derivatives of the control are the derivatives of the planner.
     [`delucax.planning.ILQR`][] uses the implicit function theorem, and gives NaN if a
-    plan did not converge. If the planner samples, only the chosen start is
-    differentiated. The choice itself has no derivative.
+    plan did not converge. If the planner is based on samples, only the start that it
+    chose is differentiated. The choice itself has no derivative.
 
     **Arguments:**
 
     - `dynamics`: the model. Its observation must be its state. If the state is not
         measured, put the MPC into a [`delucax.controllers.OutputFeedback`][].
-    - `cost`: the stage and final cost. The horizon can be short if the final cost
-        bounds the cost after it.
+    - `cost`: the stage and final cost. The horizon can be short if the final cost is an
+        upper bound of the cost after the horizon.
     - `horizon`: the number of steps `T` of a plan.
     - `planner`: any [`delucax.planning.AbstractPlanner`][]; [`delucax.planning.ILQR`][]
         by default. You can differentiate with respect to its floating-point options,
-        and change them without compiling again. A planner that has `states` starts each
-        plan from these states and the controls of the last plan, and from nothing else.
+        and change these options without compiling again. A planner that has `states`
+        starts each plan only from these states and the controls of the last plan, not
+        from the other trajectories above.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
-    - `start`: what a plan may start from besides the last plan. By default the second
-        and third trajectory above. Controls of shape `(T, m)` replace the control of
-        the third one. A [`delucax.planning.Start`][] replaces both, for example by
-        another stabilising feedback.
-    - `throw`: whether to raise at run time if there is no usable plan; true by default.
-        If false, the controller uses the last plan for one more step, under its gains,
-        and then discards it. If there is no usable plan in the next step either, it
-        applies the first trajectory of `start`, by default the LQR's. With
-        `real_time`, it keeps following the last plan.
+    - `start`: the trajectories from which a plan may start besides the last plan; by
+        default the second and third trajectory above. If you give controls of shape
+        `(T, m)`, they replace the control of the third trajectory. A
+        [`delucax.planning.Start`][] replaces both trajectories, for example by another
+        stabilising feedback.
+    - `throw`: whether to raise an error at run time if there is no usable plan; true by
+        default. If false, the controller uses the last plan for one more step, under
+        its gains, and then discards it. If there is no usable plan in the next step
+        either, it applies the first trajectory of `start`, which is by default the
+        trajectory under the LQR. With `real_time`, the controller keeps following the
+        last plan.
     - `fallback`: a controller that acts in the steps without a usable plan, instead of
-        raising. It is called at every step, so its state is up to date. None by
-        default.
+        raising. The fallback is called at every step, so that its state is up to date.
+        None by default.
     - `real_time`: whether to solve one quadratic program per step; false by default.
         The planner must then be a [`delucax.planning.SQP`][], which is also the
         default.
-    - `max_qp_steps`: the most linear systems per quadratic program, 50 by default.
+    - `max_qp_steps`: the largest number of linear systems that are solved for a
+        quadratic program, 50 by default.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
         planners that accept them; none by default.
     - `difference`: a function `(x, x_ref) -> deviation` that the planner uses, for
         example to wrap angles; subtraction by default.
 
-    **Raises:** `ValueError` if an argument has the wrong type or shape; an error at run
-    time as `throw` says.
+    **Raises:** `ValueError` if an argument has the wrong type or shape; with `throw`,
+    an error at run time if there is no usable plan.
 
     Source: Richalet, Rault, Testud and Papon, 1978; Diehl, Bock and Schloeder, 2005
     (warm start and real-time iteration).
@@ -284,7 +290,7 @@ class MPC(AbstractController):
         )
 
     def prepare(self, t: RealScalar, state: MPCState) -> MPCState:
-        """Set up the program of a step before its state is known. Needs `real_time`.
+        """Set up the program of a step before the state is measured. Needs `real_time`.
 
         **Arguments:**
 
@@ -305,14 +311,14 @@ class MPC(AbstractController):
 
         **Arguments:**
 
-        - `t`: the time of the step, the same as for `prepare`.
+        - `t`: the time of the step, the same time as in the call of `prepare`.
         - `y`: the state of the plant, shape `(n,)`.
         - `state`: the state from `prepare`.
 
         **Returns:** `(u, state)`: the control, shape `(m,)`, and the new state.
 
         **Raises:** `ValueError` without `real_time`, or if `state` is not from
-        `prepare`; an error at run time as `throw` says.
+        `prepare`; with `throw`, an error at run time if there is no usable plan.
         """
         _check_real_time(self.real_time, "feedback")
         check_state(self, y, self.dynamics.state_size)

@@ -43,8 +43,8 @@ class MLP(AbstractController):
     - `depth`: the number of hidden layers, 2 by default; 0 for a linear map.
     - `features`: $\phi$, a function of an observation, such as `env.encode`; the
         observation itself by default.
-    - `bounds`: `(low, high)`, each a finite number or vector, to which the control is
-        limited by a smooth function; none by default.
+    - `bounds`: `(low, high)`, each a finite number or vector, between which `tanh`
+        keeps the control; none by default.
     - `activation`: the activation function of the hidden layers, `jnp.tanh` by default.
     - `key`: a random key for the initial weights.
 
@@ -152,8 +152,8 @@ def mlp_policy(
 ) -> AbstractController:
     """A fully connected network that fits an environment.
 
-    The network acts on `environment.encode(y)`. The network limits its controls to
-    `environment.control_bounds` by a smooth function, if these bounds are finite.
+    The network acts on `environment.encode(y)`. The network keeps the controls between
+    `environment.control_bounds` by `tanh`, if these bounds are finite.
 
     **Arguments:**
 

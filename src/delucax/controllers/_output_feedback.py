@@ -41,7 +41,7 @@ class OutputFeedback(AbstractController):
     - `estimator`: the estimator of the state, such as a
         [`delucax.estimators.KalmanFilter`][].
 
-    **Raises:** `ValueError` if one of them has the wrong type.
+    **Raises:** `ValueError` if `controller` or `estimator` has the wrong type.
 
     !!! example
 
@@ -151,8 +151,9 @@ class LQG(AbstractController):
     `estimator`, a [`delucax.estimators.KalmanFilter`][], with `L`; `average_cost`, the
     average cost per step in the steady state, a scalar (`None` without `steady_state`).
 
-    **Raises:** `ValueError` for the same reasons as the regulator and the filter; an
-    error at run time if there is no stabilising gain or the filter has no steady state.
+    **Raises:** `ValueError` for the same reasons as [`delucax.controllers.LQR`][] and
+    [`delucax.estimators.KalmanFilter`][]; an error at run time if there is no
+    stabilising gain or the filter has no steady state.
 
     Source: Åström, 1970.
 

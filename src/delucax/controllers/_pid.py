@@ -175,33 +175,35 @@ class PID(_AbstractPID):
     D_k &= (T_d D_{k-1} + z_k - z_{k-1}) / (T_d + \Delta t)
     \end{aligned}$$
 
-    The derivative $D$ passes through a first-order lag and starts at 0. By default it
-    is the derivative of $z = -h(y)$, so a jump of the reference gives no kick. With
-    `derivative_on="error"`, $z = e$.
+    The derivative $D$ passes through a first-order lag and starts at 0. By default $D$
+    is the derivative of $z = -h(y)$, so a jump of the reference gives no jump of the
+    control through $D$. With `derivative_on="error"`, $z = e$.
 
-    The second term of the integral is back-calculation, which prevents windup. It uses
-    the control that was applied, so the bounds of the environment count too. A loop
-    with $k_i = 0$ has no integral.
+    The second term of the integral is back-calculation, which prevents windup.
+    Back-calculation uses the control that was applied, so it also works for the bounds
+    of the environment. A loop with $k_i = 0$ has no integral.
 
     **Arguments:**
 
     - `kp`, `ki`, `kd`: the gains $k_p$, $k_i$ and $k_d$, each a number or a vector with
-        an entry for each loop; trainable. `ki` and `kd` are 0 by default. Their units
-        are units of the control per unit of the error, its integral and its derivative.
+        an entry for each loop; trainable. `ki` and `kd` are 0 by default. The unit of a
+        gain is the unit of the control divided by the unit of the error, of its
+        integral or of its derivative.
     - `dt`: the control interval $\Delta t$, equal to the environment's `dt`.
     - `reference`: $r$, a function of time, a vector or a number; 0 by default.
-    - `output`: $h$, what the loops follow: an index into the observation, a tuple of
-        indices, a matrix, or a function of the observation. By default the whole
-        observation.
+    - `output`: $h$, which takes the controlled outputs from the observation: an index
+        into the observation, a tuple of indices, a matrix, or a function of the
+        observation. By default the whole observation.
     - `bounds`: `(low, high)`, each a number or a vector; none by default.
-    - `derivative_time_constant`: $T_d$, the time constant of the lag, `dt` by default;
-        0 for no lag.
+    - `derivative_time_constant`: $T_d$, the time constant of the first-order lag of the
+        derivative, `dt` by default; 0 for no lag.
     - `derivative_on`: `"measurement"` (default) or `"error"`.
     - `anti_windup_time`: $T_a$, at least `dt`. By default the integral time `kp / ki`
         of each loop, but at least `dt`.
 
-    **Raises:** `ValueError` if sizes do not fit, or a time is out of its range; at run
-    time, if the number of outputs is not the number of loops.
+    **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or a
+    time is out of its range; at run time, if the number of outputs is not the number of
+    loops.
 
     Source: Åström and Hägglund, 2006.
 
@@ -305,9 +307,10 @@ class LeakyPID(_AbstractPID):
     u_k &= \operatorname{clip}(k_p e_k + k_i I_k + k_d D_k, \mathrm{low}, \mathrm{high})
     \end{aligned}$$
 
-    All of them start at 0. The average does not wind up, but it does not remove a
-    constant error either. The "derivative" is a difference that is not divided by `dt`.
-    For an exact integral and derivative, use [`delucax.controllers.PID`][].
+    Both averages and the error start at 0. The average $I$ does not wind up, but it
+    does not remove a constant error of the outputs. The "derivative" $D$ is an average
+    of differences that is not divided by `dt`. For an exact integral and derivative,
+    use [`delucax.controllers.PID`][].
 
     **Arguments:**
 
@@ -316,8 +319,9 @@ class LeakyPID(_AbstractPID):
     - `dt`, `reference`, `output`, `bounds`: as in [`delucax.controllers.PID`][].
     - `time_constant`: $T$, 0.5 by default.
 
-    **Raises:** `ValueError` if sizes do not fit, or a time is not positive; at run
-    time, if the number of outputs is not the number of loops.
+    **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or a
+    time is not positive; at run time, if the number of outputs is not the number of
+    loops.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).

@@ -15,7 +15,7 @@ class Residual(AbstractController):
     $$u = \operatorname{clip}(\pi_\mathrm{base}(t, y), \mathrm{low}, \mathrm{high}) +
     \pi_\mathrm{correction}(t, y)$$
 
-    Both controllers learn which control was applied in total.
+    Both controllers are told the total control that was applied.
     [`delucax.training.fit`][] with `trainable="correction"` trains only the correction.
 
     **Arguments:**
@@ -24,10 +24,11 @@ class Residual(AbstractController):
     - `correction`: the controller whose control is added.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, to which the control of
         `base` is clipped before the correction is added; none by default. Without
-        them, the correction must undo a control far beyond the environment's bounds.
+        `bounds`, the correction must first undo a base control that is far beyond the
+        environment's bounds.
 
-    **Raises:** `ValueError` if one of the two is not a controller, or low bounds are
-    above high ones; at run time, if the two controls differ in size.
+    **Raises:** `ValueError` if `base` or `correction` is not a controller, or low
+    bounds are above high ones; at run time, if the two controls differ in size.
 
     Source: Johannink et al., 2019; Silver, Allen, Tenenbaum and Kaelbling, 2018
     (residual policy learning).

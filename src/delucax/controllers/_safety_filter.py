@@ -76,81 +76,90 @@ class SafetyFilter(AbstractController):
     $$c = \dot b + \mathrm{decay}\; b$$
 
     A barrier has relative degree two if only its second derivative depends on the
-    control. Its condition is the same for $\dot b + \mathrm{decay}\; b$ in place of
-    $b$, with a second decay. The filter determines the degree when you make it.
+    control. The condition of a barrier of degree two has $\dot b + \mathrm{decay}\; b$
+    in place of $b$, and a second decay. The filter determines the degree when you make
+    it.
 
     If the filter acts at all times and $b \ge 0$ at the start, then $b \ge 0$ at all
-    times. For degree two, $\dot b + \mathrm{decay}\; b \ge 0$ must hold at the start
-    too.
+    times. A barrier of degree two also needs $\dot b + \mathrm{decay}\; b \ge 0$ at the
+    start.
 
     **Discrete time.** The change over a step replaces the derivative:
 
     $$c = b(t + \Delta t, F(t, x, u)) - (1 - \mathrm{decay})\, b(t, x)$$
 
     The filter linearises the condition at $n$, and again at each solution, until the
-    solution stays. If no barrier is at risk, one linearisation is enough.
+    solution does not change any more. If no barrier is at risk, one linearisation is
+    enough.
 
     **Disturbances.** With `disturbance`, the condition holds for the worst
-    $|w_i| \le \mathrm{disturbance}_i$, in both orders of degree two. This is exact in
-    continuous time, where $f$ must be affine in $w$. In discrete time it is exact to
-    first order in $w$.
+    $|w_i| \le \mathrm{disturbance}_i$, in both derivatives of a barrier of degree two.
+    This worst case is exact in continuous time, where $f$ must be affine in $w$. In
+    discrete time it is exact to first order in $w$.
 
     **A control that is held.** If the control is held between samples, a condition can
-    fall in between. [`held`][delucax.controllers.SafetyFilter.held] computes a margin
-    that covers this.
+    be violated between two samples. [`held`][delucax.controllers.SafetyFilter.held]
+    computes a margin that prevents this.
 
-    **Conditions that cannot hold.** A condition with a `price` may be missed by $d$,
-    which costs $\tfrac12\, \mathrm{price}\; d^2$. If the hard conditions cannot all
-    hold within the bounds, the filter returns the control within the bounds with the
-    smallest sum of the distances to these conditions. A rollout counts such steps in
-    `incidents["failed_filter"]`. The state of the controller has, for the last step,
+    **Conditions that cannot hold.** A condition with a `price` may be violated by an
+    amount $d$, at a cost of $\tfrac12\, \mathrm{price}\; d^2$. If the hard conditions
+    cannot all hold within the bounds, the filter returns the control within the bounds
+    with the smallest sum of the distances to these conditions. A rollout counts such
+    steps in `incidents["failed_filter"]`. The state of the controller has, for the last
+    step,
 
-    - `missed`: by how much each condition was missed,
-    - `result`: the status: `no_feasible_point` if a hard condition was missed,
+    - `missed`: by how much each condition was violated,
+    - `result`: the status: `no_feasible_point` if a hard condition was violated,
         `ill_posed` if a number was NaN, `not_converged` if a condition in discrete time
-        was still missed after `max_iterations`,
+        was still violated after `max_iterations`,
     - `iterations`: the number of linearisations,
 
     and `failures`, the number of failed steps so far.
 
     **Derivatives.** You can train a policy through the filter. The derivatives are
-    exact, in discrete time by the implicit function theorem if the filter converged.
-    One active condition is solved in closed form, several by [`delucax.qp.solve`][].
-    The control is not smooth at states where a condition becomes active. There the
-    derivative belongs to one side, or is NaN if a quadratic program was solved.
+    exact, in discrete time by the implicit function theorem if the filter converged. A
+    single active condition is solved in closed form, and several active conditions by
+    [`delucax.qp.solve`][]. The control is not smooth at states where a condition
+    becomes active. At such states the derivative is a one-sided derivative, or NaN if a
+    quadratic program was solved.
 
     **Arguments:**
 
     - `controller`: any controller.
     - `plant`: an [`delucax.AbstractSystem`][], affine in the control, or an
         [`delucax.AbstractDynamics`][]. The filter must observe the state of the plant.
-        If it is not measured, put the filter into a
+        If the state is not measured, put the filter into a
         [`delucax.controllers.OutputFeedback`][].
     - `barriers`: a function `b(t, x)` that returns a number or a vector, or a
         dictionary of such functions. You can differentiate with respect to the
         [`delucax.parameter`][] fields of a barrier that is an `eqx.Module`.
     - `decay`: how fast a barrier may fall, 1 by default: a rate (1/s) in continuous
-        time, a fraction from 0 to 1 in discrete time. A number; or a pair, for the two
-        orders of degree two; or a dictionary of these by the name of the barrier.
-    - `margin`: the least value of each condition, in its own units; 0 by default. A
-        number, or a dictionary by the name of the barrier.
-    - `disturbance`: bounds of $|w|$, a number or of shape `(k,)`; none by default.
+        time, a fraction from 0 to 1 in discrete time. Give a number; or, for degree
+        two, a pair of the first and the second decay; or a dictionary from the name of
+        a barrier to a number or a pair.
+    - `margin`: the least value of each condition, in its own units; 0 by default. Give
+        a number, or a dictionary from the name of a barrier to a number.
+    - `disturbance`: the largest absolute value of each disturbance, a number or of
+        shape `(k,)`; none by default.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
-    - `price`: the price of missing a condition, a number or a dictionary by the name of
-        the barrier. Barriers without a price are hard. By default all are hard.
-    - `weight`: the price of changing each control, a number or of shape `(m,)`; 1 by
+    - `price`: the cost of violating a barrier's condition: a number, or a dictionary
+        from the name of a barrier to a number. Barriers without a price are hard. By
+        default all are hard.
+    - `weight`: the cost of changing each control, a number or of shape `(m,)`; 1 by
         default.
     - `states`: the states at which the filter checks the relative degree and that the
         system is affine, shape `(k, n)`. By default 16 points in a box of half-width 1
         about the equilibrium, or about zero.
     - `degrees`: the relative degree of each barrier, 1 or 2; a number, or a dictionary
-        by the name of the barrier. Give it if the plant or the barriers are traced:
-        then it cannot be determined, and is not checked.
-    - `max_iterations`: the most linearisations in discrete time, 20 by default.
+        from the name of a barrier to a number. Give the degrees if the plant or the
+        barriers are traced, because the filter cannot determine or check them under a
+        trace.
+    - `max_iterations`: the largest number of linearisations in discrete time, 20 by
+        default.
 
     **Raises:** `ValueError` if an argument has the wrong type, shape or value, if a
-    barrier has no relative degree of 1 or 2, or if the system is not affine in the
+    barrier does not have relative degree 1 or 2, or if the system is not affine in the
     control, or in a bounded disturbance.
 
     Source: Ames et al., 2017 and 2019; Nguyen and Sreenath, 2016, Xiao and Belta, 2019
@@ -283,7 +292,7 @@ class SafetyFilter(AbstractController):
     def conditions(self) -> Conditions:
         """The conditions without their margin: a function of `(t, x, u)`.
 
-        It returns a vector, in the order of `names`.
+        The function returns a vector, in the order of `names`.
         """
         given = self.plant, self.barriers, self.decay, self.disturbance
         return Conditions(*given, degrees=self.degrees)
@@ -299,23 +308,24 @@ class SafetyFilter(AbstractController):
         r"""The filter with a larger margin, for a control that is held over `dt`.
 
         Write a condition as $c = \Delta + \mathrm{decay}\; \psi$. Here $\psi$ is the
-        function that it keeps positive, either $b$ or $\dot b + \mathrm{decay}\; b$,
-        and $\Delta$ is the smallest rate of change of $\psi$. Let
-        $c \ge \mathrm{margin}$ at a sample, and let $\Delta$ fall at a rate of at most
-        $M$ until the next sample. Then, at a time $s$ after the sample,
+        function that the condition keeps positive, either $b$ or
+        $\dot b + \mathrm{decay}\; b$, and $\Delta$ is the smallest rate of change of
+        $\psi$. Let $c \ge \mathrm{margin}$ at a sample, and let $\Delta$ fall at a rate
+        of at most $M$ until the next sample. Then, at a time $s$ after the sample,
 
         $$\psi \ge (1 - \mathrm{decay}\; s)\, \psi_0 + s\, (\mathrm{margin} - s M / 2)$$
 
-        This is not negative if $\mathrm{margin} = \mathrm{dt}\; M / 2$ and
-        $\mathrm{decay} \cdot \mathrm{dt} \le 1$. So barriers that hold at the start
-        hold at all times.
+        This lower bound is not negative if $\mathrm{margin} = \mathrm{dt}\; M / 2$ and
+        $\mathrm{decay} \cdot \mathrm{dt} \le 1$. So barriers that are not negative at
+        the start are never negative.
 
         The method computes $M$ as a maximum over the controls within the bounds, the
         disturbances, and the states at which all barriers hold and from which $\psi$
         can reach zero within `dt`. It evaluates the corners of the grid cells that
-        contain such points, and adds an allowance for the points in between, from
-        second differences. Check that more `points` change the margin little. The
-        result is valid if the states stay in the box and the filter does not fail.
+        contain such states, and adds an allowance for the points in between, from
+        second differences. Check that the margin changes little if you increase
+        `points`. The result is valid if the states stay in the box and the filter does
+        not fail.
 
         **Arguments:**
 
@@ -326,10 +336,10 @@ class SafetyFilter(AbstractController):
         - `points`: the number of grid points for each state, each control and time, 11
             by default.
 
-        **Returns:** the filter, with this amount added to its `margin`.
+        **Returns:** the filter, with $\mathrm{dt}\; M / 2$ added to its `margin`.
 
-        **Raises:** `ValueError` in discrete time, without finite bounds, for a box of
-        the wrong shape, or for a grid that is too large.
+        **Raises:** `ValueError` if the filter acts in discrete time or has no finite
+        bounds, if the box has the wrong shape, or if the grid is too large.
 
         Source: Breeden, Garg and Panagou, 2022 (the margin by the second derivative
         along a step); Cortez et al., 2019.

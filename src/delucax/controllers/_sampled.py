@@ -40,8 +40,8 @@ def sampled_weights(
 
     **Returns:** `(Qd, Rd, Sd)`, shapes `(n, n)`, `(m, m)` and `(n, m)`.
 
-    **Raises:** `ValueError` if `system` is not linear, a weight does not fit, or `dt`
-    is not positive.
+    **Raises:** `ValueError` if `system` is not linear, a weight has the wrong shape, or
+    `dt` is not positive.
 
     Source: Van Loan, 1978.
 
@@ -106,15 +106,16 @@ def lqrd(
     $$\delta x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u +
     \delta u^\top R\, \delta u$$
 
-    where $\delta x$ and $\delta u$ are the deviations from the operating point. Its `P`
-    belongs to this continuous-time cost: the minimum from a deviation $\delta x$ is
-    $\delta x^\top P\, \delta x$. As `dt` goes to 0, the gain goes to the gain of
-    [`delucax.riccati.care`][].
+    where $\delta x$ and $\delta u$ are the deviations from the operating point. The `P`
+    of the controller belongs to this continuous-time cost: the minimal cost from a
+    deviation $\delta x$ is $\delta x^\top P\, \delta x$. As `dt` goes to 0, the gain
+    converges to the gain of [`delucax.riccati.care`][].
 
     **Arguments:**
 
     - `system`: a linear system about an equilibrium, or any other system, which is
-        linearised at `point` or, without a `point`, at the equilibrium that it defines.
+        linearised at `point` or, without a `point`, at the equilibrium that the system
+        defines.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `dt`: the step, a positive number.
@@ -127,8 +128,8 @@ def lqrd(
     **Returns:** a [`delucax.controllers.LQR`][].
 
     **Raises:** `ValueError` if `system` is not a system or defines no equilibrium, a
-    weight does not fit, or `dt` is not positive; an error at run time if there is no
-    stabilising gain.
+    weight has the wrong shape, or `dt` is not positive; an error at run time if there
+    is no stabilising gain.
 
     Source: Levis, Schlueter and Athans, 1971; Van Loan, 1978.
 

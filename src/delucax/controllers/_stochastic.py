@@ -220,7 +220,7 @@ class Gaussian(_AroundBase):
 
 
 class Categorical(_AroundBase):
-    r"""A policy that draws one of several controls, with probabilities from a base controller.
+    r"""A policy that draws one of several given controls at random.
 
     $$P(u = a_i) = \operatorname{softmax}(\ell)_i, \qquad \ell = \mathrm{base}(t, y)$$
 

@@ -26,9 +26,10 @@ class SoftConstraint(eqx.Module):
     **Arguments:**
 
     - `function`: a function as for [`delucax.planning.Constraints`][].
-    - `linear`: the linear weight, at least 0: a number, or one for each value of the
-        function; 0 by default.
-    - `quadratic`: the quadratic weight, of the same kind; 0 by default.
+    - `linear`: the linear weight, at least 0: a number, or one number for each value of
+        the function; 0 by default.
+    - `quadratic`: the quadratic weight, at least 0: a number, or one number for each
+        value of the function; 0 by default.
 
     **Raises:** `ValueError` if `function` is not a function, or a weight is negative or
     not finite.
@@ -88,29 +89,33 @@ _FUNCTIONS = "inequality", "equality", "final_inequality", "final_equality"
 
 
 class Constraints(eqx.Module):
-    """Constraints of a plan, at each step and at the end.
+    """Constraints on the states and controls of a plan, at each step and at the end.
 
-    At each step they are `inequality(t, x, u) <= 0` and `equality(t, x, u) = 0`. At the
-    end they are `final_inequality(t, x) <= 0` and `final_equality(t, x) = 0`. Bounds on
-    states and controls may be added.
+    The constraints of each step are `inequality(t, x, u) <= 0` and
+    `equality(t, x, u) = 0`. The constraints at the end are
+    `final_inequality(t, x) <= 0` and `final_equality(t, x) = 0`. You can add bounds on
+    states and controls.
 
     Each function returns a number or a vector. To give several functions, use a
-    dictionary. Its keys name them in messages and in
-    [`delucax.planning.Multipliers`][]. The first step counts too, and its state is
-    given: a constraint on the state alone must already hold there.
+    dictionary. The keys of the dictionary name the functions in messages and in
+    [`delucax.planning.Multipliers`][]. The constraints also apply at the first step,
+    where the state is given. So the given first state must already satisfy a constraint
+    on the state alone.
 
     **Arguments:**
 
     - `inequality`: a function `(t, x, u)`, a [`delucax.planning.SoftConstraint`][], or
-        a dictionary of these; none by default.
-    - `equality`: the same kinds; none by default.
-    - `final_inequality`: the same kinds, with functions `(t, x)`; none by default.
-    - `final_equality`: the same kinds, with functions `(t, x)`; none by default.
+        a dictionary of functions and soft constraints; none by default.
+    - `equality`: a constraint or a dictionary, as for `inequality`; none by default.
+    - `final_inequality`: a constraint or a dictionary, as for `inequality`, with
+        functions `(t, x)`; none by default.
+    - `final_equality`: a constraint or a dictionary, as for `inequality`, with
+        functions `(t, x)`; none by default.
     - `states`: bounds `(low, high)`, each a number or an array of shape `(n,)` or
-        `(T+1, n)`; or a [`delucax.qp.Soft`][] with such bounds. The first row is
-        ignored, because the first state is given. None by default.
-    - `controls`: bounds of the same kinds, of shape `(m,)` or `(T, m)`. For bounds that
-        do not vary in time, use `bounds` of the planner, which is cheaper. None by
+        `(T+1, n)`; or a [`delucax.qp.Soft`][] with such bounds. The first row of the
+        bounds is ignored, because the first state is given. None by default.
+    - `controls`: bounds like `states`, of shape `(m,)` or `(T, m)`. For bounds that do
+        not vary in time, use `bounds` of the planner, which is cheaper. None by
         default.
 
     Only [`delucax.planning.SQP`][] takes soft constraints and the bounds `states` and

@@ -42,81 +42,87 @@ class ILQR(AbstractPlanner):
 
     Each iteration linearises the dynamics about the current trajectory $\bar x$,
     $\bar u$, expands the cost to second order, cross terms included, and solves this
-    linear-quadratic problem. It then follows
-    $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ through the true dynamics,
-    where the change $-d_k$ and the gain $K_k$ come from that solution.
+    linear-quadratic problem. The iteration then applies the control
+    $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ to the true dynamics, where
+    the change $-d_k$ and the gain $K_k$ come from the solution of the linear-quadratic
+    problem.
 
-    The line search tries the steps $\alpha = 1, 1/2, \dots, 1/2048$. It accepts a step
-    if the cost falls by at least 1e-4 of the predicted decrease. It rejects a step if
-    the trajectory diverges. The regularisation $\mu$ rises if no step is accepted or
-    the control Hessian is not positive definite. It falls after each accepted step, by
-    the schedule of Tassa, Erez and Todorov.
+    The line search tries the steps $\alpha = 1, 1/2, \dots, 1/2048$. The line search
+    accepts a step if the cost falls by at least 1e-4 of the predicted decrease. The
+    line search rejects a step if the trajectory diverges. The regularisation $\mu$
+    rises if no step is accepted or the control Hessian is not positive definite. The
+    regularisation falls after each accepted step, by the schedule of Tassa, Erez and
+    Todorov.
 
     The iteration has converged if the projected gradient with respect to each control
     is at most `tolerance` times one plus the size of the terms that cancel in it. It
     has also converged if full steps no longer lower the gradient, and the predicted
     decrease is below the rounding of the cost.
 
-    Call it like every [`delucax.planning.AbstractPlanner`][]. It takes hard constraints
-    by the method of multipliers.
+    Call the planner like every [`delucax.planning.AbstractPlanner`][]. ILQR handles
+    hard constraints by the method of multipliers.
 
-    You can differentiate the plan, in both modes and to any order, with respect to
-    every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The derivative
-    comes from the implicit function theorem: it takes one linear-quadratic problem at
-    the solution, with exact second derivatives even if the iteration used none.
-    Derivatives are NaN unless the plan converged to a strict minimum. With respect to
-    `controls` and `states`, where the iteration starts, they are zero.
+    You can differentiate the plan, in forward and reverse mode and to any order, with
+    respect to every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The
+    derivative comes from the implicit function theorem: it solves one linear-quadratic
+    problem at the solution, with exact second derivatives even if the iteration did not
+    use second derivatives. Derivatives are NaN unless the plan converged to a strict
+    minimum. The derivatives with respect to `controls` and `states`, where the
+    iteration starts, are zero.
 
     The minimum is local, so it depends on the start. On an unstable plant, controls
-    without feedback lead far away, and the iteration may end at a stationary point
-    there. If `controls` is a number of steps, the iteration starts from
+    without feedback lead far away, and the iteration may end at a stationary point far
+    from the start. If `controls` is a number of steps, the iteration starts from
     [`delucax.planning.Start.default`][], which also tries the trajectory of an LQR.
 
-    For a hybrid plant, the model about a trajectory only holds while the number of
-    events in each step is the same. Where this number changes, the cost may have a kink
-    or a jump. If the iteration ends there without convergence, the result is
-    `events_changed`, and the plan is the best so far. To get a plan with certain
-    events, start from a trajectory that has them.
+    For a hybrid plant, the model about a trajectory is only valid as long as the number
+    of events in each step is the same. At a trajectory where this number changes, the
+    cost may have a kink or a jump. If the iteration ends at such a trajectory without
+    convergence, the result is `events_changed`, and the plan is the best so far. To get
+    a plan with certain events, start from a trajectory that has these events.
 
     Under `jax.vmap` on CPU, the plans of a batch are computed one after the other. This
-    is up to six times as fast as all together, because no plan waits for the line
-    searches of another. On accelerators they are computed together.
+    is up to six times as fast as computing all plans together, because no plan waits
+    for the line searches of another plan. On accelerators the plans are computed
+    together.
 
     **Arguments:**
 
     - `max_iterations`: the most iterations; 500 by default.
-    - `tolerance`: the relative tolerance of the gradient. By default it is the square
-        root of the machine precision (1.5e-8 in float64), or the square of
+    - `tolerance`: the relative tolerance of the gradient. By default the tolerance is
+        the square root of the machine precision (1.5e-8 in float64), or the square of
         `finite_difference` if that is larger. With 0, all iterations are taken.
-    - `constraint_tolerance`: by how much a constraint may be violated. The default is
-        the machine precision to the power 0.4 (5.5e-7 in float64).
+    - `constraint_tolerance`: the largest allowed violation of a constraint. The default
+        is the machine precision to the power 0.4 (5.5e-7 in float64).
     - `second_order`: whether to use the second derivatives of dynamics and constraints
-        (differential dynamic programming). This takes fewer but more expensive
-        iterations. An iteration leaves them out if they make the problem nonconvex. If
-        false, no iteration uses them (Gauss-Newton), which is slow if multipliers are
-        large. By default true if there are constraints and no `finite_difference`.
-    - `regularise`: `"control"` (default) adds $\mu$ to the control Hessian, `"state"`
-        to the Hessian of the cost-to-go.
-    - `line_search`: `"backtracking"` (default) tries one step after the other;
-        `"parallel"` tries all at once, for accelerators.
+        (differential dynamic programming). With second derivatives the planner takes
+        fewer but more expensive iterations. An iteration leaves the second derivatives
+        out if they make the problem nonconvex. If false, no iteration uses second
+        derivatives (Gauss-Newton), which is slow if multipliers are large. The default
+        is true if there are constraints and no `finite_difference`.
+    - `regularise`: `"control"` (default) adds $\mu$ to the control Hessian; `"state"`
+        adds $\mu$ to the Hessian of the cost-to-go.
+    - `line_search`: `"backtracking"` (default) tries one step size after the other;
+        `"parallel"` tries all step sizes at once, for accelerators.
     - `parallel`: if true, the linear-quadratic problems are solved in parallel over
         time, for long horizons on accelerators; false by default.
-    - `finite_difference`: a spacing, such as 1e-2. The dynamics are then linearised by
-        central differences, with two calls for each state and each control. By default
-        they are differentiated. The derivatives of the cost and of the plan are exact
-        in both cases.
-    - `states`: states to start from, shape `(T+1, n)` (multiple shooting). They need
-        not follow from `controls`; the iteration closes the gaps. `controls` must then
-        be an array, or a number of steps, which holds the control of the equilibrium.
-        By default the states follow from `controls`.
+    - `finite_difference`: a spacing, such as 1e-2. With a spacing, the dynamics are
+        linearised by central differences, with two calls for each state and each
+        control. By default the dynamics are differentiated automatically. The
+        derivatives of the cost and of the plan are exact in both cases.
+    - `states`: states to start from, shape `(T+1, n)` (multiple shooting). These states
+        need not follow from `controls`: the iteration closes the gaps. `controls` must
+        then be an array, or a number of steps, which means a start at the constant
+        control of the equilibrium. By default the states follow from `controls`.
     - `penalty`: the first weight $\rho$ of the penalty $\rho\, c^2 / 2$ of a violation
-        $c$; 10 by default. It grows by a factor of 10 when the violation falls too
-        slowly. Take more if the start is near the solution, or if the cost is much
-        larger than the violations.
+        $c$; 10 by default. The weight grows by a factor of 10 when the violation falls
+        too slowly. Choose a larger penalty if the start is near the solution, or if the
+        cost is much larger than the violations.
 
     **Raises:** `ValueError` if an option is of the wrong kind or out of its range, or
     if `parallel` is combined with `regularise="state"` or `finite_difference` with
-    `second_order`. A call raises it if `parallel` is combined with `bounds`.
+    `second_order`. A call raises a `ValueError` if `parallel` is combined with
+    `bounds`.
 
     Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
     Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
@@ -239,8 +245,9 @@ def ilqr(
 ) -> Plan:
     r"""Plan a trajectory by the iterative linear-quadratic regulator (iLQR).
 
-    The plan is a locally optimal trajectory with feedback gains. `ilqr` is a short call
-    of [`delucax.planning.ILQR`][], which describes the method and has more options.
+    The plan is a locally optimal trajectory with feedback gains. `ilqr` calls
+    [`delucax.planning.ILQR`][], which has more options and whose page describes the
+    method.
 
     **Arguments:**
 
@@ -255,14 +262,14 @@ def ilqr(
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
     - `bounds`: the bounds `(low, high)` of the controls, each a number or an array of
         shape `(m,)`; none by default.
-    - `constraints`: hard [`delucax.planning.Constraints`][] on states and controls, by
-        the method of multipliers; none by default.
+    - `constraints`: hard [`delucax.planning.Constraints`][] on states and controls,
+        which are handled by the method of multipliers; none by default.
     - `max_iterations`: the most iterations; 500 by default.
     - `tolerance`: the relative tolerance of the gradient; the square root of the
         machine precision by default (1.5e-8 in float64). With 0, all iterations are
         taken.
-    - `throw`: if true (default), raise if the plan did not converge. If false, check
-        `plan.result` yourself.
+    - `throw`: if true (default), raise an error if the plan did not converge. If false,
+        check `plan.result` yourself.
 
     **Returns:** a [`delucax.planning.Plan`][]. Its `result` is one of:
 
@@ -273,9 +280,9 @@ def ilqr(
     - `no_feasible_point`: no penalty weight made the constraints hold.
     - `diverged`: every start diverges.
 
-    If it is not `successful`, the plan is the best iterate. If the control Hessian at
-    the plan is not positive definite, `plan.regularisation` is what was added to it,
-    and the derivatives are NaN.
+    If the `result` is not `successful`, the plan is the best iterate. If the control
+    Hessian at the plan is not positive definite, `plan.regularisation` is the number
+    that was added to the Hessian, and the derivatives are NaN.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
     finite, the horizon is 0, or a lower bound is above an upper one; an error at run

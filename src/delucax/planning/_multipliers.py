@@ -21,21 +21,22 @@ class Multipliers(eqx.Module):
     to first order. The same holds for equalities. Multipliers of inequalities and
     bounds are at least 0, and they are 0 if the constraint is inactive.
 
-    If a planner starts from an earlier plan, it also starts from its multipliers.
+    If a planner starts from an earlier plan, it also starts from the multipliers of
+    that plan.
 
     **Attributes:**
 
-    - `stage`: those of the constraints `inequality` and `equality`, by their names,
-        each of shape `(T, p)` for a constraint with `p` values.
-    - `final`: those of `final_inequality` and `final_equality`, by their names, each of
-        shape `(p,)`.
-    - `states`: those of the bounds of states, a pair `(lower, upper)` of arrays of
-        shape `(T+1, n)`; `None` without such bounds.
-    - `controls`: those of the bounds of controls, a pair `(lower, upper)` of arrays of
-        shape `(T, m)`; `None` without bounds, and always for
+    - `stage`: a dictionary with the multipliers of the constraints `inequality` and
+        `equality` by name. The shape is `(T, p)` for a constraint with `p` values.
+    - `final`: a dictionary with the multipliers of `final_inequality` and
+        `final_equality` by name, each of shape `(p,)`.
+    - `states`: the multipliers of the bounds of states, a pair `(lower, upper)` of
+        arrays of shape `(T+1, n)`; `None` without such bounds.
+    - `controls`: the multipliers of the bounds of controls, a pair `(lower, upper)` of
+        arrays of shape `(T, m)`; `None` without bounds, and always for
         [`delucax.planning.ILQR`][].
-    - `costates`: those of the dynamics, shape `(T+1, n)`. Row `k` is minus the
-        derivative of the cost from stage `k` on with respect to $x_k$, as in
+    - `costates`: the multipliers of the dynamics, shape `(T+1, n)`. Row `k` is minus
+        the derivative of the cost from stage `k` on with respect to $x_k$, as in
         [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`.
     - `penalty`: the last penalty weight of `ILQR`; `None` for
         [`delucax.planning.SQP`][].

@@ -24,7 +24,7 @@ class Plan(AbstractController):
     $$u = u_k - K_k\, (y - x_k), \qquad k = \mathrm{round}((t - t_0) / \Delta t)$$
 
     where $x_k$, $u_k$ and $K_k$ are the `states`, `controls` and `gains`. The control
-    is clipped to the bounds of the plan. Outside the horizon it is NaN, which
+    is clipped to the bounds of the plan. Outside the horizon the control is NaN, which
     [`delucax.rollout`][] reports.
 
     Every [`delucax.planning.AbstractPlanner`][] returns a plan, and so do
@@ -36,36 +36,38 @@ class Plan(AbstractController):
 
     - `states`: $x_0, \dots, x_T$, shape `(T+1, n)`.
     - `controls`: $u_0, \dots, u_{T-1}$, shape `(T, m)`, trainable.
-    - `gains`: $K_0, \dots, K_{T-1}$, shape `(T, m, n)`, trainable. The row of a control
-        is zero at the steps where the control is held at a bound.
+    - `gains`: $K_0, \dots, K_{T-1}$, shape `(T, m, n)`, trainable. If a control is held
+        at a bound at some step, its row of the gain matrix of that step is zero.
     - `cost`: the cost of the trajectory, with the final cost.
     - `trace`: the cost of the start and of each iteration, shape
-        `(max_iterations + 1,)`. If there were fewer iterations, the last cost is
-        repeated. With constraints it is the augmented Lagrangian, or for
-        [`delucax.planning.SQP`][] the cost with the penalty of soft constraints.
+        `(max_iterations + 1,)`. If the planner took fewer iterations, the last cost is
+        repeated. With constraints, `trace` holds the augmented Lagrangian instead of
+        the cost, or for [`delucax.planning.SQP`][] the cost with the penalty of soft
+        constraints.
     - `residual`: how far the plan is from a stationary point: the largest entry of the
         gradient of the cost with respect to the controls, projected to the bounds. For
-        `SQP` it is the gradient of the Lagrangian, and for a planner that samples the
-        largest change of a control in the last iteration.
+        `SQP`, `residual` is the largest entry of the gradient of the Lagrangian. For a
+        planner that samples, it is the largest change of a control in the last
+        iteration.
     - `violation`: the largest violation of a constraint. For
-        [`delucax.planning.ILQR`][] it also counts an inactive constraint whose
-        multiplier is not zero. 0 without constraints.
+        [`delucax.planning.ILQR`][], `violation` also takes account of inactive
+        constraints whose multiplier is not zero. Without constraints it is 0.
     - `multipliers`: the [`delucax.planning.Multipliers`][] of the constraints; `None`
         without constraints, or if the planner has no multipliers.
     - `result`: the status, one of `delucax.RESULTS`.
     - `iterations`: the number of iterations.
-    - `rollouts`: the number of computed trajectories. Each candidate of a line search
-        counts.
-    - `regularisation`: the regularisation of the last iteration. If it is above zero,
-        the control Hessian at the solution is not positive definite, or the line search
-        had difficulties.
+    - `rollouts`: the number of computed trajectories. Each trajectory that a line
+        search tries counts as a rollout.
+    - `regularisation`: the regularisation of the last iteration. If `regularisation` is
+        above zero, the control Hessian at the solution is not positive definite, or the
+        line search had difficulties.
     - `t0`: the time of the first state.
     - `dt`: the control interval.
     - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` without bounds.
     - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
     - `parameters`: the values that the planner chose for
-        [`delucax.planning.Unknowns`][], by their paths. A duration is there as the step
-        `dt` of the dynamics. `None` without unknowns.
+        [`delucax.planning.Unknowns`][], by their paths. A chosen duration appears as
+        the step `dt` of the dynamics. `None` without unknowns.
 
     !!! example
 
@@ -119,9 +121,9 @@ class Plan(AbstractController):
     def is_usable(self) -> Array:
         """Whether the plan can be followed.
 
-        Its controls must be finite, and its result neither `diverged` nor
-        `no_feasible_point`. A plan that did not converge is usable, because it is the
-        best iterate so far.
+        The controls of a usable plan are finite, and its `result` is neither `diverged`
+        nor `no_feasible_point`. A plan that did not converge is usable, because it is
+        the best iterate so far.
         """
         finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
         lost = self.result == RESULTS.diverged

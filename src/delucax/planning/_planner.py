@@ -89,13 +89,13 @@ class AbstractPlanner(eqx.Module):
     - Keep the controls within the bounds. `problem.roll_out` and `problem.clip` do.
     - If the planner takes no constraints, raise an error if `problem.constraints` is
         not `None`.
-    - Return `problem.plan(states, controls, cost)`. The call of the planner raises an
-        error if the `result` of this plan is not `successful`.
+    - Return `problem.plan(states, controls, cost)`. A call of the planner raises an
+        error if the `result` of the plan that `solve` returns is not `successful`.
 
     If the planner draws random numbers, set `is_stochastic = True`.
 
     Your planner then also works in [`delucax.controllers.MPC`][]. The derivatives of
-    the plan are those of `solve`.
+    the plan are the derivatives of `solve`.
 
     !!! example
 
@@ -134,14 +134,14 @@ class AbstractPlanner(eqx.Module):
     def starts_from_states(self) -> bool:
         """Whether an option of the planner gives the states to start from.
 
-        A call then does not take a `Start` or a `Plan`.
+        If it does, a call of the planner does not take a `Start` or a `Plan`.
         """
         return False
 
     def first_multipliers(self, problem: Problem, horizon: int) -> Multipliers | None:
         """Multipliers of zero, in the shapes that a plan of this planner has.
 
-        The default, for plans without multipliers, is `None`.
+        The default is `None`, for a planner whose plans have no multipliers.
 
         **Arguments:**
 
@@ -161,7 +161,7 @@ class AbstractPlanner(eqx.Module):
 
         - `problem`: a [`delucax.planning.Problem`][].
         - `start`: one [`delucax.planning.Start`][], or several along a first axis.
-        - `key`: a random key if the planner is stochastic, else `None`.
+        - `key`: a random key if the planner is stochastic, otherwise `None`.
 
         **Returns:** a [`delucax.planning.Plan`][].
         """

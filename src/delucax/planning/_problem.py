@@ -76,9 +76,9 @@ class FreeStart(eqx.Module):
 class Problem(eqx.Module):
     """A planning problem: minimise a cost along the trajectory of dynamics.
 
-    [`delucax.planning.AbstractPlanner`][] passes it to the `solve` of a planner. Its
-    arguments are then checked, and its arrays have the same precision. You can
-    differentiate with respect to every array.
+    [`delucax.planning.AbstractPlanner`][] passes it to the `solve` of a planner. The
+    arguments of this problem are already checked, and its arrays all have the same
+    precision. You can differentiate with respect to every array.
 
     **Attributes:**
 
@@ -91,8 +91,9 @@ class Problem(eqx.Module):
         without bounds.
     - `difference`: `(x, x_ref) -> deviation`; `None` for subtraction.
     - `constraints`: [`delucax.planning.Constraints`][]; `None` without constraints.
-    - `multipliers`: the multipliers and the weight of the augmented Lagrangian. If they
-        are given, the costs of the problem include its terms. `None` otherwise.
+    - `multipliers`: the multipliers and the weight of the augmented Lagrangian. If
+        multipliers are given, the costs of the problem include the terms of the
+        augmented Lagrangian. `None` otherwise.
     - `unknowns`: [`delucax.planning.Unknowns`][]; `None` without unknowns.
     - `free`: the entries of the first state that are unknown. `x0` then holds guesses
         of them. `None` if the first state is given.
@@ -129,15 +130,14 @@ class Problem(eqx.Module):
     __repr__ = shown
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
-        """The deviation of `x` from `x_ref`, by `difference` if that is given.
+        """The deviation of `x` from `x_ref`: `difference(x, x_ref)`, or `x - x_ref`.
 
         **Arguments:** `x`, `x_ref`: states, shape `(n,)`.
         """
         return x - x_ref if self.difference is None else self.difference(x, x_ref)
 
     def missed_start(self, x: Array) -> Array:
-        """By how much a trajectory from `x` misses the first state; zero in the entries
-        that are free."""
+        """The difference between `x` and the given first state; zero in the entries that are free."""
         missed = self.deviation(self.x0, x)
         if self.free is None:
             return missed

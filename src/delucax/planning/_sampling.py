@@ -158,15 +158,16 @@ class MPPI(AbstractSampler):
     v_i = e^{-J^i / \lambda}$$
 
     where $J^i$ is the cost of the trajectory of sequence $i$, and $\lambda$ the
-    temperature. No charge is added for the distance from the mean. A sequence that
-    diverges has zero weight.
+    temperature. The cost $J^i$ has no extra term for the distance from the mean. A
+    sequence that diverges has zero weight.
 
     The plan is the cheapest of the means and the start, so it costs at most as much as
-    the start. Its gains are zero. You can differentiate it with respect to everything
-    that the costs depend on; the random numbers are then constants.
+    the start. Its gains are zero. You can differentiate the plan with respect to
+    everything that the costs depend on. The derivatives hold the random numbers fixed.
 
-    Call it like every [`delucax.planning.AbstractPlanner`][], with a `key`. It takes no
-    constraints. The result is `diverged` if the start and all means diverge.
+    Call the planner like every [`delucax.planning.AbstractPlanner`][], with a `key`.
+    MPPI takes no constraints. The result is `diverged` if the start and all means
+    diverge.
 
     **Arguments:**
 
@@ -174,10 +175,10 @@ class MPPI(AbstractSampler):
     - `iterations`: the number of iterations; 10 by default.
     - `scale`: the standard deviation of the samples, a number or an array of shape
         `(m,)`, in the unit of the control; 1 by default.
-    - `correlation`: the correlation of a sampled control with the one before it, from 0
-        (white noise, the default) to 1 (constant).
-    - `temperature`: $\lambda$, in the unit of the cost; 1 by default. The lower it is,
-        the fewer of the best sequences have weight.
+    - `correlation`: the correlation of a sampled control with the control of the step
+        before, from 0 (white noise, the default) to 1 (constant).
+    - `temperature`: $\lambda$, in the unit of the cost; 1 by default. With a lower
+        temperature, fewer of the best sequences have weight.
 
     **Raises:** `ValueError` if an option is out of its range.
 
@@ -245,19 +246,19 @@ class CEM(AbstractSampler):
     where $\beta$ is the momentum. A sequence that diverges has no weight among the
     elites.
 
-    Call it like [`delucax.planning.MPPI`][]. The plan and its result are as described
-    there. For derivatives, the random numbers and the choice of the elites are
-    constants.
+    Call it like [`delucax.planning.MPPI`][]. The plan and its `result` are defined as
+    for [`delucax.planning.MPPI`][]. Derivatives of the plan hold the random numbers and
+    the choice of the elites fixed.
 
     **Arguments:**
 
     - `samples`: the number of sequences in each iteration; 256 by default.
     - `iterations`: the number of iterations; 10 by default.
     - `elites`: the number of elites; 32 by default.
-    - `scale`: the first standard deviation, a number or an array of shape `(m,)`, in
-        the unit of the control; 1 by default.
-    - `correlation`: the correlation of a sampled control with the one before it, from 0
-        (white noise, the default) to 1 (constant).
+    - `scale`: the standard deviation in the first iteration, a number or an array of
+        shape `(m,)`, in the unit of the control; 1 by default.
+    - `correlation`: the correlation of a sampled control with the control of the step
+        before, from 0 (white noise, the default) to 1 (constant).
     - `momentum`: $\beta$, from 0 to 1; 0.1 by default.
 
     **Raises:** `ValueError` if an option is out of its range, or there are more elites

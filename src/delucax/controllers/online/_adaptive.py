@@ -65,9 +65,10 @@ class Adaptive(AbstractController):
     active experts, so that the weight of any expert can rise quickly.
 
     With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` the
-    control comes from a single expert. Another expert is drawn only with a probability
-    equal to the relative loss of weight of the current expert, so the expert seldom
-    changes. With [`delucax.controllers.gpc`][] as base, this is AdaGPC.
+    control comes from a single expert. At each step, another expert is drawn only with
+    a small probability: the fraction of its weight that the current expert has lost in
+    this step, compared with the best expert. So the expert seldom changes. With
+    [`delucax.controllers.gpc`][] as base, this is AdaGPC.
 
     **Arguments:**
 

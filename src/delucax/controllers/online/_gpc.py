@@ -40,13 +40,13 @@ def gpc(
 
     The disturbances $w$ are computed from the states, with the controls that were
     applied. The matrices $E$ follow the gradient of the cost that each step would have
-    had under them: see [`delucax.controllers.OnlineLearner`][]. Compared with the best
-    fixed $E$ in hindsight, the regret over $T$ steps grows as $\sqrt T$, for any
-    disturbances.
+    had if these matrices had always been used: see
+    [`delucax.controllers.OnlineLearner`][]. Compared with the best fixed $E$ in
+    hindsight, the regret over $T$ steps grows as $\sqrt T$, for any disturbances.
 
     The dynamics may be linear, time-invariant or time-varying, or nonlinear with an
-    observed state. Nonlinear dynamics are linearised along the run. Their disturbance
-    is the residual of the nonlinear map.
+    observed state. Nonlinear dynamics are linearised along the run. The disturbance of
+    nonlinear dynamics is the residual of the nonlinear map.
 
     **Arguments:**
 
@@ -58,26 +58,26 @@ def gpc(
         point.
     - `memory`: the number of past disturbances. By default the smallest $h$ from 10 to
         50 with $\rho^h \le 0.1$, where $\rho$ is the spectral radius of the closed
-        loop. It is 10 if `dynamics` are not linear and time-invariant, or inside a JAX
-        transformation, where the closed loop is not known.
+        loop. The default is 10 if `dynamics` are not linear and time-invariant, or
+        inside a JAX transformation, because the closed loop is not known there.
     - `horizon`: the length of the counterfactual roll-out. By default the smallest $h$
         from 10 to 1000 with $\rho^h \le 0.03$.
     - `learning_rate`: the scale of the optimiser's step. For Newton's method it is the
-        longest step. By default $0.15 / |B|$, where $|B|$ is the size of the change of
-        the state by a unit of control in one step (Frobenius norm).
+        length of the longest step. By default $0.15 / |B|$, where $|B|$ is the
+        Frobenius norm of the change of the state in one step by a unit control.
     - `optimiser`: an Optax transformation. By default
         [`delucax.controllers.adagrad_norm`][] if `dynamics` are linear and
         time-invariant, otherwise [`delucax.controllers.online_newton`][]. Neither
-        depends on the scale of the cost. The second learns faster, but each of its
-        steps takes ten times as long.
+        optimiser depends on the scale of the cost. `online_newton` learns faster, but
+        each of its steps takes ten times as long.
     - `radius`: the largest Frobenius norm of $E$, $50 / |B|$ by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. Its state has the
-    disturbances in `loop.signal`, and the matrices $E$ side by side in `theta`, shape
-    `(m, memory n)`.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. The state of the learner has
+    the disturbances in `loop.signal`, and the matrices $E$ side by side in `theta`,
+    shape `(m, memory n)`.
 
     **Raises:** `ValueError` if `base` does not stabilise the dynamics, does not fit
-    them or cannot be designed, the cost is not a scalar, the state is not observed, or
+    them or cannot be computed, the cost is not a scalar, the state is not observed, or
     a number is out of its range.
 
     Source: Agarwal, Bullins, Hazan, Kakade and Singh, 2019.
@@ -134,43 +134,43 @@ def drc(
 
     $\eta_t$ is nature's output: the observation that the closed loop would have given
     if nothing had been added to the control of the base. $G(v)$ is the response of the
-    closed loop to all that was added, after clipping. The matrices $M$ follow the
-    gradient of the cost that each step would have had if they had been used in the past
-    too: see [`delucax.controllers.OnlineLearner`][]. The regret against the best fixed
-    $M$ in hindsight grows as $\sqrt T$.
+    closed loop to all controls that were added, after clipping. The matrices $M$ follow
+    the gradient of the cost that each step would have had if they had been used in the
+    past too: see [`delucax.controllers.OnlineLearner`][]. The regret against the best
+    fixed $M$ in hindsight grows as $\sqrt T$.
 
-    With a `base` of zero, it is the gradient response controller. A base such as
-    [`delucax.controllers.LQG`][] gives good control from the start, and stabilises
-    unstable plants.
+    With a `base` whose control is zero, `drc` is the gradient response controller. A
+    base such as [`delucax.controllers.LQG`][] gives good control from the start, and
+    stabilises unstable plants.
 
     **Arguments:**
 
-    - `dynamics`: the model. It must be linear and time-invariant if the state is not
-        observed.
+    - `dynamics`: the model. The model must be linear and time-invariant if the state is
+        not observed.
     - `cost`: the stage cost, a differentiable function of `(t, y, u)`, where `y` is the
         observation.
-    - `base`: a controller that stabilises the dynamics. By default the
+    - `base`: a controller that stabilises the dynamics. By default a
         [`delucax.controllers.LQG`][] for the curvature of the cost, and for
-        disturbances and sensor noise of unit covariance; or
+        disturbances and sensor noise of unit covariance; or a
         [`delucax.controllers.LQR`][] if the state is observed.
-    - `memory`: the number of outputs, 10 by default.
+    - `memory`: the number of past outputs $\eta$ that the control uses, 10 by default.
     - `horizon`: the length of the counterfactual roll-out. By default the smallest $h$
         from 10 to 1000 with $\rho^h \le 0.03$, where $\rho$ is the spectral radius of
         the closed loop.
     - `learning_rate`: the scale of the optimiser's step. For Newton's method it is the
-        longest step. By default 0.15 divided by the size of the first response of the
-        observation to a unit of control.
+        length of the longest step. By default 0.15 divided by the norm of the first
+        response of the observation to a unit control.
     - `optimiser`: an Optax transformation; by default
         [`delucax.controllers.online_newton`][] with a prior of 4 steps.
-    - `radius`: the largest Frobenius norm of $M$; by default 50 divided by the same
-        size.
+    - `radius`: the largest Frobenius norm of $M$; by default 50 divided by the norm of
+        the first response of the observation to a unit control.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. Its state has nature's
-    outputs in `loop.signal`, and the matrices $M$ side by side in `theta`, shape
-    `(m, memory p)`.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. The state of the learner has
+    nature's outputs in `loop.signal`, and the matrices $M$ side by side in `theta`,
+    shape `(m, memory p)`.
 
     **Raises:** `ValueError` if `base` does not stabilise the dynamics, does not fit
-    them or cannot be designed, the cost is not a scalar, or a number is out of its
+    them or cannot be computed, the cost is not a scalar, or a number is out of its
     range.
 
     Source: Simchowitz, Singh and Hazan, 2020.
@@ -227,16 +227,16 @@ def sfc(
     $$H_{jk} = \frac{(1 - \mathrm{margin})^{j + k - 1}}{j + k - 1}$$
 
     For a long memory, [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][]
-    need a matrix for each step, but a few filters are enough here. So there is less to
-    learn if the closed loop is slow. The filters depend only on the memory and the
-    margin, not on the plant.
+    need a matrix for each step, but `sfc` needs only a few filters. So `sfc` has fewer
+    weights to learn if the closed loop is slow. The filters depend only on the memory
+    and the margin, not on the plant.
 
     The double spectral controller, for a state that is not observed, also adds
 
     $$\sum_i M'_i f_i(s_t, \dots) + \sum_{i \le j} M''_{ij} (f_i * f_j)(s_t, \dots)$$
 
-    where $f_i * f_j$ is one filter after the other. These can represent an observer,
-    which is itself a filter of the past.
+    where $f_i * f_j$ applies one filter after the other. These terms can represent an
+    observer, which is itself a filter of the past.
 
     **Arguments:**
 
@@ -244,13 +244,13 @@ def sfc(
         in [`delucax.controllers.drc`][].
     - `filters`: the number of filters, 5 by default.
     - `memory`: the number of past values that are filtered, 30 by default.
-    - `margin`: the stability margin, between 0 and 1, 0.2 by default. The filters
-        represent memories well that fade as $(1 - \mathrm{margin})^k$ or faster.
+    - `margin`: the stability margin, between 0 and 1, 0.2 by default. The filters are
+        accurate for a memory that fades as $(1 - \mathrm{margin})^k$ or faster.
     - `double`: whether to use the double spectral controller; false by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. Its state has the last
-    `memory + 1` values of the signal in `loop.signal`, or `2 memory` with `double`, and
-    the matrices $M$ side by side in `theta`.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. The state of the learner has
+    the last `memory + 1` values of the signal in `loop.signal`, or `2 memory` with
+    `double`, and the matrices $M$ side by side in `theta`.
 
     **Raises:** `ValueError` for the same reasons as [`delucax.controllers.drc`][], or
     if `filters` is larger than `memory`, or `margin` is not between 0 and 1.
@@ -321,9 +321,9 @@ def neural_gpc(
     $$u_t = \mathrm{base}(y_t) + \mathrm{network}(s_t, \dots, s_{t-\mathrm{memory}+1})$$
 
     The signal $s$ is the last disturbance if the state is observed, and nature's output
-    otherwise. The output of the network is zero at first. There is no bound on the
-    regret. Use it for costs and plants for which a linear map of the past is not
-    enough.
+    otherwise. The output of the network is zero at first. The regret has no known
+    bound. Use `neural_gpc` for costs and plants for which a linear map of the past is
+    not enough.
 
     **Arguments:**
 
@@ -336,8 +336,8 @@ def neural_gpc(
         default.
     - `key`: a random key for the initial weights.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` is the weights
-    of the network.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` holds the
+    weights of the network.
 
     **Raises:** `ValueError` for the same reasons as [`delucax.controllers.gpc`][], or
     if there is no random key.

@@ -42,27 +42,29 @@ def best_in_hindsight(
 
     $$\min_\theta \; \sum_t c(t, x_t(\theta), u_t(\theta)) + c_f(x_T(\theta))$$
 
-    Here $\theta$ is the trainable weights of `controller`. For `learner.fixed()` it is
-    the weights of the policy, not of the base. The run has the same start, disturbances
-    and sensor noise as `trajectory`.
+    Here $\theta$ are the trainable weights of `controller`. For `learner.fixed()`,
+    $\theta$ are the weights of the policy, without the weights of the base controller.
+    The run has the same start, disturbances and sensor noise as `trajectory`.
 
-    The search is Newton's method with Levenberg's damping, through the rollout. It
-    finds the global minimum if the cost is convex in $\theta$. That is the case for a
-    disturbance-action policy on a linear plant with a convex cost, but in general not
-    for a linear gain.
+    The search is Newton's method with Levenberg's damping, with derivatives through the
+    rollout. It finds the global minimum if the cost is convex in $\theta$. The cost is
+    convex for a disturbance-action policy on a linear plant with a convex cost, but in
+    general not for a linear gain.
 
     - `gpc(...).fixed()`: the best disturbance-action policy.
     - `drc(...).fixed()`: the best disturbance-response policy.
-    - `Linear(K)` or `LQR(...)`: the best gain, with a search from the given one.
+    - `Linear(K)` or `LQR(...)`: the best gain, with the given gain as the start of the
+        search.
     - `OpenLoop(controls)`: the best open loop, for short horizons.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `controller`: the class of controllers, and the start of the search.
+    - `controller`: a controller whose weights are the start of the search. The search
+        covers all controllers of the same structure.
     - `trajectory`: a run with its states and disturbances. The search covers its whole
         length.
-    - `iterations`: the most Newton steps, 30 by default.
+    - `iterations`: the largest number of Newton steps, 30 by default.
     - `tolerance`: the search stops if the predicted decrease is below this fraction of
         the cost; by default the square root of the rounding error.
 
@@ -124,7 +126,7 @@ def best_in_hindsight(
 
 
 def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... T"]:
-    r"""The regret: by how much a run has cost more than another, up to each step.
+    r"""The regret: the cost of a run minus the cost of another run, up to each step.
 
     $$\mathrm{regret}_k = \sum_{t \le k} (c_t - c^*_t)$$
 
@@ -138,7 +140,8 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... 
 
     **Returns:** shape `(T,)`.
 
-    **Raises:** `ValueError` if one of them has no costs, or they differ in length.
+    **Raises:** `ValueError` if one of the two runs has no costs, or the runs differ in
+    length.
 
     !!! example
 

@@ -61,8 +61,9 @@ class OnlineLearner(AbstractLearner):
 
     The features $\phi_t$ are filters of a signal that does not depend on the added
     control: the past disturbances, or nature's output. Before each control, $\theta$
-    takes a step against the gradient of a counterfactual loss: the cost of this step if
-    $\theta$ had been used in the last $h$ steps too, where $h$ is the `horizon`.
+    takes a step against the gradient of a counterfactual loss. This loss is the cost
+    that the current step would have if $\theta$ had been used in the last $h$ steps
+    too, where $h$ is the `horizon`.
 
     $$\begin{aligned}
     \ell_t(\theta) &= c(t, y_t(\theta), u_t(\theta)) \\
@@ -75,24 +76,26 @@ class OnlineLearner(AbstractLearner):
     Nonlinear dynamics are linearised along the run.
 
     [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
-    [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make such
+    [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make online
     learners.
 
     **Attributes:**
 
-    - `loop`: the model with its base controller. `loop.base` is the base,
-        `loop.horizon` the length of the roll-out, `loop.response` the $G_j$ if they are
-        the same at all times. `loop.memory` and `loop.filters` define the features.
+    - `loop`: the model with its base controller. `loop.base` is the base controller,
+        `loop.horizon` is the length $h$ of the counterfactual roll-out, and
+        `loop.response` holds the $G_j$ if they are the same at all times. `loop.memory`
+        and `loop.filters` define the features.
     - `cost`: the stage cost.
     - `policy`: the family of policies. `policy.start`, the initial $\theta$, is
         trainable.
     - `learning_rate`: the scale of the optimiser's step, an array. You can
-        differentiate with respect to it.
-    - `optimiser`: an Optax transformation. It gets the extra arguments `learning_rate`
-        and `curvature`, a function that returns a root of the curvature of the loss.
+        differentiate with respect to `learning_rate`.
+    - `optimiser`: an Optax transformation. Its `update` gets two extra arguments:
+        `learning_rate`, and `curvature`, a function that returns a square root $L$ of
+        the curvature $L L^\top$ of the loss.
 
-    The state of the controller has `theta`, what has been learned, and `loop.signal`,
-    the last values of the signal, newest first.
+    The state of the controller has `theta`, the learned weights, and `loop.signal`, the
+    last values of the signal, newest first.
 
     !!! example
 
@@ -177,11 +180,11 @@ class OnlineLearner(AbstractLearner):
     def fixed(self, theta: Any = None) -> FixedPolicy:
         """The same controller without learning.
 
-        **Arguments:** `theta`: what has been learned, from the state of the controller;
+        **Arguments:** `theta`: the learned weights, from the state of the controller;
         the initial theta by default.
 
         **Returns:** a controller. Its `policy.start` is theta, trainable. Its `loop` is
-        that of the learner.
+        the `loop` of the learner.
         """
         policy = self.policy if theta is None else self.policy.at(theta)
         return FixedPolicy(self.loop, policy)

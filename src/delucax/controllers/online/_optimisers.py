@@ -60,10 +60,11 @@ def adagrad_norm() -> optax.GradientTransformation:
 
     Here $\eta$ is the `learning_rate` of the learner. For convex losses and a set of
     diameter $D$, the regret is at most $(D^2 / (2 \eta) + \eta) \sqrt{\sum_t |g_t|^2}$.
-    The optimiser needs to know neither the size nor the number of the gradients.
+    The optimiser does not need to know the size or the number of the gradients in
+    advance.
 
     **Returns:** an `optax.GradientTransformation`. Each call returns the same object,
-    so learners with it share compiled code.
+    so learners with this optimiser share compiled code.
 
     Source: Streeter and McMahan, 2010; Ward, Wu and Bottou, 2019.
 
@@ -172,8 +173,8 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     derivative of the observation and control of step $s$ with respect to $\theta$.
     $H_s$ is the curvature of the cost at them, or its positive part if the cost is not
     convex. $c$ is the mean curvature per weight over the first $n$ steps that have any.
-    So the prior weighs as much as $n$ steps, for any scale of cost, disturbance and
-    weights.
+    So the prior has the weight of $n$ average steps, for any scale of cost, disturbance
+    and weights.
 
     With quadratic costs this is recursive least squares, and its regret grows as
     $\log T$.
@@ -182,15 +183,15 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     curvature. The memory and the time of a step grow with the square of the number of
     weights.
 
-    **Arguments:** `prior`: $n$, the weight of the prior in steps, 100 by default. A
-    small one learns fast if the features are similar to each other. A large one keeps
-    noise out of what is learned.
+    **Arguments:** `prior`: $n$, the weight of the prior in steps, 100 by default. With
+    a small prior the optimiser learns fast if the features are similar to each other. A
+    large prior makes the learned weights less sensitive to noise.
 
-    **Returns:** an `optax.GradientTransformationExtraArgs`. Those with the same prior
-    are equal, so learners with them share compiled code.
+    **Returns:** an `optax.GradientTransformationExtraArgs`. Two optimisers with the
+    same prior are equal, so learners with the same prior share compiled code.
 
-    **Raises:** `ValueError` if `prior` is not positive; when it is used without a
-    curvature.
+    **Raises:** `ValueError` if `prior` is not positive; at the first update, if no
+    curvature is given.
 
     Source: Simchowitz, 2020; Hazan, Agarwal and Kale, 2007; Potter, 1963 (the form).
 
