@@ -33,11 +33,11 @@ def count_evaluations(
     """Run a function of dynamics, and count how often it evaluates them.
 
     The function gets dynamics that report each evaluation to the host at run time. The
-    count is therefore exact in compiled loops too. Under `jax.vmap` each member of the
-    batch counts. Dead code, which XLA removes, does not count.
+    count is therefore exact in compiled loops too. Under `jax.vmap` the evaluations of
+    all members of the batch are counted. Dead code, which XLA removes, is not counted.
 
-    Use it to count, not to time: each report takes microseconds, and each call compiles
-    anew.
+    Do not use `count_evaluations` to measure time: each report takes microseconds, and
+    each call compiles again.
 
     **Arguments:**
 
@@ -47,9 +47,10 @@ def count_evaluations(
     **Returns:** `(out, evaluations)`: `out` is what the function returns, and
     `evaluations` a named tuple of whole numbers:
 
-    - `primal`: calls of the dynamics. The first pass of a derivative is one call.
-    - `tangent`: products of their Jacobian with a vector.
-    - `cotangent`: products of the transposed Jacobian with a vector.
+    - `primal`: calls of the dynamics. The primal pass of a derivative counts as one
+        call.
+    - `tangent`: products of the Jacobian of the dynamics with a vector.
+    - `cotangent`: products of the transposed Jacobian of the dynamics with a vector.
 
     **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or `function`
     is not a function.

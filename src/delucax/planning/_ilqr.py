@@ -88,10 +88,11 @@ class ILQR(AbstractPlanner):
 
     **Arguments:**
 
-    - `max_iterations`: the most iterations; 500 by default.
+    - `max_iterations`: the largest number of iterations; 500 by default.
     - `tolerance`: the relative tolerance of the gradient. By default the tolerance is
         the square root of the machine precision (1.5e-8 in float64), or the square of
-        `finite_difference` if that is larger. With 0, all iterations are taken.
+        `finite_difference` if that is larger. With a tolerance of 0, the planner takes
+        all iterations.
     - `constraint_tolerance`: the largest allowed violation of a constraint. The default
         is the machine precision to the power 0.4 (5.5e-7 in float64).
     - `second_order`: whether to use the second derivatives of dynamics and constraints
@@ -264,10 +265,10 @@ def ilqr(
         shape `(m,)`; none by default.
     - `constraints`: hard [`delucax.planning.Constraints`][] on states and controls,
         which are handled by the method of multipliers; none by default.
-    - `max_iterations`: the most iterations; 500 by default.
+    - `max_iterations`: the largest number of iterations; 500 by default.
     - `tolerance`: the relative tolerance of the gradient; the square root of the
-        machine precision by default (1.5e-8 in float64). With 0, all iterations are
-        taken.
+        machine precision by default (1.5e-8 in float64). With a tolerance of 0, the
+        planner takes all iterations.
     - `throw`: if true (default), raise an error if the plan did not converge. If false,
         check `plan.result` yourself.
 
@@ -285,8 +286,8 @@ def ilqr(
     that was added to the Hessian, and the derivatives are NaN.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
-    finite, the horizon is 0, or a lower bound is above an upper one; an error at run
-    time as `throw` says.
+    finite, the horizon is 0, or a lower bound is above an upper one; with `throw`, an
+    error at run time if the plan did not converge.
 
     !!! example
 

@@ -58,46 +58,49 @@ def ilc(
 ) -> Plan:
     r"""Iterative learning control: improve a plan by running it on the plant.
 
-    It works like [`delucax.planning.ilqr`][], but the states and the costs come from
-    runs of the plant, and only the derivatives come from the model. Each iteration
+    Iterative learning control works like [`delucax.planning.ilqr`][], but the states
+    and the costs come from runs of the plant, and only the derivatives come from the
+    model. Each iteration
 
     1. linearises the model along the last run $\bar x$, $\bar u$ of the plant,
     2. solves the linear-quadratic problem,
     3. runs $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ on the plant, where
-        the change $-d_k$ and the gain $K_k$ are from that solution, for
-        $\alpha = \alpha_\mathrm{last}\, 1.1^{1 - j^2}$ with $j = 0, \dots, 9$, until a
-        run costs at most as much as the last one.
+        the change $-d_k$ and the gain $K_k$ come from the solution of the
+        linear-quadratic problem, for $\alpha = \alpha_\mathrm{last}\, 1.1^{1 - j^2}$
+        with $j = 0, \dots, 9$, until a run costs at most as much as the last run.
 
-    If none of these runs does, learning stops early. The final plan is close to the
-    optimal plan of the plant. The distance between them grows with the error of the
-    model's derivatives. If the problem is not convex, the control Hessian is
-    regularised until it is.
+    If all of these runs cost more, learning stops early. The final plan is close to the
+    optimal plan of the plant. The distance between the two plans grows with the error
+    of the model's derivatives. If the problem is not convex, the control Hessian is
+    regularised until it is positive definite.
 
     **Arguments:**
 
-    - `plant`: the true dynamics, which are only run.
+    - `plant`: the true dynamics, which are simulated but not differentiated.
     - `model`: the dynamics to differentiate, with the same sizes of state and control.
     - `cost`: the stage and final cost.
     - `plan`: the [`delucax.planning.Plan`][] to start from, made with the model. Each
-        run has its first state, time and bounds. The first run follows its feedback.
+        run has the first state, the time and the bounds of this plan. The first run
+        follows the feedback of this plan.
     - `w`: disturbances of the plant, the same in each run and unknown to the model,
         shape `(T, k)`; zero by default.
-    - `iterations`: the most iterations; 40 by default.
+    - `iterations`: the largest number of iterations; 40 by default.
     - `step`: the first $\alpha$; 1 by default.
-    - `throw`: if true (default), raise if the first run diverges. If false, check the
-        `result` yourself.
+    - `throw`: if true (default), raise an error if the first run diverges. If false,
+        check the `result` yourself.
 
-    **Returns:** a [`delucax.planning.Plan`][]: the best run of the plant, and feedback
-    about it.
+    **Returns:** a [`delucax.planning.Plan`][]: the best run of the plant, with feedback
+    gains about this run.
 
-    - `rollouts`: the number of runs, with the first one.
-    - `trace`: the costs of the first run and after each iteration.
-    - `residual`: the largest entry of the gradient, by the model's derivatives.
-    - `result`: `successful` if all iterations were taken, `no_descent` if a search
-        failed before, `diverged` if the first run diverged.
+    - `rollouts`: the number of runs, including the first run.
+    - `trace`: the cost of the first run, and the cost after each iteration.
+    - `residual`: the largest entry of the gradient, computed with the model's
+        derivatives.
+    - `result`: `successful` if all iterations were taken, `no_descent` if a line search
+        failed before that, `diverged` if the first run diverged.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is out of its
-    range; an error at run time as `throw` says.
+    range; with `throw`, an error at run time if the first run diverges.
 
     Source: Abbeel, Quigley and Ng, 2006; Agarwal, Hazan, Majumdar and Singh, 2021.
 
@@ -144,19 +147,20 @@ def igpc(
 ) -> Plan:
     r"""Iterative gradient perturbation control: `ilc` that also learns within a run.
 
-    It learns from the mismatch between plant and model. The control in a run is
+    The control law learns from the mismatch between plant and model. The control in a
+    run is
 
     $$u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)
     + \sum_{i=1}^M E_i\, w_{k-i} + o, \qquad w_k = x_{k+1} - F(t_k, x_k, u_k)$$
 
-    where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first terms are
-    those of [`delucax.planning.ilc`][]. The control is clipped to the bounds.
+    where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first three terms
+    are the same as in [`delucax.planning.ilc`][]. The control is clipped to the bounds.
 
-    $E$ and $o$ start at zero in each run. At step $k$ they take a gradient step of size
-    `learning_rate` over $k$. The gradient is that of a counterfactual cost: the last
-    stage cost of `horizon` steps of the model under these parameters, with the observed
-    mismatch added. The next iteration linearises along this run, and therefore keeps
-    what the run has learned.
+    $E$ and $o$ start at zero in each run. At step $k$, both take a gradient step of
+    size `learning_rate` over $k$. The gradient belongs to a counterfactual cost: the
+    last stage cost of `horizon` steps of the model with these $E$ and $o$ and with the
+    observed mismatch. The next iteration linearises along this run, and therefore keeps
+    what was learned in the run.
 
     **Arguments:**
 
@@ -166,18 +170,19 @@ def igpc(
     - `memory`: the number $M$ of past disturbances; 3 by default.
     - `horizon`: the number of steps of the counterfactual cost; 3 by default.
     - `indices`: `"aligned"` (default) uses each disturbance at the step at which it
-        acted; `"deluca"`, for comparison, one step early, as the original library does.
-    - `anneal`: if true (default), a search tries up to 6 steps until one lowers the
-        cost. If none does, it divides the learning rate by 100. If false, a search
-        tries up to 10 steps until one does not raise the cost. If none does, learning
-        stops.
+        acted; `"deluca"`, for comparison, uses it one step early, as the original
+        library does.
+    - `anneal`: if true (default), a line search tries up to 6 step sizes until a run
+        has a lower cost. If no run has, the learning rate is divided by 100. If false,
+        a line search tries up to 10 step sizes until a run does not have a higher cost.
+        If all runs have, learning stops.
 
     **Returns:** a [`delucax.planning.Plan`][] with the fields of
-    [`delucax.planning.ilc`][]: the best run of the plant, with the controls as they
-    were applied, and feedback about it.
+    [`delucax.planning.ilc`][]: the best run of the plant, with the applied controls,
+    and feedback gains about this run.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is out of its
-    range; an error at run time as `throw` says.
+    range; with `throw`, an error at run time if the first run diverges.
 
     Source: Agarwal, Hazan, Majumdar and Singh, 2021.
 

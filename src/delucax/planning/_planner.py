@@ -216,7 +216,7 @@ class AbstractPlanner(eqx.Module):
         **Returns:** a [`delucax.planning.Plan`][].
 
         **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
-        finite; an error at run time as `throw` says.
+        finite; with `throw`, an error at run time if the plan is not successful.
         """
         where = type(self).__name__
         check_instance(dynamics, AbstractDynamics, "dynamics", where)

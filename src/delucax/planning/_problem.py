@@ -137,7 +137,7 @@ class Problem(eqx.Module):
         return x - x_ref if self.difference is None else self.difference(x, x_ref)
 
     def missed_start(self, x: Array) -> Array:
-        """The difference between `x` and the given first state; zero in the entries that are free."""
+        """The deviation of the given first state from `x`; zero in the free entries."""
         missed = self.deviation(self.x0, x)
         if self.free is None:
             return missed
@@ -163,7 +163,7 @@ class Problem(eqx.Module):
         return jnp.minimum(jnp.maximum(u, low), high)
 
     def room(self, controls: Array) -> tuple[Array, Array] | None:
-        """The bounds of the changes of `controls`; `None` without bounds."""
+        """The bounds of a change that is added to `controls`; `None` without bounds."""
         if self.bounds is None:
             return None
         low, high = self.bounds
@@ -188,20 +188,17 @@ class Problem(eqx.Module):
         return values_of(self.constraints, True, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The values of the constraints along the trajectory `states` and `controls`:
-        at each step, and at the end."""
+        """The values of the constraints along a trajectory, at each step and at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
 
     def with_multipliers(self, multipliers: Augmentation | None) -> "Problem":
-        """The same problem with the augmented Lagrangian with `multipliers` as its
-        cost."""
+        """The same problem, with the augmented Lagrangian as its cost."""
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
-        """The cost of a step at `t`, `x` and `u`, with the terms of its constraints,
-        which have the multipliers `y`."""
+        """The cost of a step, plus the terms of its constraints for multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
             # `+ 0.0`, because an integer has no gradient.
@@ -210,7 +207,7 @@ class Problem(eqx.Module):
         return cost + augmented(c, y, self.multipliers.rho, equal)
 
     def final_cost(self, t: Array, x: Array) -> Array:
-        """The final cost at `t` and `x`, with the terms of the final constraints."""
+        """The final cost at `t` and `x`, plus the terms of the final constraints."""
         cost = jnp.asarray(self.cost.final(t, x) + 0.0)
         if self.multipliers is None:
             return cost

@@ -41,48 +41,50 @@ class SQP(AbstractPlanner):
     $$\min \sum_{k=0}^{T-1} c(t_k, x_k, u_k) + c_T(t_T, x_T)
     \quad \text{subject to} \quad x_{k+1} = F(t_k, x_k, u_k, w_k)$$
 
-    and [`delucax.planning.Constraints`][], where $c_T$ is the final cost. It also finds
-    feedback gains about this trajectory. The variables are the states and the controls
-    (multiple shooting). The initial guess of the states need not follow the dynamics,
-    which helps with unstable plants.
+    and [`delucax.planning.Constraints`][], where $c_T$ is the final cost. SQP also
+    finds feedback gains about this trajectory. The variables are the states and the
+    controls (multiple shooting). The initial guess of the states need not follow the
+    dynamics, which helps with unstable plants.
 
     Each iteration solves a quadratic program about the current trajectory, as
-    [`delucax.qp.solve`][] does. Far from a solution, the Hessian of this program is
-    that of the cost. It is that of the Lagrangian from a relative error of 0.01 on, or
-    always if the program with the Hessian of the cost has no unique minimum. If the
-    Hessian is not convex along the dynamics, the squares of the active constraints are
-    added to it, and then a multiple of the identity.
+    [`delucax.qp.solve`][] does. Far from a solution, this program has the Hessian of
+    the cost. As soon as the relative error is below 0.01, the program has the Hessian
+    of the Lagrangian. It always has the Hessian of the Lagrangian if the program with
+    the Hessian of the cost has no unique minimum. If the Hessian is not convex along
+    the dynamics, the planner adds the squares of the active constraints to it, and if
+    necessary a multiple of the identity.
 
-    The line search tries the steps 1, 1/2, ..., 1/2048. It accepts a step by a funnel:
-    the sum of all violations must stay below the width of the funnel. Also, either the
-    cost must fall by 1e-4 of the predicted decrease, or the violations must fall below
-    0.9 of the width. In the second case the funnel narrows.
+    The line search tries the steps 1, 1/2, ..., 1/2048. The line search accepts a step
+    by a funnel: the sum of all constraint violations must stay below a number, the
+    width of the funnel. Also, either the cost must fall by 1e-4 of the predicted
+    decrease, or the violations must fall below 0.9 of the width. If the step is
+    accepted because the violations fall, the width is reduced.
 
-    If the linearised constraints have no feasible point, the squares of their
-    violations are added to the cost at a price. Near a stationary point, the
-    constraints are tried again and the price rises. If no price makes them hold, the
-    result is `no_feasible_point`.
+    If the linearised constraints have no feasible point, the planner adds the weighted
+    squares of their violations to the cost. Near a stationary point, the planner tries
+    the constraints again and increases the weight. If the constraints do not hold with
+    any weight, the result is `no_feasible_point`.
 
     The iteration has converged if three conditions hold. The gradient of the Lagrangian
     and the error of complementarity are at most `tolerance` times one plus the size of
-    the terms that cancel in them. The states follow the dynamics to that tolerance. No
-    constraint is violated by more than `constraint_tolerance`.
+    the terms that cancel in them. The states follow the dynamics to the same relative
+    tolerance. No constraint is violated by more than `constraint_tolerance`.
 
-    The states start from those that follow from the controls. If these violate the
-    constraints too much, the first state at every stage is the guess instead: the guess
-    with the smaller sum of all violations is taken. If the planner starts from an
-    earlier plan, it also starts from its multipliers.
+    The initial guess of the states is the trajectory under the initial controls, or the
+    first state repeated at every stage. The planner takes the guess with the smaller
+    sum of all violations. If the planner starts from an earlier plan, it also starts
+    from the multipliers of that plan.
 
-    `plan.multipliers` are those of the solution. `plan.cost` does not include the
-    penalty of violated soft constraints; `plan.trace` does.
+    `plan.multipliers` are the multipliers at the solution. `plan.cost` does not include
+    the penalty of violated soft constraints; `plan.trace` does.
 
-    You can differentiate the plan, in both modes, with respect to every array in
-    `dynamics`, `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`. The derivative
-    comes from the implicit function theorem: it takes one quadratic program at the
-    solution, with exact second derivatives. Derivatives are NaN unless the plan
+    You can differentiate the plan, in forward and reverse mode, with respect to every
+    array in `dynamics`, `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`. The
+    derivative comes from the implicit function theorem: it solves one quadratic program
+    at the solution, with exact second derivatives. Derivatives are NaN unless the plan
     converged to a strict minimum whose active constraints are independent and have
-    positive multipliers. With respect to `controls` and `states`, where the iteration
-    starts, they are zero.
+    positive multipliers. The derivatives with respect to `controls` and `states`, where
+    the iteration starts, are zero.
 
     The planner does not track the events of a hybrid plant. If the solution is at a
     kink, where the events change, the result is `not_converged` or `no_descent`.
@@ -92,16 +94,16 @@ class SQP(AbstractPlanner):
 
     **Arguments:**
 
-    - `max_iterations`: the most iterations; 200 by default.
+    - `max_iterations`: the largest number of iterations; 200 by default.
     - `tolerance`: the relative tolerance of the optimality conditions; the square root
         of the machine precision by default (1.5e-8 in float64).
-    - `constraint_tolerance`: by how much a constraint may be violated; a tenth of the
-        default `tolerance` by default.
+    - `constraint_tolerance`: the largest allowed violation of a constraint; by default
+        a tenth of the default `tolerance`.
     - `second_order`: if true (default), use the Hessian of the Lagrangian near a
         solution. If false, always use the Hessian of the cost (Gauss-Newton).
     - `states`: states to start from, shape `(T+1, n)`. `controls` must then be an
-        array, or a number of steps, which holds the control of the equilibrium. By
-        default the states follow from `controls`.
+        array, or a number of steps, which means a start at the constant control of the
+        equilibrium. By default the states follow from `controls`.
 
     **Raises:** `ValueError` if an option is of the wrong kind or out of its range.
 
@@ -178,9 +180,9 @@ class SQP(AbstractPlanner):
     def prepare(self, problem: Problem, start: Start) -> PyTree:
         """Prepare a real-time iteration: set up its quadratic program.
 
-        The program is about the states and controls of `start`, which need not follow
-        the dynamics. It does not depend on `problem.x0`, so you can prepare it before
-        the state is measured.
+        The program is an expansion about the states and controls of `start`, which need
+        not follow the dynamics. The program does not depend on `problem.x0`, so you can
+        prepare it before the state is measured.
 
         **Arguments:**
 
@@ -209,17 +211,18 @@ class SQP(AbstractPlanner):
     def feedback(self, problem: Problem, ready: PyTree, max_steps: int = 50) -> Plan:
         """Finish a real-time iteration: solve the prepared quadratic program.
 
-        The plan starts from `problem.x0` and takes the full step of the program.
+        The plan starts from `problem.x0` and takes the full step that solves the
+        program.
 
         **Arguments:**
 
         - `problem`: the [`delucax.planning.Problem`][] with the current state as `x0`.
         - `ready`: what `prepare` returned.
-        - `max_steps`: the most linear systems to solve; 50 by default.
+        - `max_steps`: the largest number of linear systems to solve; 50 by default.
 
         **Returns:** a [`delucax.planning.Plan`][]. Its `result` is `successful` if the
-        quadratic program was solved. `residual`, `violation` and `iterations` are those
-        of the program.
+        quadratic program was solved. `residual`, `violation` and `iterations` are the
+        numbers of the quadratic program.
         """
         return fed_back(problem, ready, max_steps)
 

@@ -30,12 +30,14 @@ class Start(eqx.Module):
 
     $$u_k = \bar u_k - K_k\, (x_k - \bar x_k)$$
 
-    where $\bar u_k$, $\bar x_k$ and $K_k$ are `controls`, `states` and `gains`. It is
-    clipped to the bounds of the planner. Without gains, controls drive an unstable
-    plant far away. With stabilising gains the plant stays near `states`.
+    where $\bar u_k$, $\bar x_k$ and $K_k$ are `controls`, `states` and `gains`. The
+    control is clipped to the bounds of the planner. Without gains, an unstable plant
+    drifts far away under given controls. With stabilising gains the plant stays near
+    `states`.
 
     Several starts are stacked along a first axis. The planner computes the trajectory
-    of each start and takes the cheapest. It ignores a start that diverges.
+    of each start and begins with the cheapest trajectory. It ignores a start that
+    diverges.
 
     **Arguments:**
 
@@ -43,11 +45,12 @@ class Start(eqx.Module):
     - `states`: shape `(T+1, n)` or `(c, T+1, n)`; needed with `gains`.
     - `gains`: shape `(T, m, n)` or `(c, T, m, n)`; none by default.
     - `multipliers`: [`delucax.planning.Multipliers`][] to start from, the same for all
-        starts. Zero by default, and for a constraint whose name or shape they do not
-        have. Planners without multipliers ignore them.
+        starts. By default all multipliers are zero. The multipliers of a constraint are
+        also zero if its name or shape is not among the given multipliers. Planners
+        without multipliers ignore this argument.
 
-    **Raises:** `ValueError`, when a planner is called, if the shapes do not fit or a
-    number is not finite.
+    **Raises:** `ValueError`, when a planner is called, if the shapes do not fit the
+    problem or a number is not finite.
 
     !!! example
 
@@ -92,7 +95,7 @@ class Start(eqx.Module):
         return Start(self.controls, self.states, self.gains)
 
     def shifted(self) -> "Start":
-        """The start one step later; its last step is repeated."""
+        """The start for the next time step; the last step is repeated."""
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
         start, y = jax.tree.map(shift, self.trajectories), self.multipliers
         if y is not None:
@@ -117,11 +120,12 @@ class Start(eqx.Module):
         - `state_size`: the number of states `n`.
         - `control_size`: the number of controls `m`.
         - `name`: the name of the start in messages.
-        - `where`: the name of the function that takes it, for messages.
+        - `where`: the name of the function that takes the start, for messages.
 
         **Returns:** the start, with floating-point arrays.
 
-        **Raises:** `ValueError` if a shape does not fit or a number is not finite.
+        **Raises:** `ValueError` if a shape does not fit the problem or a number is not
+        finite.
         """
         n, m = state_size, control_size
         given = self.controls, self.states, self.gains
@@ -152,7 +156,7 @@ class Start(eqx.Module):
         return Start(*arrays, multipliers=self.multipliers)
 
     def stacked(self, state_size: int) -> "Start":
-        """The start with a first axis, with states and with gains.
+        """The start as a stack of starts that all have states and gains.
 
         **Arguments:** `state_size`: the number of states `n`.
         """
@@ -172,8 +176,9 @@ class Start(eqx.Module):
 
         **Arguments:** `problem`: a [`delucax.planning.Problem`][].
 
-        **Returns:** `(start, states, controls, cost)`: this one start, and what
-        `problem.roll_out` returns for it. The cost is infinite if all starts diverge.
+        **Returns:** `(start, states, controls, cost)`: the start with the lowest cost,
+        and its trajectory and cost from `problem.roll_out`. The cost is infinite if all
+        starts diverge.
         """
 
         def roll(start):

@@ -31,9 +31,9 @@ def _as_bounds(value: Any) -> Any:
 class Unknowns(eqx.Module):
     """Unknowns of a plan besides the controls: first state, parameters and duration.
 
-    [`delucax.planning.SQP`][] chooses them together with the controls. Each unknown has
-    bounds `(low, high)`, which may be infinite. The iteration starts
-    from the values in the problem, clipped to the bounds.
+    [`delucax.planning.SQP`][] chooses the unknowns together with the controls. Each
+    unknown has bounds `(low, high)`, which may be infinite. The iteration starts from
+    the values in the problem, clipped to the bounds.
 
     **Arguments:**
 
@@ -46,12 +46,14 @@ class Unknowns(eqx.Module):
     - `duration`: bounds `(low, high)` of the time from the first state to the last one,
         two positive numbers. All steps have the same length. The dynamics must
         discretise a system in continuous time, such as [`delucax.Discretized`][]. Costs
-        and constraints get the true times, so the final cost `t` minimises the time.
-        The stage cost is not multiplied by the step. Not an unknown by default.
+        and constraints get the true times, so a plan with the final cost `t` minimises
+        the duration. The stage cost is not multiplied by the length of a step. By
+        default the duration is not an unknown.
 
     **Raises:** `ValueError` if nothing is unknown, bounds are not a pair of numbers
     with `low <= high`, or a duration may be zero or negative. A call of the planner
-    raises it if a name does not exist or a parameter has no finite value to start from.
+    raises a `ValueError` if a name does not exist or a parameter has no finite value to
+    start from.
 
     !!! example
 

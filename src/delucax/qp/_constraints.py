@@ -15,7 +15,7 @@ from .._typing import Array
 class Soft(eqx.Module):
     r"""Bounds that may be violated at a cost.
 
-    A violation $t \ge 0$ of one side costs $v\, t + \tfrac12 W t^2$. The penalty is
+    A violation $t \ge 0$ of a bound costs $v\, t + \tfrac12 W t^2$. The penalty is
     exact if $v$ is larger than the multiplier of the hard bound: the solution then
     violates the bound only if the constraints leave no other choice.
 
@@ -23,11 +23,11 @@ class Soft(eqx.Module):
 
     - `low`, `high`: the bounds, numbers or arrays, which may be infinite.
     - `linear`: the weight $v$, at least 0; a number, or of the shape of the bounds; 0
-        by default. If it is infinite, the bound is hard.
+        by default. If the weight is infinite, the bound is hard.
     - `quadratic`: the weight $W$, like `linear`.
 
-    **Raises:** `ValueError` if a weight is negative or NaN, or if there is no finite
-    number between the bounds.
+    **Raises:** `ValueError` if a weight is negative or NaN, or if no finite number lies
+    between the bounds.
 
     Source: Kerrigan and Maciejowski, 2000.
 
@@ -67,8 +67,8 @@ class Soft(eqx.Module):
 class Rows(eqx.Module):
     r"""General linear constraints, $l \le C x + D u \le h$.
 
-    A row with two equal bounds is an equation. If a row has no bound on one side, give
-    an infinite bound there.
+    A row whose two bounds are equal is an equation. If a row has no bound on one side,
+    give an infinite bound for this side.
 
     **Arguments:**
 

@@ -70,9 +70,9 @@ class Dense(eqx.Module):
     E x = b, \quad \mathit{low} \le x \le \mathit{high}, \quad
     \mathit{lower} \le G x \le \mathit{upper}$$
 
-    It is suitable for up to some hundreds of variables. Write a problem of optimal
-    control as a [`delucax.qp.Staged`][] program instead: its time is linear in the
-    horizon.
+    The dense form is suitable for up to some hundreds of variables. Write a problem of
+    optimal control as a [`delucax.qp.Staged`][] program instead, because the time to
+    solve a staged program is linear in the horizon.
 
     **Arguments:**
 
@@ -82,11 +82,11 @@ class Dense(eqx.Module):
     - `bounds`: a pair `(low, high)` of numbers or arrays of shape `(n,)`, which may be
         infinite, or a [`delucax.qp.Soft`][]; none by default.
     - `rows`: a [`delucax.qp.Rows`][] with the matrix `G` of shape `(p, n)` as its `C`,
-        and without a `D`; none by default.
+        and no `D`; none by default.
 
     **Raises:** `ValueError` if an array has the wrong shape, has NaN, or is not finite
-    (only bounds may be infinite), if there is no finite number between two bounds, or
-    if `P` is not symmetric and positive semidefinite.
+    (only bounds may be infinite), if no finite number lies between two bounds, or if
+    `P` is not symmetric and positive semidefinite.
 
     !!! example
 
@@ -157,7 +157,7 @@ class Dense(eqx.Module):
             self.rows = as_limits(rows, (len(self.G),), "rows", where)
 
     def form(self) -> DenseForm:
-        """The program as the method takes it."""
+        """The program in the standard form of the solver."""
         n, dtype = self.q.shape[0], jnp.result_type(*jax.tree.leaves(self))
         empty = jnp.zeros((0, n), dtype)
         G = empty if self.G is None else self.G
@@ -180,7 +180,7 @@ class Dense(eqx.Module):
         return [self.P]
 
     def primal(self, x: Array) -> tuple[Array, None]:
-        """The variables of the unknowns `x` of the form; there are no controls."""
+        """The variables, from the unknowns `x` of the standard form; there are no controls."""
         return x, None
 
     def multipliers(self, p: Array, sides: Array) -> DenseMultipliers:

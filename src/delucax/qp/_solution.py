@@ -12,24 +12,25 @@ from ._staged_problem import StagedMultipliers
 class Solution(eqx.Module):
     r"""The solution of a quadratic program, or a certificate that it has none.
 
-    If `result` is `RESULTS.no_feasible_point`, the multipliers are a certificate. The
-    multipliers of inequalities are not negative, their combination of the constraints,
-    $E^\top y + G^\top (\mu_\mathrm{upper} - \mu_\mathrm{lower})$, is zero, and the same
-    combination of the right sides is $-1$. ($G$ has a row for each bound of a variable
-    here.) A feasible point would contradict this. `x` and `u` are NaN, and `cost` is
-    infinite.
+    If `result` is `RESULTS.no_feasible_point`, the multipliers are a certificate that
+    no point satisfies the constraints. The multipliers of inequalities are not
+    negative, their combination of the constraints, $E^\top y + G^\top
+    (\mu_\mathrm{upper} - \mu_\mathrm{lower})$, is zero, and the same combination of the
+    right sides is $-1$. ($G$ has a row for each bound of a variable here.) A feasible
+    point would contradict this. `x` and `u` are NaN, and `cost` is infinite.
 
-    If `result` is `RESULTS.unbounded`, `x` and `u` are a direction. It stays within all
-    constraints, the Hessian is zero along it, and the linear cost decreases by 1 per
-    unit. The multipliers are NaN, and `cost` is minus infinity.
+    If `result` is `RESULTS.unbounded`, `x` and `u` are a direction in which the cost
+    decreases without bound. Moving along this direction violates no constraint, the
+    Hessian is zero along it, and the linear cost decreases by 1 per unit of length. The
+    multipliers are NaN, and `cost` is minus infinity.
 
     **Attributes:**
 
     - `x`: the variables, shape `(n,)`; for a staged program the states, `(T+1, n)`.
-    - `u`: the controls of a staged program, shape `(T, m)`; `None` for a dense one.
+    - `u`: the controls of a staged program, shape `(T, m)`; `None` for a dense program.
     - `multipliers`: a [`delucax.qp.DenseMultipliers`][] or a
         [`delucax.qp.StagedMultipliers`][].
-    - `cost`: the cost of the solution, with the violations of soft sides.
+    - `cost`: the cost of the solution, including the cost of violated soft bounds.
     - `primal_residual`: the largest violation of a constraint that is not soft.
     - `dual_residual`: the largest entry of the gradient of the Lagrangian.
     - `complementarity`: the largest product of a multiplier and its slack.

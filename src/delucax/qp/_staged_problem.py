@@ -33,8 +33,8 @@ class StagedMultipliers(eqx.Module):
 
     **Attributes:**
 
-    - `costates`: the multipliers of the equations, shape `(T+1, n)`. The first belongs
-        to the start, and is zero if the start is free. Entry $k + 1$ belongs to
+    - `costates`: the multipliers of the equations, shape `(T+1, n)`. The first costate
+        belongs to the start, and is zero if the start is free. Entry $k + 1$ belongs to
         $x_{k+1} = A x_k + B u_k + d_k$. The derivative of the optimal cost with respect
         to $d_k$ is `-costates[k + 1]`.
     - `states`: a pair `(lower, upper)` of non-negative arrays of shape `(T+1, n)`;
@@ -89,9 +89,9 @@ class Staged(eqx.Module):
     $x_0$, bounds of states and controls, and general rows.
 
     An argument without a time axis holds at all stages. Bounds of the states hold at
-    stages 1 to T. They also hold at stage 0 if the start is free, but not for a given
-    start, because the program cannot change it. A Riccati recursion solves the program
-    in time linear in the horizon.
+    stages 1 to T. These bounds also hold at stage 0 if the start is free. They do not
+    hold for a given start, because the program cannot change a given start. A Riccati
+    recursion solves the program in time linear in the horizon.
 
     **Arguments:**
 
@@ -118,7 +118,7 @@ class Staged(eqx.Module):
     **Raises:** `ValueError` if an array has the wrong shape or has NaN, if it is not
     finite (only bounds may be infinite), if arrays are for different horizons, if there
     is no finite number between two bounds, or if the weights are not symmetric and
-    positive semidefinite. The message names the stage, and the entry of a bound.
+    positive semidefinite. The error message names the stage, and the entry of a bound.
 
     Source: Rao, Wright and Rawlings, 1998.
 
@@ -325,7 +325,7 @@ class Staged(eqx.Module):
         return [stage] if self.final is None else [stage, self.final]
 
     def primal(self, x: Array) -> tuple[Array, Array]:
-        """The states and the controls of the unknowns `x` of the form."""
+        """The states and the controls, from the unknowns `x` of the standard form."""
         n = self.B.shape[-2]
         return x[:, :n], x[:-1, n:]
 

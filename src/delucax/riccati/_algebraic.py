@@ -26,7 +26,8 @@ def dare(
     (B^\top X A + S^\top) + Q = 0$$
 
     The gain $K = (R + B^\top X B)^{-1} (B^\top X A + S^\top)$ gives the optimal control
-    $u_k = -K x_k$ of $E x_{k+1} = A x_k + B u_k$ over an infinite horizon. It minimises
+    $u_k = -K x_k$ of $E x_{k+1} = A x_k + B u_k$ over an infinite horizon. This control
+    minimises
 
     $$\sum_{k=0}^\infty \left( x_k^\top Q x_k + 2 x_k^\top S u_k + u_k^\top R u_k
     \right),$$
@@ -35,13 +36,14 @@ def dare(
 
     The solver is structure-preserving doubling: each iteration doubles the horizon of
     the Riccati recursion, from a positive final cost. Newton steps follow while the
-    residual is large. Both need only products and linear solves, no eigenvalues, which
-    suits accelerators and `jax.vmap`. In a batch, a member that fails does not affect
-    the others. The solution is differentiable to any order, in either mode, by the
-    implicit function theorem.
+    residual is large. Doubling and Newton steps need only products and linear solves,
+    no eigenvalues, so they run well on accelerators and under `jax.vmap`. In a batch,
+    an equation that fails does not affect the other equations. The solution is
+    differentiable to any order, in forward and reverse mode, by the implicit function
+    theorem.
 
     If $(A, Q)$ is not detectable, the stabilising solution is not the minimal solution
-    of the equation: a control that lets the state grow costs less.
+    of the equation, because a control that lets the state grow costs less.
 
     **Arguments:**
 
@@ -56,13 +58,14 @@ def dare(
     - `throw`: raise an error unless there is a stabilising solution (default). If
         false, check `result`.
 
-    **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][]. The solve is successful if the
     closed loop is stable and the relative residual, after diagonal balancing of the
     states, is at most 1e-12 (1e-5 in single precision). A residual of up to a hundred
-    times that is accepted if rounding of $X$ alone may cause it. Else `result` is one
-    of `RESULTS.not_stabilisable`, `not_stabilising` (there is no stabilising solution),
-    `on_boundary` (eigenvalues on the unit circle, or so close that rounding of the data
-    removes the stabilising solution), `not_converged` and `ill_posed`.
+    times this limit is accepted if the rounding of $X$ alone may cause it. Otherwise
+    `result` is one of `RESULTS.not_stabilisable`, `not_stabilising` (there is no
+    stabilising solution), `on_boundary` (eigenvalues on the unit circle, or so close
+    that rounding of the data removes the stabilising solution), `not_converged` and
+    `ill_posed`.
 
     **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `Q` or
     `R` is not symmetric, or if `R` is not semidefinite. With `throw`, an error at run
@@ -105,7 +108,7 @@ def care(
     $$A^\top X E + E^\top X A - (E^\top X B + S) R^{-1} (B^\top X E + S^\top) + Q = 0$$
 
     The gain $K = R^{-1} (B^\top X E + S^\top)$ gives the optimal control $u = -K x$ of
-    $E \dot{x} = A x + B u$ over an infinite horizon. It minimises
+    $E \dot{x} = A x + B u$ over an infinite horizon. This control minimises
 
     $$\int_0^\infty \left( x^\top Q x + 2 x^\top S u + u^\top R u \right)
     \mathrm{d}t,$$
@@ -113,19 +116,20 @@ def care(
     and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 
     The solver is the scaled sign iteration of the Hamiltonian matrix. If it fails, the
-    solver starts once more in a unit of $X$ that suits weak controls. What
-    [`delucax.riccati.dare`][] says about Newton steps, accelerators, batches,
-    derivatives and undetectable modes also holds here.
+    solver starts once more, with $X$ in a larger unit that suits controls with a weak
+    effect. What [`delucax.riccati.dare`][] says about Newton steps, accelerators,
+    batches, derivatives and undetectable modes also holds here.
 
     **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as in
     [`delucax.riccati.dare`][].
 
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite. With a singular
-        weight the optimal control may be an impulse, which no gain gives.
+        weight the optimal control may be an impulse, which no feedback gain can
+        produce.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. The
-    criteria and the values of `result` are those of [`delucax.riccati.dare`][], with
-    the imaginary axis instead of the unit circle.
+    criteria and the values of `result` are the same as in [`delucax.riccati.dare`][],
+    with the imaginary axis instead of the unit circle.
 
     **Raises:** as in [`delucax.riccati.dare`][], and `ValueError` if `R` is only
     semidefinite.
@@ -175,9 +179,9 @@ def filter_dare(
     $$\hat{x}_{k+1} = A \hat{x}_k + K (y_k - C \hat{x}_k), \qquad
     K = (A X C^\top + S) (V + C X C^\top)^{-1}.$$
 
-    $X$ is the covariance of the prediction error: of $x_k$ given all measurements
-    before time $k$. The gain of the measurement update of a Kalman filter is
-    $X C^\top (V + C X C^\top)^{-1}$. The equation is the same as in
+    $X$ is the covariance of the prediction error, which is the covariance of $x_k$
+    given all measurements before time $k$. The gain of the measurement update of a
+    Kalman filter is $X C^\top (V + C X C^\top)^{-1}$. The equation is the same as in
     [`delucax.riccati.dare`][], for the transposed system.
 
     **Arguments:**

@@ -32,15 +32,15 @@ class FiniteHorizonSolution(eqx.Module):
     r"""The optimal control of a linear-quadratic problem over a finite horizon.
 
     In discrete time the minimal cost from state $x$ at step $t$ is
-    $x^\top X_t x + 2 p_t^\top x + s_t$. The control $u = -K_t x - k_t$ attains it. In
-    continuous time the minimal cost from $x$ at `times[i]` is $x^\top X_i x$, and the
-    control $u = -K_i x$ attains it.
+    $x^\top X_t x + 2 p_t^\top x + s_t$. The control $u = -K_t x - k_t$ attains this
+    cost. In continuous time the minimal cost from $x$ at `times[i]` is $x^\top X_i x$,
+    and the control $u = -K_i x$ attains this cost.
 
     **Attributes:**
 
-    - `X`: the quadratic part of the cost-to-go, symmetric. In discrete time at each
-        step and at the end, shape `(T+1, n, n)`; in continuous time at each point of
-        the grid, shape `(N, n, n)`.
+    - `X`: the quadratic part of the cost-to-go, symmetric. In discrete time, `X` has
+        one matrix for each step and one for the end, shape `(T+1, n, n)`. In continuous
+        time, it has one matrix for each point of the grid, shape `(N, n, n)`.
     - `K`: the gains, shape `(T, m, n)`, or `(N, m, n)` in continuous time.
     - `closed_loop`: the matrices $A - B K$, shape `(T, n, n)`, or `(N, n, n)` in
         continuous time.
@@ -114,7 +114,8 @@ def dre(
     $q_f = -X_f x_T^*$.
 
     All arguments except `final` and `final_q` may vary in time. The solution is
-    differentiable to any order, in either mode. A gradient needs as much memory as $X$.
+    differentiable to any order, in forward and reverse mode. A gradient needs as much
+    memory as $X$.
 
     **Arguments:**
 
@@ -140,8 +141,8 @@ def dre(
     before it have no minimum, and the solution is NaN there.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
-    weight is not symmetric, or if there is no horizon. With `throw`, an error at run
-    time if a step has no minimum.
+    weight is not symmetric, or if neither `horizon` nor a time axis gives the number of
+    steps. With `throw`, an error at run time if a step has no minimum.
 
     Source: Bertsekas, 2017; Sarkka and Garcia-Fernandez, 2023 (in parallel).
 
@@ -241,11 +242,11 @@ def cre(
     $$\int_{t_0}^{t_1} \left( x^\top Q x + 2 x^\top S u + u^\top R u \right)
     \mathrm{d}t + x(t_1)^\top X_f\, x(t_1).$$
 
-    The solution is exact except for rounding, for stiff equations and coarse grids too.
-    The flow of $[I; X]$ is linear, so a matrix exponential gives it over a short
-    interval. Intervals are then composed, which doubles their length each time, in a
-    form whose terms do not grow. The solution is differentiable to any order, in either
-    mode.
+    The solution is exact except for rounding errors, even for stiff equations and
+    coarse grids. The flow of $[I; X]$ is linear, so a matrix exponential gives the flow
+    over a short interval. The solver then composes intervals and doubles their length
+    each time, in a form whose terms do not grow. The solution is differentiable to any
+    order, in forward and reverse mode.
 
     **Arguments:**
 
@@ -257,15 +258,15 @@ def cre(
     - `times`: the times at which $X$ is computed, increasing, at least two, shape
         `(N,)`.
     - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
-    - `throw`: raise an error if there is no minimum (default). If false, check
+    - `throw`: raise an error if the cost has no minimum (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at the times
-    from which the cost has no minimum.
+    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. The solution is NaN at
+    the times from which the cost has no minimum.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
     weight is not symmetric, or if the times do not increase. With `throw`, an error at
-    run time if there is no minimum.
+    run time if the cost has no minimum.
 
     Source: Davison and Maki, 1973 (the linear flow).
 

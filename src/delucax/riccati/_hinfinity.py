@@ -81,14 +81,14 @@ def hinf_dare(
     The solver is doubling, followed by Newton steps. The equation also has solutions
     that do not solve the game. Therefore the solver checks at the end that $X$ is
     positive semidefinite, that the game has a saddle point, and that the closed loop is
-    stable. At a given `gamma` the solution is differentiable to any order, in either
-    mode, by the implicit function theorem.
+    stable. At a given `gamma` the solution is differentiable to any order, in forward
+    and reverse mode, by the implicit function theorem.
 
-    Without `gamma`, secants and bisection find the smallest level that a controller can
-    attain. It has first derivatives only. The other results are then differentiated
-    with the level held fixed, and these derivatives may be large, because the saddle
-    point vanishes just below the level. For a design whose derivatives follow the
-    level, give `gamma=1.05 * hinf_dare(...).gamma`.
+    Without `gamma`, a search by secants and bisection finds the smallest level that a
+    controller can attain. It has first derivatives only. The derivatives of the other
+    results then hold the level fixed. These derivatives may be large, because the
+    saddle point vanishes just below the level. For a design whose derivatives include
+    the change of the level, give `gamma=1.05 * hinf_dare(...).gamma`.
 
     **Arguments:**
 
@@ -104,8 +104,9 @@ def hinf_dare(
     - `throw`: raise an error unless the game is solved (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
-    no solution, for example because `gamma` is below the smallest attainable level.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. The matrices of the result are
+    NaN if there is no solution, for example because `gamma` is below the smallest
+    attainable level.
 
     **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `Q` or
     `R` is not symmetric, if `Q` is not semidefinite, or if `gamma` or `tolerance` is
@@ -161,8 +162,8 @@ def hinf_care(
     The solver doubles the interval of the Riccati differential equation, and then takes
     Newton steps. At the end it checks that $X$ is positive semidefinite and that the
     closed loop is stable. The solution is differentiable to any order at a given
-    `gamma`. Without `gamma`, the smallest level has first derivatives, and the other
-    results are differentiated with the level held fixed, as in
+    `gamma`. Without `gamma`, the smallest level has first derivatives, and the
+    derivatives of the other results hold the level fixed, as in
     [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the smallest level, $X$ may
     grow without bound: for a controller, take a `gamma` a few percent higher.
 
@@ -172,11 +173,11 @@ def hinf_care(
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
     - `tolerance`: the relative tolerance of the smallest level; by default 1e-6, or
         1e-3 in float32. If $X$ grows without bound, the result is the smallest level at
-        which $X$ has enough correct digits to be accepted. It is above the exact level
-        by about 1e-5, relatively.
+        which $X$ has enough correct digits to be accepted. This level is above the
+        exact smallest level by a relative difference of about 1e-5.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
-    no solution.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. The matrices of the result are
+    NaN if there is no solution.
 
     **Raises:** as in [`delucax.riccati.hinf_dare`][].
 

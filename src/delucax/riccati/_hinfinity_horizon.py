@@ -99,8 +99,9 @@ def hinf_dre(
     steps before it.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
-    weight is not symmetric, if there is no horizon, or if `gamma` or `tolerance` is not
-    positive. With `throw`, an error at run time if the game is not solved.
+    weight is not symmetric, if neither `horizon` nor a time axis gives the number of
+    steps, or if `gamma` or `tolerance` is not positive. With `throw`, an error at run
+    time if the game is not solved.
 
     Source: Basar and Bernhard, 1995.
 
@@ -157,12 +158,12 @@ def hinf_cre(
     $$\int_{t_0}^{t_1} \left( x^\top Q x + u^\top R u \right) \mathrm{d}t
     + x(t_1)^\top X_f\, x(t_1) \le \gamma^2 \int_{t_0}^{t_1} w^\top w \,\mathrm{d}t.$$
 
-    The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. It is
-    differentiable to any order at a given `gamma`. Without `gamma`, the smallest level
-    has first derivatives, and the other results are differentiated with the level held
-    fixed, as in [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the smallest
-    level, $X$ grows without bound at the first time: for a controller, take a `gamma` a
-    few percent higher.
+    The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. The
+    solution is differentiable to any order at a given `gamma`. Without `gamma`, the
+    smallest level has first derivatives, and the other results are differentiated with
+    the level held fixed, as in [`delucax.riccati.hinf_dare`][]. As `gamma` approaches
+    the smallest level, $X$ grows without bound at the first time: for a controller,
+    take a `gamma` a few percent higher.
 
     **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as in
     [`delucax.riccati.hinf_care`][].
@@ -172,8 +173,8 @@ def hinf_cre(
     - `final`: final weight $X_f$, shape `(n, n)`, symmetric, positive semidefinite;
         zero by default.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][]. It is NaN at the times from which
-    there is no solution, for example because `gamma` is too low.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. The solution is NaN at the times
+    from which there is no saddle point, for example because `gamma` is too low.
 
     **Raises:** as in [`delucax.riccati.hinf_care`][], and `ValueError` if the times do
     not increase.

@@ -38,14 +38,16 @@ class MatrixSolution(eqx.Module):
 
     **Attributes:**
 
-    - `X`: the solution, shape `(n, n)`, or `(n, m)` of a Sylvester equation.
+    - `X`: the solution, shape `(n, n)`, or `(n, m)` for a Sylvester equation.
     - `residual`: the norm of the residual of the equation, divided by
         $(|A| + |B|)\, |X| + |C|$, or in discrete time by $(|A|\, |B| + 1)\, |X| + |C|$.
-        It is the relative change of the data that would make $X$ exact.
+        The residual is the size of a relative change of the data for which $X$ would be
+        exact.
     - `iterations`: the number of doublings, or of steps of the sign iteration.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
-    `X` is differentiable. If the solve failed, its derivatives are zero.
+    `X` is differentiable. If the solve failed, the derivatives of the solution are
+    zero.
 
     !!! example
 
@@ -97,8 +99,8 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     - `throw`: raise an error unless the equation is solved (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision). Else `result` is
+    **Returns:** a [`delucax.riccati.MatrixSolution`][]. The solve is successful if the
+    `residual` is at most 1e-12 (1e-5 in single precision). Otherwise `result` is
     `RESULTS.not_separated`, or `RESULTS.ill_posed` if two eigenvalues of $A$ sum to
     zero.
 
@@ -186,8 +188,8 @@ def sylvester(
     - `throw`: raise an error unless the equation is solved (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision). Else `result` is
+    **Returns:** a [`delucax.riccati.MatrixSolution`][]. The solve is successful if the
+    `residual` is at most 1e-12 (1e-5 in single precision). Otherwise `result` is
     `RESULTS.not_separated`, or `RESULTS.ill_posed` if $A$ and $-B$ share an eigenvalue.
 
     **Raises:** `ValueError` if a matrix has the wrong shape or is not finite. With

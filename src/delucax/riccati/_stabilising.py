@@ -70,17 +70,17 @@ class RiccatiSolution(eqx.Module):
     - `closed_loop`: the matrix of the closed loop, shape `(n, n)`: $A - B K$, or
         $E^{-1} (A - B K)$; for a filter $A - K C$.
     - `spectral_radius`: in discrete time, a close upper bound on the spectral radius of
-        `closed_loop`, to about eight digits. The loop is stable if it is below 1.
-        `None` in continuous time.
+        `closed_loop`, to about eight digits. The loop is stable if the spectral radius
+        is below 1. `None` in continuous time.
     - `iterations`: the number of doublings, or of steps of the sign iteration.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
     - `spectral_abscissa`: in continuous time, a close upper bound on the largest real
-        part of an eigenvalue of `closed_loop`. The loop is stable if it is below 0.
-        `None` in discrete time.
+        part of an eigenvalue of `closed_loop`. The loop is stable if the spectral
+        abscissa is below 0. `None` in discrete time.
 
     `X`, `K` and `closed_loop` are differentiable. `residual`, `spectral_radius` and
     `spectral_abscissa` are measurements and have no gradient. If the solve failed and
-    the loop is not stable, the derivatives are zero, so that a failed member does not
+    the loop is not stable, the derivatives are zero, so that a failed equation does not
     affect the gradient of a batch.
 
     !!! example

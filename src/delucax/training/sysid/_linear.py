@@ -46,8 +46,8 @@ def linear(
     [`delucax.LinearDynamics`][]. Row i of its `estimate` holds the entries of $A$, $B$
     and $c$ for state i.
 
-    **Raises:** `ValueError` if `record` is not a uniform record or a list of them; an
-    error at run time as `throw` says.
+    **Raises:** `ValueError` if `record` is not a uniform record or a list of them; with
+    `throw`, an error at run time if the data do not determine all entries.
 
     !!! example
 
@@ -119,8 +119,8 @@ def arx(
     $A_1, \dots, A_a, B_0, \dots, B_{b-1}$ for output i.
 
     **Raises:** `ValueError` if `record` is not a uniform record or a list of them, a
-    count is below 1, or a record has fewer steps than the model looks back; an error at
-    run time as `throw` says.
+    count is below 1, or a record has fewer steps than the model looks back; with
+    `throw`, an error at run time if the data do not determine all entries.
 
     Source: Ljung, 1999.
 
