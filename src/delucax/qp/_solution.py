@@ -21,7 +21,7 @@ class Solution(eqx.Module):
 
     If `result` is `RESULTS.unbounded`, `x` and `u` are a direction in which the cost
     decreases without bound. Moving along this direction violates no constraint, the
-    Hessian is zero along it, and the linear cost decreases by 1 per unit of length. The
+    Hessian is zero along it, and the linear cost of the direction is -1. The
     multipliers are NaN, and `cost` is minus infinity.
 
     **Attributes:**

@@ -89,7 +89,7 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
 
     The solver is the sign iteration if all eigenvalues of $A$ are on one side of the
     imaginary axis. Otherwise it solves the equation as one dense linear system up to
-    $n = 16$. For a larger $n$, `result` is `RESULTS.not_separated`.
+    $n = 16$. If $n$ is larger, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
@@ -137,8 +137,8 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     white noise of covariance $Q$.
 
     The solver is doubling if all eigenvalues of $A$ are on one side of the unit circle.
-    Otherwise it solves the equation as one dense linear system up to $n = 16$. For a
-    larger $n$, `result` is `RESULTS.not_separated`.
+    Otherwise it solves the equation as one dense linear system up to $n = 16$. If $n$
+    is larger, `result` is `RESULTS.not_separated`.
 
     **Arguments:** `A`, `Q` and `throw`: as in [`delucax.riccati.lyap`][].
 

@@ -28,7 +28,7 @@ from ._steps import AbstractSurrogate
 
 
 class ActorCritic(eqx.Module):
-    r"""A policy, and a critic that estimates its discounted cost to go.
+    r"""A policy, and a critic that estimates the discounted cost to go of the policy.
 
     $$V(t, y) = a + b\, c(t, y)$$
 
@@ -41,11 +41,13 @@ class ActorCritic(eqx.Module):
         [`delucax.controllers.Gaussian`][] and [`delucax.controllers.Categorical`][] do.
     - `critic`: a controller without a memory and with one output, such as a
         [`delucax.controllers.MLP`][].
-    - `shift`, `scale`: $a$ and $b$, 0 and 1 by default. Training sets them, so that the
-        targets of the critic's own output have mean 0 and standard deviation 1.
+    - `shift`, `scale`: $a$ and $b$, 0 and 1 by default. Training sets `shift` and
+        `scale` such that the targets for the output $c$ have mean 0 and standard
+        deviation 1.
 
-    **Raises:** `ValueError` if one is not a controller, or the critic has a memory.
-    `value` and `raw` raise it if the critic does not give one output.
+    **Raises:** `ValueError` if `policy` or `critic` is not a controller, or the critic
+    has a memory. `value` and `raw` raise a `ValueError` if the critic does not give one
+    output.
 
     !!! example
 
@@ -118,10 +120,10 @@ def actor_critic(
     """A policy and a critic for an environment: two fully connected networks.
 
     The input of both networks is `environment.encode(y)`, standardised with the
-    statistics that training collects. The last layers start with weights a hundred
-    times smaller than usual. So the policy starts near the middle of the bounds, and
-    the critic starts nearly constant, because the gradient of an untrained critic is
-    misleading.
+    statistics that training collects. The last layers of both networks start with
+    weights a hundred times smaller than usual. So the policy starts near the middle of
+    the bounds, and the critic starts nearly constant, because the gradient of an
+    untrained critic is misleading.
 
     **Arguments:**
 
@@ -137,7 +139,7 @@ def actor_critic(
     **Returns:** a [`delucax.training.ActorCritic`][].
 
     **Raises:** `ValueError` if `environment` is not an environment, `head` is unknown,
-    a size is below 1, there is no key, or a categorical head has no table.
+    a size is below 1, there is no key, or a categorical head has no table of actions.
 
     Source: Andrychowicz et al., 2021 (the small last layer of the policy).
 

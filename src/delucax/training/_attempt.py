@@ -15,7 +15,7 @@ class Attempt(NamedTuple):
     - `structure`: the structure of the policy, as in [`delucax.training.Synthesis`][].
     - `method`: the training method, such as `"gradient"` or `"evolution"`.
     - `cost`: the mean cost over the initial states on which policies are chosen.
-    - `seconds`: the time it took, with compilation.
+    - `seconds`: the time that the training took, including compilation [s].
 
     !!! example
 

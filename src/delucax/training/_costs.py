@@ -90,17 +90,17 @@ def expected_cost(
     - `horizon`: steps per rollout; the `horizon` of the environment by default.
     - `checkpoint`: what the gradient stores: `"step"` (default), `"sqrt"` or `None`, as
         in [`delucax.rollout`][].
-    - `gradient_decay`: the damping of the gradient through time, as in
-        [`delucax.rollout`][]. 1 by default, which is the true gradient.
+    - `gradient_decay`: the damping factor of the gradient through time, as in
+        [`delucax.rollout`][]; 1 by default, which gives the true gradient.
     - `truncate`: the gradient is cut every `truncate` steps, as in
         [`delucax.rollout`][]; never by default.
-    - `ranges`: ranges of parameters, as in [`delucax.randomise`][]. Each rollout then
-        draws its own plant. None by default.
+    - `ranges`: ranges of parameters, as in [`delucax.randomise`][]. With `ranges`, each
+        rollout draws its own plant. None by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar.
 
     **Raises:** `ValueError` if `batch`, `horizon` or `truncate` is below 1,
-    `environment` is not an environment, `checkpoint` is none of the above,
+    `environment` is not an environment, `checkpoint` has another value,
     `gradient_decay` is not a finite number, or `ranges` are not valid.
 
     !!! example
@@ -179,8 +179,8 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
     $$L(\theta) = \sum_k \log p_\theta(u_k \mid t_k, y_k, s_k)$$
 
     Here $s_k$ is the memory of the controller. The observations and the drawn controls
-    are held fixed in $L$. [`delucax.training.LikelihoodRatio`][] needs such a loss; the
-    other estimators accept it too.
+    are held fixed in $L$. [`delucax.training.LikelihoodRatio`][] needs such a loss, and
+    the other gradient estimators accept such a loss too.
 
     **Arguments:**
 
@@ -191,7 +191,8 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
     controller must be a [`delucax.AbstractStochasticPolicy`][].
 
     **Raises:** `ValueError` if `horizon` is below 1 or `environment` is not an
-    environment. When the loss is called, if the controller is not a stochastic policy.
+    environment. A `ValueError` is also raised when the loss is called, if the
+    controller is not a stochastic policy.
 
     !!! example
 
@@ -264,15 +265,17 @@ def worst_case(
 
     $$w_k \leftarrow r\, \frac{g_k}{\lVert g_k \rVert}$$
 
-    If the cost is convex in the disturbances, an iteration never lowers it. This is so
-    for a linear plant, linear feedback and a convex cost. The search runs from several
-    starts at once; every other start is constant over time, the others are noise. It
-    returns the best disturbances of all iterations and starts.
+    If the cost is convex in the disturbances, an iteration never lowers the cost. The
+    cost is convex in the disturbances for a linear plant, a linear feedback and a
+    convex stage cost. The search runs from several starts at once; every second start
+    is constant over time, and the remaining starts are noise. `worst_case` returns the
+    disturbances with the highest cost among all starts and iterations.
 
     **Arguments:**
 
     - `environment`: the environment. Its own disturbance is not used.
-    - `controller`: the controller. If it adapts, the gradient includes its adaptation.
+    - `controller`: the controller. If the controller adapts, the gradient includes the
+        adaptation.
     - `key`: a random key, for the starts of the search, the rollout and the controller.
     - `bound`: $r$, the bound on the Euclidean norm of each $w_k$, a positive number.
     - `x0`: the initial state, shape `(n,)`; drawn by the environment by default.
@@ -281,8 +284,9 @@ def worst_case(
     - `starts`: the number of starts, 8 by default.
 
     **Returns:** a named tuple. `w`, shape `(horizon, k)`, are the disturbances, to use
-    in `rollout(..., w=w)`. `total_cost` is their total cost. `costs`, shape
-    `(iterations + 1,)`, is the total cost at each iteration of the best start.
+    in `rollout(..., w=w)`. `total_cost` is the total cost under these disturbances.
+    `costs`, shape `(iterations + 1,)`, is the total cost at each iteration of the best
+    start.
 
     **Raises:** `ValueError` if an argument has the wrong type, shape or range, or the
     environment takes no disturbance.

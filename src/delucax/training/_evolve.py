@@ -91,7 +91,7 @@ def evolve(
     callbacks: Sequence[Callable[[int, dict[str, float]], Any]] = (),
     throw: bool = True,
 ) -> Fitted:
-    r"""Train a model without derivatives: separable natural evolution strategies.
+    r"""Train a model without derivatives, by separable natural evolution strategies.
 
     Each generation draws weights $\mu + \sigma \odot e_i$ from a normal distribution,
     with $e_i \sim \mathcal{N}(0, I)$ in pairs of opposite sign. The losses are ranked,
@@ -101,15 +101,15 @@ def evolve(
     \log \sigma \leftarrow \log \sigma + \frac{\eta}{2} \sum_i v_i (e_i^2 - 1),
     \qquad \eta = \frac{3 + \log d}{5 \sqrt{d}}$$
 
-    Only the order of the losses counts. So it also works if the loss jumps or is flat
-    almost everywhere, such as a reward at the end of an episode. It works best for up
-    to a few hundred weights.
+    Only the order of the losses is used. So `evolve` also works if the loss jumps or is
+    flat almost everywhere, such as a reward at the end of an episode. `evolve` works
+    best for up to a few hundred weights.
 
     **Arguments:**
 
-    - `loss`: a function `loss(model, key)` to a scalar;
-        [`delucax.training.expected_cost`][] makes one. All models of a generation get
-        the same key.
+    - `loss`: a function `loss(model, key)` to a scalar; for example from
+        [`delucax.training.expected_cost`][]. All models of a generation get the same
+        key.
     - `model`: a controller or any other pytree; the initial $\mu$.
     - `steps`: the number of generations, at least 1.
     - `key`: a random key.
@@ -120,8 +120,8 @@ def evolve(
     - `block`, `progress`, `callbacks`, `throw`: as in [`delucax.training.fit`][], with
         blocks of 50 generations by default.
 
-    **Returns:** a [`delucax.training.Fitted`][]. Its model is the mean $\mu$; its
-    history has the smallest loss of each generation.
+    **Returns:** a [`delucax.training.Fitted`][]. The `model` of the result is the mean
+    $\mu$, and its `history` has the smallest loss of each generation.
 
     **Raises:** `ValueError` if an argument has the wrong type or range. `RuntimeError`
     if no model of a generation has a finite loss, unless `throw` is false.

@@ -39,8 +39,8 @@ class Fitted(eqx.Module):
 
     **Attributes:**
 
-    - `model`: the trained model. If training diverged, the model before the step that
-        failed.
+    - `model`: the trained model. If training diverged, this is the model before the
+        step that failed.
     - `history`: the losses and other numbers of each step, a
         [`delucax.training.History`][].
     - `result`: the status, `RESULTS.successful` or `RESULTS.diverged` of
@@ -96,40 +96,42 @@ def fit(
 ) -> Fitted:
     r"""Train a model with a loss and an Optax optimiser.
 
-    Use it to train policies and to fit any other model, such as a learned simulator.
-    Each step $k$ evaluates the loss with the key `jax.random.fold_in(key, k)`, its
-    gradient with respect to the trainable values, and the update of the optimiser.
-    A value with a constraint is optimised as $z = \mathrm{unconstrain}(v)$, and the
-    model gets $v = \mathrm{constrain}(z)$, so every step stays in the valid set.
+    Use `fit` to train policies or any other model, such as a learned simulator. Each
+    step $k$ evaluates the loss with the key `jax.random.fold_in(key, k)`, its gradient
+    with respect to the trainable values, and the update of the optimiser. A parameter
+    with a constraint is optimised as $z = \mathrm{unconstrain}(v)$, and the model gets
+    $v = \mathrm{constrain}(z)$, so the parameter satisfies its constraint at every
+    step.
 
-    The steps run in compiled blocks. The result does not depend on the size of a block.
-    A run that resumes from its checkpoint, on the same kind of machine, gives the same
-    bits as a run without interruption. A second call does not compile again if the loss
-    is the same function, the optimiser is made in the same way, such as a new
+    The steps run in compiled blocks. The result does not depend on `block`. A run that
+    resumes from its checkpoint, on the same kind of machine, gives the same bits as a
+    run without interruption. A second call does not compile again if the loss is the
+    same function, the optimiser is made in the same way, such as a new
     `optax.adam(1e-3)`, and the model has the same structure and shapes.
 
     You cannot call `fit` under `jax.jit` or `jax.vmap`. To train an ensemble, pass a
-    batch of keys and a batch of models: all are trained at once, independently of each
-    other.
+    batch of keys and a batch of models: `fit` trains all models at once, independently
+    of each other.
 
     **Arguments:**
 
     - `loss`: a function `loss(model, key)`, or `loss(model, batch, key)` with `data`.
-        It returns a scalar, or a scalar and a dictionary of scalar metrics. If it is a
-        module, as [`delucax.training.expected_cost`][] returns, its arrays can change
-        without a new compilation. Or an [`delucax.training.AbstractSurrogate`][], a
-        loss with a memory, such as [`delucax.training.PPO`][].
+        The loss returns a scalar, or a scalar and a dictionary of scalar metrics. If
+        the loss is a module, for example from [`delucax.training.expected_cost`][], its
+        arrays can change without a new compilation. A loss with a memory, such as
+        [`delucax.training.PPO`][], is an [`delucax.training.AbstractSurrogate`][].
     - `model`: any pytree: a controller, an environment, a network, or several of them.
         With a batch of keys, every array has a leading axis over the seeds, as
         `eqx.filter_vmap(make)(keys)` returns it.
-    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. Its parameters are a
-        dictionary from the path of each trainable leaf to its unconstrained value.
+    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. The parameters that
+        the optimiser gets are a dictionary from the path of each trainable leaf to the
+        unconstrained value of the leaf.
     - `steps`: the number of steps, at least 1.
     - `key`: a random key, or a batch of keys, shape `(seeds,)`.
     - `data`: a pytree of arrays with a common leading axis; none by default.
     - `batch_size`: the number of rows of `data` in a batch, all rows by default. Rows
-        are drawn without replacement. Each pass over the data has a new order, and
-        skips the last rows if they do not fill a batch.
+        are drawn without replacement. Each pass over the data is in a new random order,
+        and skips the last rows if they do not fill a batch.
     - `trainable`: which leaves to train; the fields marked [`delucax.weight`][] by
         default. Or pass one of these. A path such as `"dynamics.system.length"`, or
         several paths. A dictionary from paths to constraints: [`delucax.positive`][],
@@ -137,32 +139,32 @@ def fit(
         a leaf, such as `equinox.is_inexact_array`. Booleans in the structure of the
         model.
     - `gradient`: the gradient estimator, [`delucax.training.analytic`][] by default.
-        Others are [`delucax.training.EvolutionStrategies`][],
+        Other estimators are [`delucax.training.EvolutionStrategies`][],
         [`delucax.training.LikelihoodRatio`][], or any function
         `gradient(loss, values, key)` to `(value, gradient)`.
     - `block`: steps in one call to the device, at most 1000; 100 by default. The
         progress bar, the callbacks and the checkpoints are updated after each block.
     - `progress`: whether to show a progress bar with the loss; true by default.
     - `callbacks`: functions `callback(step, metrics)`, called after each block; none by
-        default. `step` is the number of steps done, `metrics` a dictionary of the last
-        step's numbers, averaged over the seeds. Use them to log to TensorBoard, for
-        example.
+        default. `step` is the number of finished steps, and `metrics` is a dictionary
+        of the numbers of the last step, averaged over the seeds. You can use callbacks
+        to log to TensorBoard, for example.
     - `checkpoint`: the path of a file for checkpoints; none by default. If the file
         exists, the run resumes from it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. A checkpoint is always written at the end of the run.
-    - `throw`: whether to raise if the loss, its gradient or an update is NaN or
-        infinite; true by default. If false, training stops before that step, and
-        `fitted.result` is `RESULTS.diverged`. In a batch only the seed that failed
-        stops.
+    - `throw`: whether to raise an error if the loss, its gradient or an update is NaN
+        or infinite; true by default. If false, training stops before that step, and
+        `fitted.result` is `RESULTS.diverged`. In a batch of seeds, only the seed that
+        failed stops.
 
     **Returns:** a [`delucax.training.Fitted`][]. With a batch of keys, the arrays of
     the model, the result, and the columns of the history except `step` and `seconds`
     have an axis over the seeds.
 
     **Raises:** `ValueError` if an argument has the wrong type or shape, nothing is
-    trainable, or the checkpoint is of another run. `RuntimeError` if training diverges,
-    unless `throw` is false.
+    trainable, or the checkpoint comes from another run. `RuntimeError` if training
+    diverges, unless `throw` is false.
 
     !!! example
 

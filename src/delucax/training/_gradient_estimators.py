@@ -24,13 +24,13 @@ def analytic(
 
     $$g = \frac{\partial \ell(\theta, \text{key})}{\partial \theta}$$
 
-    The gradient is exact for the given key. Its mean over keys is the gradient of the
-    expected loss, if derivative and expectation can be exchanged.
+    The gradient is exact for the given key. The mean of the gradient over keys is the
+    gradient of the expected loss, if derivative and expectation can be exchanged.
 
     All estimators are called as `estimator(loss, model, key)`. The gradient is with
-    respect to the leaves of the model marked [`delucax.weight`][]. If none is marked,
-    it is with respect to all floating-point arrays. [`delucax.training.fit`][] passes
-    the trainable, unconstrained values as `model`.
+    respect to the leaves of the model marked [`delucax.weight`][]. If no leaf is
+    marked, the gradient is with respect to all floating-point arrays.
+    [`delucax.training.fit`][] passes the trainable, unconstrained values as `model`.
 
     **Arguments:**
 
@@ -88,12 +88,13 @@ class ClippedSamples(eqx.Module):
     $$g = \frac{1}{n} \sum_{i=1}^{n} \min\left(1, \frac{c}{\lVert g_i \rVert}\right)
     g_i, \qquad c = a\, \operatorname{median}_i \lVert g_i \rVert$$
 
-    If the median is zero, it is taken over the gradients that are not zero.
+    If the median is zero, the median of the gradients that are not zero is used.
 
-    Use it if the plant runs away in a few episodes. The gradient of such an episode can
-    be larger than all others together without a useful direction, or it is not finite
-    and would end the training. Call it like every estimator, see
-    [`delucax.training.analytic`][], with the loss of a single episode.
+    Use `ClippedSamples` if the plant diverges in a few episodes. The gradient of a
+    diverging episode can be larger than all other gradients together without a useful
+    direction. Or it is not finite and would end the training. Call the estimator like
+    every gradient estimator, see [`delucax.training.analytic`][], with the loss of a
+    single episode.
 
     **Arguments:**
 
@@ -103,12 +104,12 @@ class ClippedSamples(eqx.Module):
 
     **Returns:** a call returns `(value, gradient)`: the mean output of the loss over
     the finite samples, and a pytree like the model, with `None` for each leaf that is
-    not a weight. Both are NaN if no sample is finite.
+    not a weight. Value and gradient are NaN if no sample is finite.
 
     **Raises:** `ValueError` if `samples` is below 1, or `factor` is not positive.
 
     Source: Abadi et al., 2016 (clipping each gradient); Andrew, Thakkar, McMahan and
-    Ramaswamy, 2021 (to a quantile).
+    Ramaswamy, 2021 (clipping to a quantile).
 
     !!! example
 
@@ -177,19 +178,21 @@ class EvolutionStrategies(eqx.Module):
     $$g = \frac{1}{n \sigma} \sum_{i=1}^{n}
     \bigl(\ell(\theta + \sigma e_i) - \ell(\theta)\bigr)\, e_i$$
 
-    Both are unbiased for the gradient of the smoothed loss
+    Both estimates are unbiased for the gradient of the smoothed loss
     $\mathbb{E}[\ell(\theta + \sigma e)]$. For a quadratic loss, this is the gradient of
-    the loss itself; in general it differs by an order of $\sigma^2$. The loss need not
-    be differentiable. All its values are computed at once under `jax.vmap`. Call it
-    like every estimator, see [`delucax.training.analytic`][].
+    the loss itself; for other losses, the difference is of the order of $\sigma^2$. The
+    loss need not be differentiable. All values of the loss are computed at once by
+    `jax.vmap`. Call the estimator like every gradient estimator, see
+    [`delucax.training.analytic`][].
 
     **Arguments:**
 
     - `sigma`: $\sigma$, the standard deviation of the noise, positive.
         [`delucax.training.fit`][] adds the noise to the unconstrained values.
     - `samples`: the number of perturbed losses in one estimate; even if antithetic.
-    - `antithetic`: whether to perturb along $e_i$ and $-e_i$; true by default. This
-        cancels the loss itself and all even terms of its expansion.
+    - `antithetic`: whether to perturb along $e_i$ and $-e_i$; true by default. With
+        opposite directions, the loss itself and all even terms of its expansion in
+        $\sigma$ cancel.
 
     **Returns:** a call returns `(value, gradient)`: the output of the loss for the
     unperturbed weights, and a pytree like the model, with `None` for each leaf that is
@@ -289,25 +292,26 @@ class LikelihoodRatio(eqx.Module):
 
     The loss must return `(cost, {"log_prob": ...})` for one draw.
     [`delucax.training.scored_cost`][] makes such a loss from an environment. If you
-    write one, note two rules. Compute the log-probability of
+    write such a loss yourself, follow two rules. Compute the log-probability of
     `jax.lax.stop_gradient(u)`, because with a draw such as `u = mean + std * e` the
-    score would cancel. And let the cost depend on the weights only through the draw.
+    gradient of the log-probability would cancel. And let the cost depend on the weights
+    only through the draw.
 
-    The other estimators accept the same loss. Call it like every estimator, see
-    [`delucax.training.analytic`][].
+    The other gradient estimators accept this kind of loss too. Call the estimator like
+    every gradient estimator, see [`delucax.training.analytic`][].
 
     **Arguments:**
 
     - `samples`: $n$, the number of draws in one estimate.
     - `baseline`: whether to subtract the mean cost of the other draws; true by default.
-        This lowers the variance without a bias.
+        The baseline lowers the variance of the estimate without a bias.
 
     **Returns:** a call returns `(value, gradient)`: the mean cost and the mean metrics
     over the draws, and a pytree like the model, with `None` for each leaf that is not a
     weight.
 
-    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline. When
-    it is called, if the loss returns no `"log_prob"`.
+    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline; when
+    the estimator is called, if the loss returns no `"log_prob"`.
 
     Source: Williams, 1992; Kool, van Hoof and Welling, 2019 (the baseline).
 

@@ -57,9 +57,9 @@ def imitate(
     r"""Train a policy to act like an expert, such as MPC, by DAgger.
 
     DAgger stands for dataset aggregation. In the first round the expert runs the
-    episodes. In every later round the policy runs them, and the expert gives the
-    control that it would have applied in each state. So the policy learns to recover
-    from its own mistakes. Each round trains on the states of all rounds so far:
+    episodes. In every later round the policy runs the episodes, and the expert gives
+    the control that it would have applied in each state. So the policy learns to
+    recover from its own mistakes. Each round trains on the states of all rounds so far:
 
     $$\ell(\theta) = \operatorname{mean}_{(t, y)} \;
     \bigl\lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \bigr\rVert^2$$
@@ -77,13 +77,13 @@ def imitate(
     - `episodes`: episodes in each round, 8 by default.
     - `steps`: steps of the optimiser in each round, 300 by default.
     - `horizon`: steps per episode; the `horizon` of the environment by default.
-    - `optimiser`: an Optax optimiser, which starts anew in each round; by default Adam
-        with a cosine decay from 0.003.
+    - `optimiser`: an Optax optimiser, whose state is reset in each round; by default
+        Adam with a cosine decay from 0.003.
     - `batch_size`: states in a batch, 256 by default.
     - `trainable`, `progress`, `throw`: as in [`delucax.training.fit`][].
 
-    **Returns:** a [`delucax.training.Fitted`][]. Its history has the steps of all
-    rounds, one round after the other.
+    **Returns:** a [`delucax.training.Fitted`][]. The `history` of the result has the
+    steps of all rounds, one round after the other.
 
     **Raises:** `ValueError` if an argument has the wrong type, the policy has a memory,
     or no control of the expert is finite. `RuntimeError` if training diverges, unless

@@ -50,20 +50,21 @@ class PPO(AbstractActorCriticLoss):
     critic, $\hat V$ its target and $b$ its `scale`. $H$ is the entropy of the policy.
     PPO does not differentiate the plant.
 
-    Train it like any loss, with any optimiser. The model is a
+    Train with this loss like with any other loss, with any optimiser. The model is a
     [`delucax.training.ActorCritic`][] with a stochastic policy. The trained controller
     is `fitted.model.policy`, or `fitted.model.policy.base` without the noise.
 
-    At the horizon an episode is truncated: the critic estimates the remaining cost.
-    After termination only the final cost follows. A policy with a memory is trained on
-    whole episodes, through its memory; a policy without one on single steps in random
-    order. The previous batches set the scale of the critic and each
-    [`delucax.controllers.Standardise`][] of the model. These stay fixed during a batch,
-    so that $\rho$ starts at 1. One more batch runs before the first step to set them.
+    At the horizon an episode is truncated: the critic estimates the remaining cost. If
+    an episode terminates, only the final cost follows. A policy with a memory is
+    trained on whole episodes, with gradients through its memory. A policy without a
+    memory is trained on single steps in random order. The previous batches set the
+    scale of the critic and each [`delucax.controllers.Standardise`][] of the model. The
+    scales stay fixed during a batch, so that $\rho$ starts at 1. An additional batch
+    before the first step sets the first scales.
 
     In total, `fit` takes `batch * horizon * (1 + steps / (epochs * minibatches))` steps
     of the environment. Metrics: `total_cost` of the last batch, `entropy`, `kl`,
-    `clipped` (the share of ratios outside the clip range) and `value_loss`.
+    `clipped` (the fraction of ratios outside the clip range) and `value_loss`.
 
     **Arguments:**
 
@@ -75,15 +76,15 @@ class PPO(AbstractActorCriticLoss):
     - `clip`: $\epsilon$, 0.2 by default.
     - `epochs`: passes over a batch, 4 by default.
     - `minibatches`: minibatches in a pass, 8 by default. Rows that do not fill the last
-        one are skipped.
+        minibatch are skipped.
     - `value_weight`: $a$, 0.5 by default.
     - `entropy_weight`: $h$, 0 by default.
     - `bootstrap`: whether the critic estimates the cost after the horizon; true by
         default. If false, the horizon terminates the episode, with the final cost.
 
-    **Raises:** `ValueError` if an argument has the wrong type or range. In training, if
-    the model is not an `ActorCritic`, its policy is not stochastic, or a Gaussian
-    policy lacks the bounds of the environment.
+    **Raises:** `ValueError` if an argument has the wrong type or range. A `ValueError`
+    is also raised in training, if the model is not an `ActorCritic`, its policy is not
+    stochastic, or a Gaussian policy lacks the bounds of the environment.
 
     Source: Schulman, Wolski, Dhariwal, Radford and Klimov, 2017; Schulman, Moritz,
     Levine, Jordan and Abbeel, 2016 (the advantage estimate); Pardo, Tavakoli, Levdik

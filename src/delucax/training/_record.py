@@ -26,15 +26,18 @@ _FORMAT = "delucax.training.fit 2"
 class History(eqx.Module):
     """The history of a training run: NumPy arrays with an entry for each step.
 
-    `history["name"]` is a column or a metric, and `len(history)` the number of steps.
+    `history["name"]` is the column or metric with this name, and `len(history)` is the
+    number of steps.
 
     **Attributes:**
 
     - `step`: the number of the step, from 0. Its key was
         `jax.random.fold_in(key, step)`.
     - `loss`: the loss before the update.
-    - `gradient_norm`: the Euclidean norm of the gradient, in unconstrained values.
-    - `seconds`: the time since training began, at the end of the block of the step.
+    - `gradient_norm`: the Euclidean norm of the gradient with respect to the
+        unconstrained values.
+    - `seconds`: the time from the beginning of training to the end of the block that
+        contains the step [s].
     - `metrics`: a dictionary of the metrics that the loss returned.
 
     !!! example

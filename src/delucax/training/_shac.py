@@ -32,25 +32,27 @@ class SHAC(AbstractActorCriticLoss):
 
     $$\frac{1}{m\, b} \Bigl(\sum_{i=0}^{m-1} \gamma^i c_i + \gamma^m V(y_m)\Bigr)$$
 
-    It is differentiated through the plant, the controls and $V$, but not into the
+    The loss is differentiated through the plant, the controls and $V$, but not into the
     previous window. So the gradient cannot explode over more than a window, and $V$
-    estimates the rest. The loss of the critic is the mean over all steps of
-    $(V_\phi - \hat V)^2 / b^2$. Here $V_\phi$ is the critic, $b$ its `scale`, and
-    $\hat V$ its target, the return of TD($\lambda$). $V$ in the loss of the policy and
-    in the targets is a target network. Its weights $\phi'$ follow the weights $\phi$ of
-    the critic at each step: $\phi' \leftarrow \phi' + r\, (\phi - \phi')$.
+    estimates the cost after the window. The loss of the critic is the mean over all
+    steps of $(V_\phi - \hat V)^2 / b^2$. Here $V_\phi$ is the critic, $b$ its `scale`,
+    and $\hat V$ its target, the return of TD($\lambda$). $V$ in the loss of the policy
+    and in the targets is a target network. The weights $\phi'$ of the target network
+    follow the weights $\phi$ of the critic at each step:
+    $\phi' \leftarrow \phi' + r\, (\phi - \phi')$.
 
     Train it like any loss. One gradient per step trains both networks. The model is a
     [`delucax.training.ActorCritic`][], whose policy may be stochastic or not. The
     trained controller is `fitted.model.policy`. Each step of `fit` takes
-    `batch * horizon` steps of the environment. Every `refresh`-th step takes as many
-    again, to set the scale of the critic and each [`delucax.controllers.Standardise`][]
-    of the model. Metrics: `total_cost` and `value_loss`.
+    `batch * horizon` steps of the environment. Every `refresh`-th step takes another
+    `batch * horizon` steps, to set the scale of the critic and each
+    [`delucax.controllers.Standardise`][] of the model. Metrics: `total_cost` and
+    `value_loss`.
 
-    The horizon, termination and `bootstrap` are as in [`delucax.training.PPO`][].
-    Unlike in the paper, a step uses all windows of whole episodes, not the next window
-    of episodes that an older policy began. So time, disturbances and the memory of the
-    policy are consistent within an episode.
+    The end of an episode and `bootstrap` are handled as in [`delucax.training.PPO`][].
+    Unlike in the paper, each step of training uses all windows of new, whole episodes,
+    not the next window of episodes that an older policy began. So time, disturbances
+    and the memory of the policy are consistent within an episode.
 
     **Arguments:**
 
@@ -61,15 +63,15 @@ class SHAC(AbstractActorCriticLoss):
         be shorter.
     - `discount`: $\gamma$, the discount factor of the cost to go, 0.99 by default.
     - `decay`: $\lambda$ of the targets, 0.95 by default.
-    - `rate`: $r$, the rate of the target network, 0.2 by default. With 1 the target
-        network equals the critic.
+    - `rate`: $r$, the rate of the target network, 0.2 by default. With a rate of 1, the
+        target network equals the critic.
     - `value_weight`: the weight of the critic's loss, 1 by default.
     - `refresh`: steps between two updates of the scales, 10 by default.
     - `bootstrap`: whether the critic estimates the cost after the horizon; true by
         default. If false, the horizon terminates the episode, with the final cost.
 
-    **Raises:** `ValueError` if an argument has the wrong type or range. In training, if
-    the model is not an `ActorCritic`.
+    **Raises:** `ValueError` if an argument has the wrong type or range. A `ValueError`
+    is also raised in training, if the model is not an `ActorCritic`.
 
     Source: Xu, Makoviychuk, Narang, Ramos, Matusik, Garg and Macklin, 2022.
 

@@ -50,14 +50,14 @@ class State(NamedTuple):
 class AbstractSurrogate(eqx.Module):
     """A surrogate loss: a loss with a memory, for [`delucax.training.fit`][].
 
-    `fit` calls `init` once. At each step it calls `update`, which may run the model,
-    and takes the gradient of the loss `surrogate(model, memory, key)` with any
-    estimator. At the end it calls `finished`. [`delucax.training.PPO`][] and
-    [`delucax.training.SHAC`][] are such losses.
+    `fit` calls `init` once. At each step, `fit` calls `update`, which may run the
+    model. Then `fit` takes the gradient of the loss `surrogate(model, memory, key)`
+    with any gradient estimator. At the end it calls `finished`.
+    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] are such losses.
 
-    Subclass it and write `init`, `update` and `__call__`. All must be pure functions.
-    Then training runs in the same compiled loop as with other losses, over several
-    seeds, and resumes from a checkpoint.
+    To write a surrogate loss, subclass this class and write `init`, `update` and
+    `__call__`. All must be pure functions. Then training runs in the same compiled loop
+    as with other losses, also for several seeds, and can resume from a checkpoint.
 
     !!! example
 
@@ -108,7 +108,7 @@ class AbstractSurrogate(eqx.Module):
         **Arguments:**
 
         - `model`: the model before the step.
-        - `memory`: the memory of the previous step.
+        - `memory`: the memory that the previous step returned.
         - `step`: the number of the step, from 0.
         - `key`: a random key.
 
@@ -129,8 +129,7 @@ class AbstractSurrogate(eqx.Module):
         """
 
     def finished(self, model: PyTree, memory: PyTree) -> PyTree:
-        """The model that `fit` returns. Override it to put values of the memory into
-        the model, such as statistics. By default the model is returned as it is.
+        """The model that `fit` returns.
 
         **Arguments:** `model`: the model. `memory`: the memory of the last step.
 

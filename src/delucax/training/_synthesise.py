@@ -45,13 +45,14 @@ class Synthesis(NamedTuple):
     - `structure`: its structure: `"zero"`, `"LQR"`, `"network"`, `"memory"` (a
         recurrent network), `"LQR + network"` or `"LQR + memory"`.
     - `costs`: a dictionary of the total costs of `"policy"`, `"zero"`, `"LQR"`, `"MPC"`
-        and `"plan"`, with an entry for each episode. All run the same episodes, which
-        were used for nothing else. Controllers that do not apply, or for which the
-        budget left no time, are missing.
+        and `"plan"`, with an entry for each episode. All controllers run the same
+        episodes, which were not used for training or for the choice of the policy. A
+        controller is missing if it does not exist for the environment or if the budget
+        left no time for it.
     - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings.
     - `seconds`: the time it took.
-    - `plants`: for a family of plants, a dictionary from each path of `ranges` to its
-        value in each of these episodes; else empty.
+    - `plants`: for a family of plants, a dictionary from each path of `ranges` to the
+        value of this parameter in each episode of the comparison; otherwise empty.
 
     !!! example
 
@@ -82,7 +83,8 @@ class Synthesis(NamedTuple):
         """A table with a row for each controller in the comparison.
 
         **Returns:** a `pandas.DataFrame` with the mean, median and worst cost. For a
-        family of plants, also the parameters in the median and in the worst episode.
+        family of plants, the table also has the parameters of the median and of the
+        worst episode.
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
@@ -116,25 +118,28 @@ def synthesise(
     The search tries several structures and training methods, refines the best of them,
     and compares the result with known controllers:
 
-    1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][] if it
-        exists.
+    1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][] if
+        this LQR exists.
     2. Trials. The structures are a network that corrects the LQR
         ([`delucax.controllers.Residual`][]) and a network alone. With `ranges`, the
-        first is recurrent, so that it can identify the plant from past observations. If
-        the state is not observed, a recurrent network alone is tried. There are three
-        kinds of training. The first is the gradient of a rollout of at most 200 steps
-        ([`delucax.training.ClippedSamples`][]). The second is the same gradient, damped
-        with a time constant of a quarter, a tenth or a thirtieth of the rollout. The
-        third is [`delucax.training.evolve`][], which needs no gradient. If neither the
-        first two trials nor a plan is better than the LQR, the search returns the LQR.
-    3. Refinement. The best third of the trials goes on for three times as long, until
-        one is left. The search trains it with the methods that still gain, and then at
-        a tenth of the learning rate. When no method gains, it tries to imitate MPC
+        network that corrects the LQR is recurrent, so that it can identify the plant
+        from past observations. If the state is not observed, a recurrent network alone
+        is tried. There are three training methods. The first method is the gradient of
+        a rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]). The
+        second method is the same gradient, damped with a time constant of a quarter, a
+        tenth or a thirtieth of the rollout. The third method is
+        [`delucax.training.evolve`][], which needs no gradient. If neither the first two
+        trials nor a plan is better than the LQR, the search returns the LQR.
+    3. Refinement. The best third of the trials is trained for three times as long, and
+        this is repeated until one policy is left. The search trains this policy with
+        the methods that still lower its cost, and then at a tenth of the learning rate.
+        When no method lowers the cost any more, the search tries to imitate MPC
         ([`delucax.training.imitate`][]), if MPC costs less.
     4. Choice. The candidates are the four best policies and the baselines. The
         criterion is the mean cost over up to 512 initial states that were not used for
-        training. In this mean, costs above 20 times the usual cost grow like their
-        logarithm only. If a baseline is as good to half a percent, it is returned.
+        training. In this mean, a cost above 20 times the usual cost grows only
+        logarithmically. If the cost of a baseline is at most half a percent higher than
+        the best, the search returns the baseline.
 
     An interrupt (`KeyboardInterrupt`) ends the training, and the best policy so far is
     returned.
@@ -144,11 +149,12 @@ def synthesise(
     - `environment`: the environment. Its dynamics and cost must be differentiable. If a
         control has no bounds, the range of a network is plus and minus two standard
         deviations of the LQR's control, or -2 to 2 if there is no LQR. If the control
-        has one bound, the range is as wide and begins at the bound.
+        has one bound, the range has the same width and begins at the bound.
     - `key`: a random key.
-    - `budget`: the time for everything, with compilation, in seconds; 75 by default, at
-        least 5. A training or comparison that has begun is finished. The trials depend
-        on the speed of the machine, and so does the result.
+    - `budget`: the time for everything, including compilation, in seconds; 75 by
+        default, at least 5. The search finishes a training or comparison that has
+        already begun. The number of trials depends on the speed of the machine, so the
+        result depends on the machine too.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
         works on a family of plants: each episode draws a plant. The LQR is designed for
         the nominal plant; MPC and the plan know each plant. None by default.

@@ -43,12 +43,12 @@ class Bootstrap(NamedTuple):
     **Attributes:**
 
     - `names`: the names of the p parameters.
-    - `estimates`: the estimates of each draw, shape `(draws, p)`; NaN if its fit
-        failed.
+    - `estimates`: the estimates of each draw, shape `(draws, p)`; NaN if the fit of a
+        draw failed.
     - `std`: the standard deviations of the estimates, shape `(p,)`.
     - `low`, `high`: the ends of the confidence intervals, shape `(p,)`.
-    - `failures`: the number of fits that failed. They do not count in `std`, `low` and
-        `high`.
+    - `failures`: the number of fits that failed. Failed fits are left out of `std`,
+        `low` and `high`.
 
     !!! example
 
@@ -99,9 +99,10 @@ def bootstrap(
 ) -> Bootstrap:
     """Confidence intervals of physical parameters by a bootstrap of the residuals.
 
-    Each draw makes a new record: it adds residuals, drawn at random from those of the
-    fit, to the outputs of the fitted model. The parameters are then fitted to this
-    record, starting at `fitted`. The spread of these estimates gives the intervals.
+    Each draw makes a new record: it adds residuals, drawn at random from the residuals
+    of the fit, to the outputs of the fitted model. The parameters are then fitted to
+    the new record, starting at `fitted`. The spread of the estimates over all draws
+    gives the intervals.
 
     The intervals of [`delucax.training.sysid.physical`][] assume white normal noise and
     a model that is nearly linear in the parameters across the interval. The bootstrap
@@ -112,24 +113,24 @@ def bootstrap(
     **Arguments:**
 
     - `fitted`: the result of [`delucax.training.sysid.physical`][].
-    - `record`: the data of that fit, a [`delucax.training.sysid.Record`][] or a list of
-        them.
+    - `record`: the data to which the parameters were fitted, a
+        [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters of the fit, in the form that `physical` takes; by
-        default the names in `fitted`. Give them again if they were a dictionary with
-        constraints.
+        default the names in `fitted`. If you gave `physical` a dictionary with
+        constraints, give it here again.
     - `draws`: the number of draws, at least 2; 100 by default.
     - `block`: the number of neighbouring residuals that are drawn together, 1 by
-        default. Take several times the number of samples over which the noise is
-        correlated.
-    - `window`: the window of each fit in steps; by default that of `fitted`.
+        default. A good choice is several times the number of samples over which the
+        noise is correlated.
+    - `window`: the window of each fit in steps; by default the window of `fitted`.
     - `level`: the confidence level, 0.95 by default.
     - `max_steps`: the maximum number of iterations of each fit, 20 by default.
     - `key`: a random key.
 
     **Returns:** a [`delucax.training.sysid.Bootstrap`][].
 
-    **Raises:** `ValueError` on arguments of the wrong kind, if `fitted` does not come
-    from `physical`, or if `block` is longer than the shortest record.
+    **Raises:** `ValueError` on arguments of the wrong kind, if `fitted` is not a result
+    of `physical`, or if `block` is longer than the shortest record.
 
     Source: Efron and Tibshirani, 1993; Künsch, 1989 (blocks).
 

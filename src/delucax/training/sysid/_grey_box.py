@@ -51,13 +51,15 @@ class GreyBox(NamedTuple):
         [`delucax.training.sysid.Identified`][].
     - `errors`: a dictionary from each `spread` that was tried to the relative
         root-mean-square error of a free run over the last part of the records. The
-        entry of 0 is the physics alone.
+        entry for the spread 0 is the error of the physics alone.
     - `spread`: the spread that was chosen; 0 for the physics alone.
     - `result`: success, or the reason why the last fit ended before it had converged.
-        The model is then the best so far: raise `max_steps`.
+        If it had not converged, the model is the best one so far: try a larger
+        `max_steps`.
 
-    The intervals in `physics` are those of the physics alone. The parameters in `model`
-    were estimated together with the network, and have no intervals.
+    The confidence intervals in `physics` belong to the fit of the physics alone. The
+    parameters in `model` were estimated together with the network, and have no
+    intervals.
 
     !!! example
 
@@ -103,18 +105,18 @@ def grey_box(
     + \left|\frac{\phi - \phi_0}{s}\right|^2, \qquad
     \dot x = f(t, x, u; \theta) + \mathrm{size} \cdot \mathrm{network}(x, u; \phi)$$
 
-    Here $z$ are the states at which the windows begin. The fit has three stages:
+    Here $z$ contains the states at which the windows begin. The fit has three stages:
 
     1. [`delucax.training.sysid.physical`][] fits the physics alone, and estimates the
        noise.
     2. The physics and the network are fitted together to the first part of each record,
-       once for each of `spreads`, by the Levenberg-Marquardt method. The last layer of
-       the network starts at zero. The weights have a normal prior, with standard
-       deviation $s$: 1 about the random initial weights in the inner layers, and the
-       spread about zero in the last layer.
-    3. The spread with the least error in a free run over the last part of the records
-       is chosen, and the model is fitted once more to the whole records. If no network
-       reduces this error by 1%, the physics alone is returned.
+        once for each of `spreads`, by the Levenberg-Marquardt method. The last layer of
+        the network starts at zero. The weights have a normal prior, with standard
+        deviation $s$: in the inner layers, the mean is the random initial weights and
+        $s = 1$; in the last layer, the mean is zero and $s$ is the spread.
+    3. The spread with the smallest error in a free run over the last part of the
+        records is chosen, and the model is fitted once more to the whole records. If no
+        network reduces this error by 1%, the physics alone is returned.
 
     **Arguments:**
 
@@ -126,15 +128,15 @@ def grey_box(
         network, 8 and 1 by default.
     - `corrected`: the names of the states whose derivatives the network corrects; all
         by default. Leave out derivatives that are known exactly, such as the derivative
-        of a position. The size of each correction is the standard deviation of the
-        derivative along the record.
+        of a position. The size of each correction is by default the standard deviation
+        of the derivative along the record.
     - `spreads`: the spreads to try; 0.01, 0.03, 0.1 and 0.3 by default.
     - `x0`, `window`: as in `physical`; a `window` of `None` takes each record as one
         window.
-    - `share`: the share of each record that is used to fit while the spread is chosen,
-        between 0 and 1; 0.75 by default.
+    - `share`: the fraction of each record to which the model is fitted while the spread
+        is chosen, between 0 and 1; 0.75 by default.
     - `max_steps`: the maximum number of iterations of each fit, 50 by default. The fit
-        of the physics alone gets at least 100.
+        of the physics alone may take at least 100 iterations.
     - `key`: a random key for the initial weights.
 
     **Returns:** a [`delucax.training.sysid.GreyBox`][].

@@ -36,9 +36,10 @@ class Identified(eqx.Module):
     vectors of the sensitivity of the data to such changes. The spread of a direction is
     the standard deviation of the estimate along it. A direction is not identifiable if
     the data do not depend on it, or if its spread is as large as the parameters
-    themselves: they can then move along it together, and the data hardly change. A
-    parameter without a constraint may be zero, so its size does not count for this; if
-    it is near zero, its change is in units of a hundred standard deviations.
+    themselves. In such a direction, the parameters can change together without a clear
+    effect on the data. A parameter without a constraint may be zero, so its size is not
+    used for this test. If its estimate is near zero, its change is measured in units of
+    a hundred standard deviations.
 
     Printing the object prints the table of `report`.
 
@@ -48,11 +49,11 @@ class Identified(eqx.Module):
     - `names`: the names of the p parameters.
     - `estimate`: the values of the parameters, shape `(p,)`; `(outputs, p)` in a linear
         fit.
-    - `std`: their standard deviations, same shape. Infinite if a parameter is not
-        identifiable, NaN if the fit did not converge.
-    - `low`, `high`: the ends of their confidence intervals, same shape. If a parameter
-        is not identifiable, they span all valid values, for example 0 to infinity. NaN
-        if the fit did not converge.
+    - `std`: the standard deviations of the estimates, same shape. Infinite if a
+        parameter is not identifiable, NaN if the fit did not converge.
+    - `low`, `high`: the ends of the confidence intervals of the parameters, same shape.
+        If a parameter is not identifiable, its interval spans all valid values, for
+        example 0 to infinity. NaN if the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
     - `spread`: the standard deviation along each direction, shape `(p,)`; NaN if the
         fit did not converge.
@@ -60,16 +61,18 @@ class Identified(eqx.Module):
         fit did not converge.
     - `noise`: the standard deviation of the residuals of each output.
     - `correlation`: a test of whether the residuals are white: $\sqrt N\, r$, where $r$
-        is their correlation coefficient at lag one over $N$ samples, for the output
-        where it is largest. In white noise it is approximately standard normal. Above
-        4, the model is wrong or the noise is correlated. In both cases the intervals
-        are too narrow, and the report says so. It is 0 if the residuals are rounding
-        errors, or less than half of the `noise` that was given; `None` in linear fits.
+        is the correlation coefficient of the residuals at lag one over $N$ samples, for
+        the output with the largest $r$. For white residuals, this number is
+        approximately standard normal. Above 4, the model is wrong or the noise is
+        correlated. In both cases the confidence intervals are too narrow, and the
+        report says so. The number is 0 if the residuals are rounding errors, or less
+        than half of the `noise` that was given; `None` in linear fits.
     - `x0`: the estimated first state, shape `(n,)`, or `(runs, n)` for a list of
-        records; `None` in linear fits, which do not estimate it.
-    - `window`, `burn_in`: those of the fit, in steps; `None` and 0 in linear fits.
+        records; `None` in linear fits, which do not estimate the first state.
+    - `window`, `burn_in`: the options of the fit, in steps; `None` and 0 in linear
+        fits.
     - `result`: success; `RESULTS.unexciting` if a direction is not identifiable; or the
-        failure of the solver.
+        reason why the solver failed.
 
     Source: Ljung, 1999 (section 16.6: the whiteness of residuals).
 
@@ -125,11 +128,11 @@ class Identified(eqx.Module):
     def report(self) -> str:
         """A table of the parameters with their intervals.
 
-        It also names the directions that are not identifiable, and warns if the
+        The report also names the directions that are not identifiable, and warns if the
         residuals are correlated.
 
-        **Returns:** a string of several lines. If the fit did not converge, it says
-        why, and gives no intervals.
+        **Returns:** a string of several lines. If the fit did not converge, the report
+        says why, and gives no intervals.
         """
         lines = [f"{'parameter':<24}{'estimate':>12}{'low':>12}{'high':>12}"]
         for *output, index in np.ndindex(self.estimate.shape):

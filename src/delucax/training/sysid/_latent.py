@@ -47,7 +47,7 @@ class LatentDynamics(AbstractDynamics):
     - `key`: a random key for the initial weights.
 
     **Attributes:** `transition` and `output`, the networks $f$ and $h$, each an
-        `eqx.nn.MLP`. They are trainable, like `A`, `B` and `C`.
+    `eqx.nn.MLP`. The networks are trainable, like `A`, `B` and `C`.
 
     **Raises:** `ValueError` if a shape is wrong, or a size is not positive.
 
@@ -142,8 +142,8 @@ class Encoder(eqx.Module):
 
     **Arguments:**
 
-    - `matrix`: $E$, shape `(n, past (p + m))`. Its columns belong to all outputs,
-        earliest first, and then to all controls.
+    - `matrix`: $E$, shape `(n, past (p + m))`. The first columns belong to all past
+        outputs, earliest first, and the other columns to all past controls.
     - `past`: the number of samples.
     - `outputs`: the number of outputs, p.
     - `width`, `depth`: units in each hidden layer and number of hidden layers, 16 and 1

@@ -37,14 +37,15 @@ def linear(
 
     - `record`: a [`delucax.training.sysid.Record`][] whose outputs are the states, or a
         list of them; uniform in time.
-    - `affine`: whether to estimate the constant $c$; false by default, for $c = 0$.
+    - `affine`: whether to estimate the constant $c$; false by default, which means
+        $c = 0$.
     - `level`: the confidence level of the intervals, 0.95 by default.
     - `throw`: raise an error if the data do not determine all entries; true by default.
         If false, check `result`.
 
     **Returns:** [`delucax.training.sysid.Identified`][]. Its `model` is a
-    [`delucax.LinearDynamics`][]. Row i of its `estimate` holds the entries of $A$, $B$
-    and $c$ for state i.
+    [`delucax.LinearDynamics`][]. Row i of `estimate` holds the entries of $A$, $B$ and
+    $c$ for state i.
 
     **Raises:** `ValueError` if `record` is not a uniform record or a list of them; with
     `throw`, an error at run time if the data do not determine all entries.
@@ -100,8 +101,9 @@ def arx(
     $$y_k = \sum_{i=1}^{a} A_i y_{k-i} + \sum_{j=0}^{b-1} B_j u_{k-\mathrm{delay}-j}
     + e_k$$
 
-    The model is returned as linear dynamics. Their state at step k holds the past,
-    `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`, and they observe $y_k$.
+    The model is returned as linear dynamics. The state of these dynamics at step k
+    holds the past, `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`, and the
+    observation is $y_k$.
 
     **Arguments:**
 
@@ -115,7 +117,7 @@ def arx(
         If false, check `result`.
 
     **Returns:** [`delucax.training.sysid.Identified`][]. Its `model` is a
-    [`delucax.LinearDynamics`][]. Row i of its `estimate` holds the entries of
+    [`delucax.LinearDynamics`][]. Row i of `estimate` holds the entries of
     $A_1, \dots, A_a, B_0, \dots, B_{b-1}$ for output i.
 
     **Raises:** `ValueError` if `record` is not a uniform record or a list of them, a

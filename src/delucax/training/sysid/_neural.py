@@ -189,9 +189,9 @@ class PredictionError(eqx.Module):
 
     The sums run over the $N$ windows of a batch and their $K$ steps. The prediction
     $\hat x_{i,k}$ is a simulation of the model with the recorded controls, from the
-    first state of window $i$. Windows of one step fit one-step predictions; longer
-    windows also penalise errors that accumulate. Angles are compared by
-    `model.difference`.
+    first state of window $i$. With windows of one step, the loss measures one-step
+    predictions. Longer windows also penalise errors that accumulate. Angles are
+    compared by `model.difference`.
 
     **Arguments:** `scale`: the size of each state, a number or shape `(n,)`; 1 by
     default.

@@ -61,59 +61,64 @@ def physical(
     \right|^2$$
 
     The record is cut into short windows. Within window $j$, the states $x_k$ are
-    simulated with the recorded controls, from the state $z_j$ at its beginning. These
-    states are estimated together with the parameters, so that measurement noise does
-    not bias the estimate. Short windows keep a simulation with wrong parameters from
-    drifting far from the record. Unlike in the original method, nothing ties the end of
-    a window to the beginning of the next, so each window costs the information of one
-    state. If some states are not measured, `window=None` is often several times as
-    precise; a fit on short windows gives it a good first guess.
+    simulated with the recorded controls, from the state $z_j$ at the beginning of the
+    window. The states $z_j$ are estimated together with the parameters, so that
+    measurement noise does not bias the estimate. Short windows keep a simulation with
+    wrong parameters from drifting far from the record. Unlike in the original method,
+    the end of a window need not match the beginning of the next window, so each window
+    adds one unknown state. If some states are not measured, a fit with `window=None` is
+    often several times as precise. A fit on short windows gives a good first guess for
+    it.
 
     The method is Levenberg-Marquardt. Its steps are scaled by the sensitivities of the
     data, so that parameters of very different size can be estimated together.
     Constrained parameters are estimated in the unconstrained space, as in
-    [`delucax.training.fit`][], so their intervals stay within the valid set.
+    [`delucax.training.fit`][], so their confidence intervals satisfy the constraints.
 
     The fit has converged if no step of the linearised problem is longer than a
-    twentieth of the standard deviation that the noise causes. If it has not, or if its
-    residuals are correlated from step to step, a second attempt starts from fits on
-    shorter windows: of two steps if the state is measured, otherwise of eight steps and
-    then of a length in between. If that does not help either, `result` says so, and
-    there are no intervals. Then try a better first guess, a shorter window, or smaller
-    steps of the integrator.
+    twentieth of the standard deviation that the noise causes. If the fit has not
+    converged, or if its residuals are correlated from step to step, a second attempt
+    starts from fits on shorter windows. These windows have two steps if the state is
+    measured. Otherwise they have eight steps at first, and then a length between eight
+    and `window`. If the second attempt does not converge either, `result` gives the
+    reason, and the result has no intervals. In this case try a better first guess, a
+    shorter window, or smaller steps of the integrator.
 
     **Arguments:**
 
     - `dynamics`: the dynamics; their parameters are the first guess. If the dynamics
         and the record have different steps, or if the controls are interpolated, the
-        dynamics must be a [`delucax.Discretized`][] system without events. Its step,
-        with the same solver and substeps, is then stretched to each step of the record.
+        dynamics must be a [`delucax.Discretized`][] system without events. The step of
+        the dynamics, with the same solver and substeps, is then stretched to the length
+        of each step of the record.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
         of paths, or a dictionary from path to constraint, as `trainable` of
         [`delucax.training.fit`][].
-    - `x0`: a guess of the first state, shape `(n,)`, or one for each record. A
-        simulation from it gives the first guess of the states at which the windows
-        begin. By default these are the measurements, which must then be the state.
+    - `x0`: a guess of the first state, shape `(n,)`, or one guess for each record. A
+        simulation from `x0` gives the first guess of the states at which the windows
+        begin. By default the first guess consists of the measurements, which must then
+        be the state.
     - `window`: the number of steps of a window, 20 by default. `None` takes each record
         as one window, which is the output-error method.
-    - `burn_in`: the number of samples at the beginning of each window that do not
-        count, 0 by default. If it is positive, the states at which the windows begin
-        are not estimated, but keep their guesses.
+    - `burn_in`: the number of samples at the beginning of each window that are left out
+        of the errors, 0 by default. If `burn_in` is positive, the states at which the
+        windows begin are not estimated, but keep their guesses.
     - `noise`: the standard deviation of the noise of each output, a number or shape
-        `(p,)`; by default it is estimated from the residuals of a first fit.
+        `(p,)`; by default the noise is estimated from the residuals of a first fit.
     - `level`: the confidence level of the intervals, 0.95 by default.
     - `max_steps`: the maximum number of iterations, 100 by default.
     - `throw`: raise an error if the fit does not converge or some parameters are not
         identifiable; true by default. If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Identified`][]. Its `model` is the dynamics
-    with the estimated parameters. Its `x0` is the estimated first state of the record,
-    or of each record.
+    **Returns:** [`delucax.training.sysid.Identified`][]. `model` is the dynamics with
+    the estimated parameters, and `x0` is the estimated first state of the record, or of
+    each record.
 
-    **Raises:** `ValueError` on arguments of the wrong shape or kind, or if there is no
-    such parameter; if `throw`, also if the record has fewer measurements than unknowns,
-    and `RuntimeError` if the fit fails (under a transformation, an error at run time).
+    **Raises:** `ValueError` on arguments of the wrong shape or kind, or if one of
+    `parameters` does not exist; if `throw`, also if the record has fewer measurements
+    than unknowns, and `RuntimeError` if the fit fails (under a transformation, an error
+    at run time).
 
     Source: Bock, 1983 (multiple shooting); Moré, 1978 (scaling); Ljung, 1999.
 

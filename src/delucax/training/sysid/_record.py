@@ -39,12 +39,12 @@ class Record(eqx.Module):
     **Arguments:**
 
     - `outputs`: shape `(N, p)`, or `(N,)` for one output.
-    - `controls`: shape `(N, m)`, or `(N,)` for one control. If `hold` is `"zero"`, they
-        may have one row less, as in a simulation.
+    - `controls`: shape `(N, m)`, or `(N,)` for one control. If `hold` is `"zero"`, the
+        controls may have one row less than the outputs, as in a simulation.
     - `dt`: the time between two samples, for uniform samples; or
     - `times`: the times of the samples, shape `(N,)`, increasing. Steps may differ.
     - `allow_gaps`: accept gaps in `times`; false by default. A gap is a step that is
-        longer than five times nine tenths of the others.
+        more than five times as long as nine tenths of all steps.
     - `hold`: the control between two samples, `"zero"` by default:
         - `"zero"`: the control of the sample before, as a digital controller holds it;
         - `"linear"`: the straight line between the two samples;
@@ -53,7 +53,7 @@ class Record(eqx.Module):
 
     **Raises:** `ValueError` if an array has the wrong shape, a sample is not finite,
     the times do not increase or have a gap, or an output or one of several controls
-    never changes. The message names the row and the column.
+    never changes. The error message names the row and the column.
 
     !!! example
 
@@ -149,7 +149,7 @@ class Record(eqx.Module):
 
     @property
     def dt(self) -> Float[Array, ""]:
-        """The time between samples; its mean if the samples are not uniform."""
+        """The time between samples; the mean time if the samples are not uniform."""
         # On the host if possible, which compiles nothing.
         mean = np.mean if is_concrete(self.steps) else jnp.mean
         return jnp.asarray(mean(self.steps), self.steps.dtype)
@@ -157,7 +157,7 @@ class Record(eqx.Module):
     def split(self, share: float = 0.5) -> tuple["Record", "Record"]:
         """Split the record in two, for estimation and validation.
 
-        **Arguments:** `share`: the share of the samples in the first part, 0.5 by
+        **Arguments:** `share`: the fraction of the samples in the first part, 0.5 by
         default.
 
         **Returns:** two records.

@@ -41,8 +41,9 @@ class StateSpace(NamedTuple):
     - `error`: the root-mean-square error of each output in a free run over the
         validation part, shape `(p,)`.
     - `start_error`: the same error before training.
-    - `history`: the record of the training, a [`delucax.training.History`][]. Its
-        metric `"validation"` is the error relative to the spread of the outputs.
+    - `history`: the record of the training, a [`delucax.training.History`][]. The
+        metric `"validation"` in it is the validation error divided by the spread of the
+        outputs.
     - `result`: success, or `RESULTS.diverged` if the training ended early or no free
         run was finite.
 
@@ -96,34 +97,36 @@ def state_space(
 
     The networks $f$ and $h$, the matrices and the encoder are trained together. The
     loss is the mean squared error of predictions over windows of `horizon` steps, which
-    begin anywhere in the records, at a state from the encoder. Each step of Adam draws
-    new windows, and the learning rate decays as a cosine. Training starts at the linear
-    model of [`delucax.training.sysid.subspace`][] with $f = h = 0$, or at random
-    weights if the data do not give such a model.
+    begin anywhere in the records. The encoder gives the state at the beginning of a
+    window. Each step of Adam draws new windows, and the learning rate decays as a
+    cosine. Training starts with the linear model of
+    [`delucax.training.sysid.subspace`][] with $f = h = 0$, or at random weights if the
+    data do not give such a model.
 
-    The last part of each record is kept for validation. From time to time, a free run
-    over this part is simulated, from a state of the encoder. The weights with the least
-    error in these free runs are returned.
+    The last part of each record is kept for validation. Every `validate_every` steps, a
+    free run over this part is simulated, from a state that the encoder gives.
+    `state_space` returns the weights with the smallest error in these free runs.
 
     The state has no unit, and another training gives another state; `model.observe`
     gives the outputs. As in `subspace`, a control affects the outputs from the next
-    sample on. The plant must be stable, because errors in a free run of an unstable
-    plant grow whatever the model.
+    sample on. The plant must be stable, because the errors in a free run of an unstable
+    plant grow even for a good model.
 
     **Arguments:**
 
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
         time.
     - `states`: n, the number of states.
-    - `past`: the number of samples that the encoder takes; a few times n.
-    - `horizon`: the number of steps of a window, 50 by default. Take about the time
-        after which the plant has forgotten its state.
+    - `past`: the number of past samples that the encoder uses; a few times n is a good
+        choice.
+    - `horizon`: the number of steps of a window, 50 by default. A good choice is the
+        number of steps after which the plant has forgotten its state.
     - `width`, `depth`: units in each hidden layer and number of hidden layers of each
         network, 16 and 1 by default.
     - `steps`: the number of training steps, 2000 by default.
     - `batch_size`: the number of windows in a training step, 64 by default.
     - `learning_rate`: the initial learning rate, 0.01 by default.
-    - `validation`: the share of each record that is kept for validation, 0.2 by
+    - `validation`: the fraction of each record that is kept for validation, 0.2 by
         default.
     - `validate_every`: the number of training steps between two free runs, 100 by
         default.

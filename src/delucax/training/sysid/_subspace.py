@@ -28,14 +28,15 @@ class Subspace(eqx.Module):
     - `model`: a [`delucax.LinearDynamics`][], $x_{k+1} = A x_k + B u_k$, $y_k = C x_k$;
         about an operating point if the fit was affine.
     - `singular_values`: shape `(horizon p,)`, in descending order, in units of the
-        spread of the outputs. If there is a clear gap, the number of values before it
-        is the order that the model needs.
+        spread of the outputs. If the values have a clear gap, the number of values
+        before the gap is the order that the model needs.
     - `x0`: the first state, shape `(n,)`, or `(records, n)` for a list of records.
     - `gain`: $K$ of the Kalman predictor $x_{k+1} = A x_k + B u_k + K (y_k - C x_k)$,
         shape `(n, p)`.
     - `start_gain`: the gain of the predictor with which $B$ and the first states were
-        fitted, shape `(n, p)`. For a stable model it is nearly zero, so that the
-        predictor is a free run. For an unstable model it makes the predictor stable.
+        fitted, shape `(n, p)`. For a stable model the gain is nearly zero, so that the
+        predictor is a free run. For an unstable model the gain makes the predictor
+        stable.
     - `error`: the root-mean-square error `y - C x` of the predictor with `start_gain`,
         shape `(p,)`.
     - `result`: success; `RESULTS.unexciting` if the controls do not excite the system
@@ -70,8 +71,8 @@ class Subspace(eqx.Module):
     def start(self, record: Records) -> Float[Array, "*records n"]:
         """Estimate the first state of another record from all of its samples.
 
-        It is the state from which the predictor with `start_gain` has the least sum of
-        squared errors. For a stable model this predictor is a free run.
+        From this state, the predictor with `start_gain` has the smallest sum of squared
+        errors. For a stable model this predictor is a free run.
 
         **Arguments:** `record`: a [`delucax.training.sysid.Record`][] or a list of
         them; uniform in time.
@@ -109,17 +110,17 @@ def subspace(
 
     The method needs no first guess and no iterations. It predicts the outputs of the
     next `horizon` steps from the past, and removes the effect of the controls of these
-    steps. What remains has as many directions as the system has states. These
-    directions are the singular vectors of a block of a triangular factor of the
-    Hankel matrices, and they give $A$, $C$ and $K$. Then $B$, the first states and the
-    operating point follow by linear least squares on the errors of a free run. Time and
-    memory are linear in the number of samples.
+    steps. The remaining prediction has as many independent directions as the system has
+    states. These directions are the singular vectors of a block of a triangular factor
+    of the Hankel matrices, and they give $A$, $C$ and $K$. Then $B$, the first states
+    and the operating point follow by linear least squares on the errors of a free run.
+    Time and memory are linear in the number of samples.
 
     The model is strictly proper: a control affects the outputs from the next sample on,
     as in all dynamics of this library. If your control affects the output of the same
     sample, fit `Record(outputs[:-1], controls[1:], dt=dt)`. Controls that depend on the
-    noise, like those of a feedback, bias the estimate. The model is not forced to be
-    stable: if the order is too high, it may have an unstable mode.
+    noise, such as the controls of a feedback, bias the estimate. The model is not
+    forced to be stable: if the order is too high, it may have an unstable mode.
 
     **Arguments:**
 
@@ -127,16 +128,17 @@ def subspace(
         time, with any number of outputs and controls.
     - `order`: n, the number of states. `singular_values` of the result show how many
         are needed; they do not depend on `order` if you give `horizon`.
-    - `horizon`: the number of steps that are predicted, and of steps of the past. A
-        longer horizon averages over more noise. By default it is the larger of 10 and
-        twice the order, or shorter if the records have too few samples.
+    - `horizon`: the number of future steps that are predicted, and also the number of
+        past steps that are used. A longer horizon averages over more noise. By default
+        the horizon is the larger of 10 and twice the order, or shorter if the records
+        have too few samples.
     - `affine`: whether to estimate an operating point too, for outputs and controls
         that are not measured from an equilibrium; false by default.
     - `throw`: raise an error if the controls do not excite the system enough; true by
         default. If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Subspace`][]. Its states are balanced, and
-    ordered by how much they contribute.
+    **Returns:** [`delucax.training.sysid.Subspace`][]. The states of the model are
+    balanced, and ordered by how much they contribute to the outputs.
 
     **Raises:** `ValueError` if `record` is not a uniform record or a list of them, a
     count is below 1, `order` exceeds `(horizon - 1)` times the number of outputs, or

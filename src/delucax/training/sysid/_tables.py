@@ -34,8 +34,8 @@ def read_csv(
     - `outputs`, `controls`: the name of a column, or a list of names.
     - `times`: the name of the column with the times; or
     - `dt`: the time from one row to the next.
-    - `by`: the name of a column that tells experiments apart. Neighbouring rows with
-        the same entry make one record. By default the file is one record.
+    - `by`: the name of a column that labels the experiments. Neighbouring rows with the
+        same label make one record. By default the file is one record.
     - `hold`: the control between samples, as in [`delucax.training.sysid.Record`][];
         `"zero"` by default.
     - `allow_gaps`: accept gaps in the times; false by default.
@@ -45,7 +45,7 @@ def read_csv(
     given.
 
     **Raises:** `ValueError` if a column is missing or an entry is not a number. The
-    message names the line and the column.
+    error message names the line and the column.
 
     !!! example
 

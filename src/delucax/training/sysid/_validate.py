@@ -33,20 +33,20 @@ class Validation(eqx.Module):
     - `simulated`: a tuple with the outputs of a free run along each record, shape
         `(N, p)`. A free run simulates the model with the controls alone, from an
         estimated first state.
-    - `rmse`: the root-mean-square error of the free run, shape `(p,)`. The samples that
-        the first state is estimated from do not count.
-    - `fit`: the same in percent, $100\,(1 - |y - \hat y| / |y - \bar y|)$, shape
-        `(p,)`.
+    - `rmse`: the root-mean-square error of the free run, shape `(p,)`. The samples from
+        which the first state is estimated are left out of the error.
+    - `fit`: the fit of the free run in percent,
+        $100\,(1 - |y - \hat y| / |y - \bar y|)$, shape `(p,)`.
     - `ahead`: the root-mean-square error of predictions over 1 to k steps, shape
         `(k, p)`.
     - `autocorrelation`: the correlation of the errors of the free run at lags 1, 2,
         ..., shape `(lags, p)`.
-    - `cross_correlation`: the correlation of these errors with the controls 0, 1, ...
-        steps before, shape `(lags + 1, p, m)`.
+    - `cross_correlation`: the correlation of the errors of the free run with the
+        controls 0, 1, ... steps before, shape `(lags + 1, p, m)`.
     - `bound`: if the errors and controls are white and independent, 95% of the
         correlations are within `-bound` and `bound`.
     - `p_value`: the p-value of the Ljung-Box test that the errors are white, shape
-        `(p,)`. A small value means that they are correlated in time.
+        `(p,)`. A small value means that the errors are correlated in time.
 
     Source: Ljung, 1999 (chapter 16); Ljung and Box, 1978.
 
@@ -98,10 +98,11 @@ def validate(
 ) -> Validation:
     """Compare a free run and predictions of a model with a record.
 
-    Use a record that the model was not fitted to. The first state is estimated from the
-    first samples by least squares. From there, the free run simulates the model with
-    the recorded controls. With `ahead`, shorter predictions are compared too. They
-    begin throughout the record, each at a state that is estimated in the same way.
+    Use a record to which the model was not fitted. The first state is estimated from
+    the first samples by least squares. From this state, the free run simulates the
+    model with the recorded controls. With `ahead`, shorter predictions are compared
+    too. These predictions begin throughout the record, at states that are estimated in
+    the same way from the samples before.
 
     **Arguments:**
 
@@ -111,7 +112,7 @@ def validate(
         the first measurement, which must then be the state, or zero for
         [`delucax.training.sysid.LatentDynamics`][].
     - `start`: the number of samples from which a state is estimated, 10 by default.
-        They do not count in the errors.
+        These samples are left out of the errors.
     - `ahead`: the largest number of steps of a prediction; 0 by default, for no
         predictions.
     - `lags`: the largest lag of the correlations, 20 by default.
