@@ -50,19 +50,19 @@ class AbstractEstimator(eqx.Module):
 
     At each step, `update` is called first, with the observation $y_k$. Then `predict`
     is called, with the control $u_k$ that was actually applied over the step from
-    $t_k$. What the estimator carries from step to step is its state, a pytree of
-    arrays. `estimate` returns the belief of a state, and `status` the status of the
-    last call.
+    $t_k$. The estimator remembers the past in its state, a pytree of arrays. `estimate`
+    returns the belief of a state, and `status` the status of the last call.
 
     [`delucax.controllers.OutputFeedback`][] makes these calls in a closed loop, and
     [`delucax.estimators.run_estimator`][] along a record. For Kalman filters,
     [`delucax.estimators.run_filter`][] also computes the log-likelihood.
 
     To write an estimator, subclass this class and write `init`, `update` and `predict`.
-    If its state is a [`delucax.estimators.Belief`][], as in a filter, that is all. If
-    its state is something else, write `estimate` too: a [`delucax.estimators.MHE`][],
-    for example, carries the observations and controls of its window and the last
-    solution. Override `status` if the estimator can fail in other ways.
+    If the state of the estimator is a [`delucax.estimators.Belief`][], as in a filter,
+    these three methods are enough. Otherwise write `estimate` too: a
+    [`delucax.estimators.MHE`][], for example, carries the observations and controls of
+    its window and the last solution. Override `status` if the estimator can fail in
+    other ways.
 
     !!! example
 
@@ -138,7 +138,8 @@ class AbstractEstimator(eqx.Module):
     def estimate(self, state: PyTree) -> Belief:
         """The estimated mean and covariance of the plant's state.
 
-        By default the state of the estimator is this belief, and is returned.
+        By default the state of the estimator is itself this belief, and the method
+        returns it.
 
         **Arguments:** `state`: the state of the estimator.
 

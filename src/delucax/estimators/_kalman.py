@@ -43,10 +43,11 @@ class KalmanFilter(AbstractGaussianFilter):
     $$y_k = y_\mathrm{ref} + C (x_k - x_\mathrm{ref}) + v_k, \quad v_k \sim N(0, V)$$
 
     The measurement update adds $L (y - \hat y)$ to the mean, with the gain
-    $L = \Sigma C^T (C \Sigma C^T + V)^{-1}$. It changes the covariance from $\Sigma$ to
-    $P = (I - L C) \Sigma (I - L C)^T + L V L^T$ (Joseph's form). The time update
-    changes it from $P$ to $A P A^T + E W E^T$. In the steady state $\Sigma$ and $L$ are
-    constant; [`delucax.riccati.filter_dare`][] computes this $\Sigma$.
+    $L = \Sigma C^T (C \Sigma C^T + V)^{-1}$. The measurement update changes the
+    covariance from $\Sigma$ to $P = (I - L C) \Sigma (I - L C)^T + L V L^T$ (Joseph's
+    form). The time update changes the covariance from $P$ to $A P A^T + E W E^T$. In
+    the steady state $\Sigma$ and $L$ are constant; [`delucax.riccati.filter_dare`][]
+    computes this $\Sigma$.
 
     **Arguments:**
 
@@ -56,24 +57,24 @@ class KalmanFilter(AbstractGaussianFilter):
     - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
     - `mean`: mean of the first state, shape `(n,)`; `x_ref` by default.
     - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
-        symmetric, semidefinite; the identity by default. Do not give it together with
-        `steady_state`, which computes it.
+        symmetric, semidefinite; the identity by default. Do not give `covariance`
+        together with `steady_state`, which computes the covariance.
     - `steady_state`: whether to use the gain of the steady state at all times; false by
         default.
     - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by
-        default. Give it if a nonlinear sensor was linearised, because its reading there
-        is not `C x_ref`.
+        default. Give `y_ref` if a nonlinear sensor was linearised, because its reading
+        at the operating point is not `C x_ref`.
     - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
         angles among the observations; subtraction by default.
 
-    **Attributes:** the arguments. With `steady_state` also `L`, the gain, shape
-    `(n, p)`, trainable; and `updated_covariance`, the covariance after the measurement
-    update, shape `(n, n)`. They are `None` otherwise.
+    **Attributes:** the arguments. With `steady_state`, there are also `L`, the gain,
+    shape `(n, p)`, trainable; and `updated_covariance`, the covariance after the
+    measurement update, shape `(n, n)`. They are `None` otherwise.
 
     **Raises:** `ValueError` if `dynamics` is not linear, a covariance is not symmetric
     and semidefinite, or sizes do not fit; or if `steady_state` is combined with
-    time-varying dynamics or with `covariance`. An error at run time if there is no
-    steady state.
+    time-varying dynamics or with `covariance`. An error at run time if the filter has
+    no steady state.
 
     Source: Kalman, 1960; Bucy and Joseph, 1968.
 
@@ -233,9 +234,10 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
     y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
 
-    It is the [`delucax.estimators.KalmanFilter`][] with $A = \partial F / \partial x$,
-    $E = \partial F / \partial w$ and $C = \partial h / \partial x$, computed at each
-    step by automatic differentiation. For linear dynamics both filters are the same.
+    This filter is the [`delucax.estimators.KalmanFilter`][] with
+    $A = \partial F / \partial x$, $E = \partial F / \partial w$ and
+    $C = \partial h / \partial x$, computed at each step by automatic differentiation.
+    For linear dynamics both filters are the same.
 
     **Arguments:**
 
@@ -305,7 +307,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
 
 class UnscentedKalmanFilter(_AbstractNonlinearFilter):
-    r"""The unscented Kalman filter: moments come from points moved by the dynamics.
+    r"""The unscented Kalman filter: moments from points that the dynamics move.
 
     $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
     y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
@@ -314,17 +316,18 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
     $\sqrt{c}\, \mathrm{chol}(\mathrm{covariance})$, with $c = \alpha^2 (n + \kappa)$.
     The outer points have the weight $1 / (2 c)$. The middle point has the weight
     $1 - n / c$ in the mean and $2 - n / c - \alpha^2 + \beta$ in the covariance. The
-    points are computed anew for the measurement update and for the time update.
+    points are computed again for each measurement update and for each time update.
 
-    The disturbance counts to first order: it adds $E W E^T$, with
-    $E = \partial F / \partial w$ at the mean, to the covariance. This is exact if the
-    disturbance is added to the state. For linear dynamics the filter is the same as the
-    [`delucax.estimators.KalmanFilter`][].
+    The disturbance is treated to first order: it adds $E W E^T$, with
+    $E = \partial F / \partial w$ at the mean, to the covariance. This treatment is
+    exact if the disturbance is added to the state. For linear dynamics the filter is
+    the same as the [`delucax.estimators.KalmanFilter`][].
 
     With the default `alpha`, `beta` and `kappa` no weight is negative, so covariances
     stay semidefinite. A small `alpha`, such as the common 1e-3, gives weights of size
-    $1 / \alpha^2$ that cancel, and digits are lost. A state with zero variance is taken
-    to be known, and there is no derivative with respect to this variance.
+    $1 / \alpha^2$ that cancel each other, so digits are lost in rounding. The filter
+    treats a state with zero variance as known, and there is no derivative with respect
+    to this variance.
 
     **Arguments:**
 

@@ -32,27 +32,29 @@ class MHE(AbstractEstimator):
     $$|x_0 - \bar x|^2_{P^{-1}} + \sum_{k < N-1} |w_k|^2_{W^{-1}}
     + \sum_{k < N} 2 \rho(|y_k - h(t_k, x_k)|_{V^{-1}})$$
 
-    over the states of the $N$ stages of the window, the last of which is now. Bounds on
-    states and disturbances are respected, and parameters of the dynamics can be
-    estimated together with the states. The prior $(\bar x, P)$ of the first state comes
-    from an extended Kalman filter, linearised about the states of the window. It leaves
-    out the observations of the window, so that none counts twice (the filtering
-    update). For linear dynamics without active bounds, the estimate is the same as with
-    a [`delucax.estimators.KalmanFilter`][], whatever the window.
+    over the states of the $N$ stages of the window, the last of which is the current
+    stage. Bounds on states and disturbances are respected, and parameters of the
+    dynamics can be estimated together with the states. The prior $(\bar x, P)$ of the
+    first state comes from an extended Kalman filter, linearised about the states of the
+    window. The prior does not include the observations of the window, so that no
+    observation is used twice (the filtering update). For linear dynamics without active
+    bounds, the estimate is the same as with a [`delucax.estimators.KalmanFilter`][],
+    for any length of the window.
 
     By default, an update makes one full Gauss-Newton step from the previous solution,
-    shifted by a step (the real-time iteration). If `iterations` is above 1, it makes
-    that many steps with a line search. A step is a pass of the Kalman filter over the
-    window and a pass back. All covariances may be singular, for example for a known
-    state, a constant parameter or a perfect sensor. Active bounds are treated as
-    perfect observations, and finding them takes more passes. The covariance of the
-    estimate comes from the forward pass without bounds.
+    shifted by a step (the real-time iteration). If `iterations` is above 1, an update
+    makes that many steps with a line search. A step consists of a forward pass of the
+    Kalman filter over the window and a backward pass. All covariances may be singular,
+    for example for a known state, a constant parameter or a perfect sensor. Active
+    bounds are treated as perfect observations, and finding the active bounds takes more
+    passes. The covariance of the estimate comes from the forward pass without bounds.
 
     The estimate is differentiable with respect to the weights, the prior, the bounds
-    and the dynamics, in forward and reverse mode. The steps are differentiated as they
-    were made, with the active bounds fixed. The derivative jumps when a bound becomes
-    active, or when a residual crosses the threshold of `robust`. Under `jax.vmap`, a
-    batch makes as many passes as the member that needs the most.
+    and the dynamics, in forward and reverse mode. The derivative is the derivative of
+    the steps that the update made, with the active bounds fixed. The derivative jumps
+    when a bound becomes active, or when a residual crosses the threshold of `robust`.
+    Under `jax.vmap`, all members of a batch make as many passes as the member that
+    needs the most passes.
 
     **Arguments:**
 
@@ -72,8 +74,8 @@ class MHE(AbstractEstimator):
         to a [`delucax.estimators.RandomWalk`][], such as
         `{"system.length": RandomWalk(0.1)}`; none by default.
     - `robust`: a threshold against outliers, in standard deviations. For larger
-        residuals, $\rho$ is linear (Huber's penalty). 1.5 to 3 are usual; `V` must then
-        be definite. By default $\rho(r) = r^2 / 2$.
+        residuals, $\rho$ is linear (Huber's penalty). Thresholds from 1.5 to 3 are
+        usual; with a threshold, `V` must be definite. By default $\rho(r) = r^2 / 2$.
     - `iterations`: the number of steps of an update, 1 by default.
     - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
         angles among the observations; subtraction by default.
@@ -81,8 +83,8 @@ class MHE(AbstractEstimator):
     If a reading is missing, do not call `update` at this step. An observation that is
     not finite is left out, and counts as a failure. `status` is
 
-    - `diverged` if an observation or the solution is not finite. If the solution is
-        not, the window keeps the estimate before the update.
+    - `diverged` if an observation or the solution is not finite. If the solution is not
+        finite, the window keeps the estimate before the update.
     - `no_feasible_point` if the bounds cannot all hold.
     - `inaccurate` if the bounds are violated slightly because of rounding.
     - `not_converged` if the active bounds were not found or, with several iterations,

@@ -24,10 +24,10 @@ class RandomWalk(eqx.Module):
 
     **Arguments:**
 
-    - `variance`: the variance of the first value, a number or one for each entry of the
-        parameter. With 0, the first value is known.
-    - `step`: the variance of the change in a step, a number or one for each entry. 0 by
-        default, for a constant.
+    - `variance`: the variance of the first value, a number, or one number for each
+        entry of the parameter. With a variance of 0, the first value is known.
+    - `step`: the variance of the change in a step, a number, or one number for each
+        entry of the parameter. The default is 0, for a constant parameter.
     - `bounds`: a pair `(low, high)` of numbers or vectors; none by default.
 
     **Raises:** `ValueError` if a variance is negative or not finite, or `bounds` is not

@@ -42,8 +42,8 @@ def run_estimator(
 ) -> Estimated:
     r"""Run any estimator over a record.
 
-    At step k, with $t_k = t_0 + k\, dt$, it calls `update` with `observations[k]`, then
-    `predict` with `controls[k]`. For a Kalman filter,
+    At step k, with $t_k = t_0 + k\, dt$, `run_estimator` calls `update` with
+    `observations[k]`, then `predict` with `controls[k]`. For a Kalman filter,
     [`delucax.estimators.run_filter`][] also computes the likelihood.
 
     **Arguments:**
@@ -66,11 +66,12 @@ def run_estimator(
         size `T`;
     - `states`: the state of the estimator after each update, with a leading axis of
         size `T`;
-    - `results`: the status of each update, and `result`, the first that is not success.
+    - `results`: the status of each update; and `result`, the first status that is not
+        success.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
-    finite, or the window is longer than the record; an error at run time as `throw`
-    says.
+    finite, or the window is longer than the record; an error at run time if `throw` is
+    true and an update fails.
 
     !!! example
 

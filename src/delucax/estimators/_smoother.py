@@ -58,7 +58,7 @@ def run_filter(
 ) -> Filtered:
     r"""Run a Kalman filter over a record.
 
-    At step k, with $t_k = t_0 + k\, dt$, it makes the measurement update with
+    At step k, with $t_k = t_0 + k\, dt$, the filter makes the measurement update with
     `observations[k]`, then the time update with `controls[k]`. It also computes the
     log-likelihood of the record,
 
@@ -88,11 +88,12 @@ def run_filter(
     - `log_likelihoods`: the log-density of each observation given those before it,
         shape `(T,)`, and `log_likelihood`, their sum;
     - `result`: one of `delucax.RESULTS`. It is `diverged` if a belief is not finite;
-        all results from that step on are NaN. It is `ill_posed` if only the likelihood
+        all results from this step on are NaN. It is `ill_posed` if only the likelihood
         is not finite, because the covariance of an observation is not definite.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
-    finite; an error at run time as `throw` says.
+    finite; with `throw`, an error at run time if a belief or the likelihood is not
+    finite.
 
     Source: Kalman, 1960; Schweppe, 1965 (the likelihood).
 
@@ -144,9 +145,9 @@ def smooth(
     G_k = P_k A^T \Sigma_{k+1}^{-1}$$
 
     The covariance is computed in a form that stays semidefinite. For a nonlinear
-    filter, $P_k A^T$ is the covariance of the state with the next state, as the filter
-    computes it. Covariances may be singular, for example for a known first state, or if
-    only some of the states have noise.
+    filter, $P_k A^T$ is the covariance of the state with the next state, which the
+    filter computes. Covariances may be singular, for example for a known first state,
+    or if only some of the states have noise.
 
     **Arguments:**
 
@@ -158,7 +159,7 @@ def smooth(
     - `mean`: the mean of each state given the whole record, shape `(T, n)`;
     - `covariance`: the covariance of each state, shape `(T, n, n)`;
     - `filtered`: the result of the filter, as `run_filter` returns it;
-    - `result`: success or the failure, one of `delucax.RESULTS`.
+    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     **Raises:** as `run_filter`.
 

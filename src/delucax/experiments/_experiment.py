@@ -53,7 +53,7 @@ class Experiment:
     **Arguments:**
 
     - `function`: the function to run; see [`delucax.experiments.experiment`][].
-    - `name`: the name of the experiment; that of the function by default.
+    - `name`: the name of the experiment; by default the name of the function.
     - `axes`: the parameters; none by default.
     - `seeds`: the seeds; `(0,)` by default.
     - `marks`: the marks of all cases; none by default.
@@ -108,7 +108,7 @@ class Experiment:
         return not {"key", "seed"}.isdisjoint(self.arguments)
 
     def used_fixtures(self) -> dict[str, Fixture]:
-        """The fixtures that it uses, directly or through other fixtures, by name. Each
+        """The fixtures that the function uses, directly or indirectly, by name. Each
         fixture comes after the fixtures that it needs."""
         used: dict[str, Fixture] = {}
         known = {**getattr(self.function, "__globals__", {}), **self.fixtures}
@@ -129,7 +129,7 @@ class Experiment:
         return used
 
     def all_axes(self) -> tuple[Axis, ...]:
-        """The axes of its parameters, and then those of its fixtures."""
+        """The axes of its parameters, and then the axes of its fixtures."""
         own = ((f.axis, name) for name, f in self.used_fixtures().items())
         return (*self.axes, *(Axis((name,), a.params) for a, name in own if a))
 
@@ -141,10 +141,11 @@ class Experiment:
         **Arguments:**
 
         - `select`: words in the name of a case, joined by `and`, `or`, `not` and
-            parentheses. Upper and lower case are the same. All cases by default.
-        - `marks`: names of marks, joined in the same way. All cases by default.
+            parentheses. The case of letters does not matter. All cases by default.
+        - `marks`: names of marks, joined by `and`, `or`, `not` and parentheses. All
+            cases by default.
         - `slow`: whether to include cases that are marked `slow`; `False` by default.
-            They are also included if `marks` names the mark.
+            Slow cases are also included if `marks` names the mark `slow`.
 
         **Raises:** `ValueError` if the function has no argument for a parameter, if an
         argument has no value, or if a value cannot be identified by its content.
@@ -230,17 +231,17 @@ class experiment:  # noqa: N801
 
     The function is called for each case, with the parameters and fixtures as arguments.
     It returns a number, or a dictionary from names to numbers, strings or arrays. The
-    arguments of the function decide how it is called:
+    arguments of the function decide how the function is called:
 
-    - with `key`: it is traced, compiled, and called for all seeds at once by `vmap`,
-      each with `jax.random.key(seed)`. Arrays, the arrays of modules, and numbers among
-      the parameters are traced, so that other values need no new compilation. A number
-      that must be known when the function is traced (a horizon, a width) is static.
-      To find these, tracing is tried with all numbers first, then with floats only,
-      then with no numbers.
-    - with `seed`: it is called once for each seed, with an integer and without `jit`.
-      Use this for code that cannot be traced, such as `fit`.
-    - with neither: it is called once, without `jit`.
+    - with `key`: the function is traced, compiled, and called for all seeds at once by
+        `vmap`, each with `jax.random.key(seed)`. Arrays, the arrays of modules, and
+        numbers among the parameters are traced, so that other values need no new
+        compilation. A number that must be known when the function is traced (a horizon,
+        a width) is static. To find the static numbers, the function is first traced
+        with all numbers traced, then with floats only, and then with no numbers.
+    - with `seed`: the function is called once for each seed, with an integer and
+        without `jit`. Use `seed` for code that cannot be traced, such as `fit`.
+    - with neither `key` nor `seed`: the function is called once, without `jit`.
 
     **Arguments:**
 

@@ -30,7 +30,8 @@ class Results:
         or `"skipped"`, which is not stored.
     - the names of what the function returned; `value` if it returned a single number.
     - `error` and `traceback`.
-    - `compile_seconds` and `run_seconds`: of the case, for all its seeds together.
+    - `compile_seconds` and `run_seconds`: the times of the case [s], for all its seeds
+        together.
     - `date`, `commit`, `dirty`, `dtype`, `device`, `versions`, `hash`: how the result
         was made.
 
@@ -142,9 +143,9 @@ class Results:
 
         **Arguments:**
 
-        - `**values`: the values, by the names of the columns.
+        - `**values`: the value that each named column must have.
 
-        **Raises:** `ValueError` if there is no such column.
+        **Raises:** `ValueError` if a column does not exist.
         """
         self._check_columns(values, "Results.where", ("traceback", "versions"))
         holds = lambda row: all(row.get(name) == v for name, v in values.items())
@@ -163,8 +164,9 @@ class Results:
 
         - `to`: a file that ends in `.csv`, `.parquet`, `.md` or `.tex`; or `"csv"`,
             `"markdown"` or `"latex"`, to get only the text.
-        - `columns`: the names of the columns. By default all for CSV and Parquet,
-            otherwise the parameters, the seed, the status and what was returned.
+        - `columns`: the names of the columns. By default all columns for CSV and
+            Parquet. For Markdown and LaTeX, the default columns are the parameters, the
+            seed, the status and the results of the function.
         - `digits`: the number of significant digits in Markdown and LaTeX, 4 by
             default.
 
@@ -211,7 +213,7 @@ class Results:
 
     @property
     def all_columns(self) -> tuple[str, ...]:
-        """The names of the columns, and then those of the versions."""
+        """The names of the columns, and then the names of the version columns."""
         versions = [name for row in self.rows for name in row["versions"]]
         return (*self.columns, *dict.fromkeys(versions))
 

@@ -57,28 +57,31 @@ def run(
 ) -> Results:
     """Run the cases of experiments that are not in the store yet.
 
-    If a case fails, its traceback is recorded and the other cases go on. They also go
-    on if a case kills its worker. Each result is stored at once. A stored case is not
-    run again unless its code or parameters changed, so the same call continues a run
-    that was killed.
+    If a case fails, its traceback is recorded and the other cases are still run, even
+    if the case kills its worker process. Each result is stored at once. A stored case
+    is not run again unless its code or parameters changed, so the same call continues a
+    run that was killed.
 
     **Arguments:**
 
     - `*experiments`: the experiments, each an [`delucax.experiments.Experiment`][].
     - `store`: a results file, which is created if it does not exist. By default the
         results are only kept in memory.
-    - `workers`: the number of processes. 1 by default, which is this process; -1 is one
-        for each core. Each of several workers computes with one thread.
+    - `workers`: the number of processes. 1 by default, which is this process; -1 means
+        one process for each core. If there are several workers, each worker computes
+        with one thread.
     - `backend`: how workers are started: `"loky"` (default), on this machine, or
-        `"dask"`, on the cluster of the open `dask.distributed.Client`. Both need the
-        extra `experiments`, and `"dask"` also needs the extra `dask`.
+        `"dask"`, on the cluster of the open `dask.distributed.Client`. Both backends
+        need the extra `experiments`, and `"dask"` also needs the extra `dask`.
     - `select`: selects cases by words in their names, such as `"lqr and not cartpole"`;
         all by default.
-    - `marks`: selects cases by their marks, in the same way; all by default.
+    - `marks`: selects cases by their marks, with the same syntax as `select`; all by
+        default.
     - `slow`: whether to include cases that are marked `slow`; `False` by default.
-    - `seeds`: a number of seeds, or the seeds, in place of those of the experiments.
+    - `seeds`: a number of seeds, or a sequence of seeds, which replaces the seeds of
+        the experiments.
     - `mesh`: a `jax.sharding.Mesh`. The seeds of each case are spread over its first
-        axis. None by default; only for one worker.
+        axis. None by default. A mesh needs `workers=1`.
     - `fresh`: whether to run cases that are already stored; `False` by default.
     - `retry`: whether to run again the cases that raised an error, expected or not;
         `False` by default.
@@ -87,7 +90,7 @@ def run(
 
     **Returns:** the [`delucax.experiments.Results`][] of the selected cases.
 
-    **Raises:** `ValueError` if an argument does not fit, before anything is run;
+    **Raises:** `ValueError` if an argument is invalid, before any case is run;
     `OSError` if the store cannot be written. The results so far are kept.
 
     !!! example

@@ -15,8 +15,9 @@ from ._store import PASSED
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     """The mean of the middle half of the values.
 
-    It ignores outliers, as the median does, but uses more of the data. If the number of
-    values is not a multiple of 4, the values at the edges count in part.
+    The interquartile mean ignores outliers, as the median does, but uses more of the
+    data. If the number of values is not a multiple of 4, the values at the edges of the
+    middle half have a reduced weight.
 
     Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
 
@@ -80,7 +81,8 @@ def compare(
 
     A value and the baseline are compared in pairs of rows that passed and that agree in
     all other parameters and in the seed. The intervals come from a bootstrap over the
-    pairs. It draws seeds within each case, or cases if each case has only one seed.
+    pairs. The bootstrap draws seeds within each case, or cases if each case has only
+    one seed.
 
     Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
 
@@ -90,7 +92,7 @@ def compare(
     - `by`: the parameter, such as `"controller"`.
     - `baseline`: the value to compare with, as the table shows it.
     - `metric`: the result to compare, `"value"` by default.
-    - `ratio`: whether to give the ratio of the interquartile means in place of their
+    - `ratio`: whether to give the ratio of the interquartile means instead of their
         difference; `False` by default.
     - `confidence`: the confidence level of the intervals, 0.95 by default.
     - `resamples`: the number of bootstrap samples, 2000 by default.
@@ -98,15 +100,15 @@ def compare(
 
     **Returns:** a `pandas.DataFrame` with a row for each value, and the columns
 
-    - `iqm`, `low`, `high`: the interquartile mean and its interval.
+    - `iqm`, `low`, `high`: the interquartile mean and its confidence interval.
     - `difference`, `difference_low`, `difference_high`: the difference from the
-        baseline over the common pairs, and its interval. With `ratio` they are called
-        `ratio`, `ratio_low` and `ratio_high`.
+        baseline over the common pairs, and its confidence interval. With `ratio` these
+        columns are called `ratio`, `ratio_low` and `ratio_high`.
     - `below`: the fraction of the pairs in which the value is below the baseline.
     - `pairs`: the number of pairs.
 
-    **Raises:** `ValueError` if there is no such parameter, value or metric, or if the
-    metric is not a number.
+    **Raises:** `ValueError` if `by`, `baseline` or `metric` does not exist in the
+    results, or if the metric is not a number.
 
     !!! example
 
@@ -183,8 +185,8 @@ def compare(
 class Bootstrap:
     """Bootstrap intervals of a statistic, and of differences or ratios of pairs.
 
-    The values come in groups, and each group is resampled separately. The two members
-    of a pair are drawn together.
+    The values come in groups, and each group is resampled separately. The two values of
+    a pair are always drawn together.
 
     Source: Efron, 1979.
 
@@ -218,7 +220,7 @@ class Bootstrap:
     statistic: Callable[..., Any] = interquartile_mean
 
     def interval(self, groups: Sequence[np.ndarray]) -> tuple[float, float, float]:
-        """The statistic of all values, and its interval.
+        """The statistic of all values, and its confidence interval.
 
         **Arguments:**
 
@@ -232,15 +234,16 @@ class Bootstrap:
     def paired(
         self, groups: Sequence[np.ndarray], ratio: bool = False
     ) -> tuple[float, float, float]:
-        """The difference or ratio of the statistic between the members of pairs.
+        """The difference or ratio of the statistic between the two values of pairs.
 
-        This is the statistic of the first members minus, or over, the statistic of the
-        second members.
+        This is the statistic of the first values minus the statistic of the second
+        values, or their quotient with `ratio`.
 
         **Arguments:**
 
         - `groups`: arrays of pairs, shape `(count, 2)`. Each is resampled separately.
-        - `ratio`: whether to divide in place of subtracting; `False` by default.
+        - `ratio`: whether to compute the ratio instead of the difference; `False` by
+            default.
 
         **Returns:** `(value, low, high)`; NaN if there are no pairs.
         """

@@ -32,22 +32,23 @@ def c(
 ) -> Report:
     """Write a controller, a plant or a function as a program in C.
 
-    The files are `NAME.h` and `NAME.c` in `directory`. They are C99 and need no library
-    except that of standard C. The program uses the stack only: it allocates no
-    memory. It has no recursion, and no variable that outlives a call. Every loop has a
-    bound. Whatever does not depend on the inputs, such as weights, becomes a constant.
+    The files are `NAME.h` and `NAME.c` in `directory`. The files are C99 and need only
+    the C standard library. The program uses the stack only: it allocates no memory. The
+    program has no recursion and no global or static variables. Every loop has a bound.
+    Whatever does not depend on the inputs, such as weights, becomes a constant.
 
     A controller becomes three functions, which do what its `init`, `__call__` and
     `applied` do: `NAME_init(state)`, `NAME_step(state, t, y, u)` and
     `NAME_applied(state, u, cost)`. A step returns 0, or a flag if a number is not
-    finite: `NAME_BAD_INPUT` for an input, `NAME_BAD_RESULT` for a result. The control
-    is then `fallback`, and the state stays as it was before the step. A step in which
-    Python would raise an error, for example with `equinox.error_if`, returns
-    `NAME_BAD_RESULT`.
+    finite: `NAME_BAD_INPUT` for an input, `NAME_BAD_RESULT` for a result. If a step
+    returns a flag, the control is `fallback`, and the state stays as it was before the
+    step. A step in which Python would raise an error, for example with
+    `equinox.error_if`, returns `NAME_BAD_RESULT`.
 
-    A function becomes `NAME(inputs..., outputs...)`. It takes numbers by value, and
-    arrays as pointers to their entries in row-major order. It always writes its
-    outputs, and returns the same flags. Arrays that it closes over become constants.
+    A function becomes `NAME(inputs..., outputs...)`. The C function takes numbers by
+    value, and arrays as pointers to their entries in row-major order. It always writes
+    its outputs, and returns the same flags as a step. Arrays in the closure of the
+    function become constants.
 
     A plant is exported as a function: the vector field of a system, or the step of
     dynamics. The inputs are `(t, x, u)`. The disturbance `w` is an input too if it
@@ -58,32 +59,33 @@ def c(
     - `function_or_controller`: a [`delucax.AbstractController`][], an
         [`delucax.AbstractSystem`][], an [`delucax.AbstractDynamics`][], or a function
         of arrays.
-    - `directory`: the folder to write to. It is created if it does not exist.
-    - `name`: an identifier in C. All public names in the C begin with it.
+    - `directory`: the folder to write to. The folder is created if it does not exist.
+    - `name`: an identifier in C. All public names in the C code begin with `name`.
     - `dtype`: the type of all real numbers, `"float32"` or `"float64"`. By default it
-        is the type of the arrays in `function_or_controller` and `example`. It may
-        differ from the precision of JAX in this process.
+        is the type of the arrays in `function_or_controller` and `example`. The type
+        may differ from the precision of JAX in this process.
     - `example`: for a function, a tuple of its inputs: arrays, numbers,
-        `jax.ShapeDtypeStruct`, or pytrees of them. Only their shapes and types count.
-        For a controller, an observation; you need it only if the controller does not
-        fix the size of the observation.
+        `jax.ShapeDtypeStruct`, or pytrees of them. Only the shapes and types of the
+        inputs are used. For a controller, an observation, which you need to give only
+        if the controller does not fix the size of the observation.
     - `fallback`: the control of a step that fails, shape `(m,)`. By default it is the
-        control of the last step that succeeded, or zeros before the first.
+        control of the last step that succeeded, or zeros if no step has succeeded yet.
     - `key`: a random key, for a controller that draws random numbers, such as
-        [`delucax.controllers.BPC`][]. The state in C holds the two words of the key. C
-        draws the numbers that JAX would draw after `init(key=key)`, and the same
-        numbers again after each `NAME_init`.
+        [`delucax.controllers.BPC`][]. The state in C holds the two words of the key.
+        The C code draws the numbers that JAX would draw after `init(key=key)`, and the
+        same numbers again after each `NAME_init`.
     - `plant`: a plant whose names and units are written into the header of a
         controller. By default it is a plant that the controller holds.
-    - `max_iterations`: the most rounds of a loop for which no bound is found. A loop
-        that would need more rounds stops there, and the flag is `NAME_BAD_RESULT`.
+    - `max_iterations`: the largest number of rounds of a loop for which no bound is
+        found. A loop that would need more rounds stops after `max_iterations` rounds,
+        and the flag is `NAME_BAD_RESULT`.
 
     **Returns:** a [`delucax.export.Report`][].
 
     **Raises:** `ValueError` if something cannot be written in C, such as eigenvalues,
     calls of Python, or random draws of a function; the message names the line of your
-    code. It is also raised if `name` is not an identifier, or `directory` cannot be
-    written to. After an error no file has changed.
+    code. A `ValueError` is also raised if `name` is not an identifier, or `directory`
+    cannot be written to. After an error no file has changed.
 
     !!! example
 

@@ -22,23 +22,25 @@ def load(
 ) -> LoadedController | LoadedFunction:
     """Compile C that [`delucax.export.c`][] wrote, and load it into Python.
 
-    The compiled library is kept in the user's cache. It is compiled again only if the
-    C, the compiler or the flags change. Nothing is written to `directory`.
+    The compiled library is kept in the user's cache. The library is compiled again only
+    if the C code, the compiler or the flags change. Nothing is written to `directory`.
 
     **Arguments:**
 
     - `directory`: the folder that holds `NAME.h` and `NAME.c`.
-    - `name`: the name of the export, needed if the folder holds several.
-    - `compiler`: the command of a C compiler. By default it is the environment variable
-        `CC`, or else the first of `cc`, `gcc` and `clang` that is installed.
-    - `flags`: arguments of the compiler. By default they make the results comparable
+    - `name`: the name of the export, needed if the folder holds several exports.
+    - `compiler`: the command of a C compiler. By default the command is the environment
+        variable `CC` or, if `CC` is not set, the first of `cc`, `gcc` and `clang` that
+        is installed.
+    - `flags`: arguments of the compiler. The default flags make the results comparable
         with JAX: `-ffp-contract=off` keeps the compiler from fusing products and sums.
 
     **Returns:** a [`delucax.export.LoadedController`][] for a controller, or a
     [`delucax.export.LoadedFunction`][] for a function or a plant.
 
-    **Raises:** `ValueError` if the folder holds no export, or holds several and `name`
-    is not given; if no compiler is found; or if the compiler fails, with its message.
+    **Raises:** `ValueError` if the folder holds no export, or holds several exports and
+    `name` is not given; if no compiler is found; or if the compiler fails. In this case
+    the error shows the message of the compiler.
 
     !!! example
 

@@ -32,14 +32,14 @@ class LoadedState(NamedTuple):
 class LoadedController(AbstractController):
     """A controller in C. [`delucax.export.load`][] returns one.
 
-    Use it like any other controller. [`delucax.rollout`][] takes it, also under `jit`
-    and `vmap`; Python then calls the C at each step. With NumPy arrays, it calls the C
-    directly and returns NumPy arrays. It computes in the precision of the export. It
-    has no derivative.
+    Use it like any other controller. [`delucax.rollout`][] accepts this controller,
+    also under `jit` and `vmap`: Python then calls the C code at each step. With NumPy
+    arrays, the controller calls the C code directly and returns NumPy arrays. It
+    computes in the precision of the export. It has no derivative.
 
-    If a number is not finite, the control is the `fallback` of
-    [`delucax.export.c`][]: by default the last good control. A rollout records each
-    such step in `trajectory.incidents` as `"declared_answer"`, and
+    If a number is not finite, the control is the `fallback` of [`delucax.export.c`][]:
+    by default the control of the last step that succeeded. A rollout records each such
+    step in `trajectory.incidents` as `"declared_answer"`, and
     [`delucax.export.Running`][] warns.
 
     **Arguments:**
@@ -150,8 +150,8 @@ class Running:
 
     **Attributes:**
 
-    - `flag`: the flag of the last step. It is 0 if all numbers were finite, 1 if an
-        input was not, and 2 if a result was not.
+    - `flag`: the flag of the last step. The flag is 0 if all numbers were finite, 1 if
+        an input was not finite, and 2 if a result was not finite.
 
     !!! example
 
@@ -185,7 +185,7 @@ class Running:
         self._step, self._applied = self._calls.in_place(self._memory, self._y, self._u)
 
     def step(self, t: float, y: Any) -> np.ndarray:
-        """One step. Warns if a number is not finite; the control is then the fallback.
+        """One step. If a number is not finite, warn and return the fallback.
 
         **Arguments:** `t`: time, a number. `y`: observation, a vector.
 
@@ -213,9 +213,9 @@ class Running:
 class LoadedFunction:
     """A function in C. [`delucax.export.load`][] returns one.
 
-    It takes and returns NumPy arrays. If one of the arguments is a JAX array, it
-    returns JAX arrays, also under `jit` and `vmap`. It returns what the exported
-    function returns, as a flat tuple if there are several results. It has no
+    It takes and returns NumPy arrays. If one of the arguments is a JAX array, the
+    function returns JAX arrays, also under `jit` and `vmap`. The results are those of
+    the exported function, as a flat tuple if there are several results. It has no
     derivative. A result that is not finite is returned as it is; with NumPy arrays
     there is a warning.
 
@@ -282,14 +282,14 @@ class LoadedFunction:
         fraction of a microsecond.
 
         **Arguments:** `*arrays`: the arrays to read, then the arrays to write the
-            results to. They are contiguous NumPy arrays with the types of the C, and
-            must not overlap. A number is an array of shape `()`; an input of this kind
-            is read once, when you bind.
+        results to. The arrays must be contiguous NumPy arrays with the types of the C
+        code, and must not overlap. Pass a number as an array of shape `()`. A number
+        that is an input is read only once, when you call `bind`.
 
-        **Returns:** a function without arguments, which returns the flag. It holds
-        Python's global interpreter lock while it runs.
+        **Returns:** a function without arguments, which returns the flag. The returned
+        function holds Python's global interpreter lock while it runs.
 
-        **Raises:** `ValueError` if an array does not fit.
+        **Raises:** `ValueError` if an array has the wrong shape or type.
         """
         about = self.description
         parts = (*about.inputs, *about.outputs)

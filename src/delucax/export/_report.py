@@ -11,13 +11,13 @@ class Report(NamedTuple):
     - `files`: the paths of the files that were written.
     - `constants`: the bytes of constants.
     - `state`: the bytes of the state; 0 for a function.
-    - `stack`: the most bytes of arrays and variables in one call. The functions of
-        `math.h` need some more.
-    - `operations`: the most arithmetic operations of one call. A function of `math.h`
-        counts as one.
+    - `stack`: the largest number of bytes that the arrays and variables of one call
+        need. The functions of `math.h` need some more.
+    - `operations`: the largest number of arithmetic operations of one call. A call of a
+        `math.h` function counts as one operation.
     - `bounds`: `(line, rounds)` for each loop that may end early: the line of Python
-        that it comes from, and its most rounds.
-    - `lines`: the lines of C in `NAME.c`.
+        from which the loop comes, and the largest number of rounds.
+    - `lines`: the number of lines in `NAME.c`.
 
     !!! example
 

@@ -28,9 +28,10 @@ def read_linear(
     **Arguments:**
 
     - `path`: the path of the file.
-    - `dt`: the step, or 0 for continuous time. By default it is the `dt` of the file.
+    - `dt`: the step, or 0 for continuous time. By default the step is the `dt` of the
+        file.
 
-    **Returns:** a [`delucax.systems.LinearSystem`][] if the step is 0, else
+    **Returns:** a [`delucax.systems.LinearSystem`][] if the step is 0, otherwise
     [`delucax.LinearDynamics`][].
 
     **Raises:** `ValueError` if the file has another format, lacks `A`, `B` or a step,
@@ -105,8 +106,8 @@ def to_control(
     Use it for the Bode, Nyquist and root-locus plots of python-control. It needs the
     extra `delucax[control]`. The result describes deviations from the operating point
     of the model: `StateSpace` cannot store that point. States and inputs keep their
-    names. If the whole state is observed, outputs have the names of the states, else
-    `y[0]`, `y[1]`, ...
+    names. If the whole state is observed, outputs have the names of the states,
+    otherwise the names are `y[0]`, `y[1]`, ...
 
     **Arguments:**
 
@@ -116,12 +117,12 @@ def to_control(
         `w0`, `w1`, ... By default the inputs are the controls only. Dynamics without
         `E` append the identity.
 
-    **Returns:** a `control.StateSpace`. Its step is the step of the dynamics, or 0 for
-    a system.
+    **Returns:** a `control.StateSpace`. The `dt` of the result is the step of the
+    dynamics, or 0 for a system.
 
     **Raises:** `ImportError` without python-control. `ValueError` if `model` is not
-    linear, is time-varying or is being traced, or is a system without `E` whose
-    disturbances are asked for.
+    linear, is time-varying or is being traced, or if `disturbances` is true for a
+    system without `E`.
 
     !!! example
 
@@ -177,18 +178,18 @@ def from_control(
     """Convert a `control.StateSpace` of python-control to a linear model.
 
     The operating point of the model is the origin. The conversion needs the extra
-    `delucax[control]`. States and controls keep their names. If `C` is the identity, it
-    is left out, because the state is then observed.
+    `delucax[control]`. States and controls keep their names. If `C` is the identity,
+    the model has no `C`, because the state is observed.
 
     **Arguments:**
 
     - `system`: a `control.StateSpace` without feed-through: its `D` must be zero.
-    - `disturbances`: the inputs that are disturbances, by name or index. They become
-        the columns of `E`, in this order; none by default.
+    - `disturbances`: the inputs that are disturbances, by name or index; none by
+        default. The columns of these inputs become the columns of `E`, in this order.
 
-    **Returns:** a [`delucax.systems.LinearSystem`][] if `system.dt` is 0, else
-    [`delucax.LinearDynamics`][] with that step. `True`, discrete time without a step,
-    becomes a step of 1.
+    **Returns:** a [`delucax.systems.LinearSystem`][] if `system.dt` is 0, otherwise
+    [`delucax.LinearDynamics`][] with the step `system.dt`. A `dt` of `True`, which
+    means discrete time with an unspecified step, becomes a step of 1.
 
     **Raises:** `ImportError` without python-control. `ValueError` if `system` is not a
     `StateSpace`, has a `D` that is not zero, has no time base or no states, or if one

@@ -223,30 +223,31 @@ def animate(
     otherwise. The animation ends when the episode ends.
 
     If the system has events, the frame nearest to an event shows the moment just after
-    it, and the name of the event appears in colour. If the rollout did not keep its
-    events, its steps are computed again to locate them. This needs the disturbances, if
-    there were any.
+    the event, and the name of the event appears in colour. If the rollout did not keep
+    its events, `animate` computes the steps again to locate the events. For this, the
+    trajectory must hold its disturbances, if the run had disturbances.
 
     **Arguments:**
 
     - `environment`: the environment that was run.
     - `trajectory`: one trajectory with its states and controls.
-    - `path`: the file to which the animation is saved at once. It ends in `.gif`,
-        `.html` (a page that needs no other file) or `.mp4` (needs ffmpeg). By default
-        nothing is saved.
-    - `fps`: frames per second. By default the animation plays in real time, unless this
-        takes fewer than 5 frames per second: then it plays 5 frames per second, faster
-        than real time.
-    - `max_frames`: the largest number of frames, 100 by default. They are spread evenly
-        over the steps.
-    - `dpi`: pixels per inch, 60 by default. The picture is then 600 pixels wide, or 300
-        without `traces`.
+    - `path`: the file to which the animation is saved at once. The name of the file
+        ends in `.gif`, `.html` (a page that needs no other file) or `.mp4` (needs
+        ffmpeg). By default nothing is saved.
+    - `fps`: frames per second. By default the animation plays in real time, unless real
+        time would take fewer than 5 frames per second. In this case the animation plays
+        5 frames per second, which is faster than real time.
+    - `max_frames`: the largest number of frames, 100 by default. The frames are spread
+        evenly over the steps.
+    - `dpi`: pixels per inch, 60 by default. With 60 pixels per inch, the picture is 600
+        pixels wide, or 300 without `traces`.
     - `traces`: whether to draw states, controls and costs beside the plant, True by
         default.
 
-    **Returns:** an animation. A notebook plays it, and `animation.save(path)` writes it
-    to a file. `len(animation)` is the number of frames, `animation.indices` the step
-    that each frame shows, and `animation.fps` the frames per second.
+    **Returns:** an animation. A notebook plays the animation, and
+    `animation.save(path)` writes it to a file. `len(animation)` is the number of
+    frames, `animation.indices` the step that each frame shows, and `animation.fps` the
+    frames per second.
 
     **Raises:** `ValueError` if the trajectory is a batch, holds no states or controls,
     has no step, or does not fit the environment; if a number is not positive; if `path`

@@ -43,35 +43,38 @@ def plot(
 ) -> Figure:
     """Draw states, controls and costs against time, in stacked panels.
 
-    States that share a unit share a panel. Controls are drawn as steps, because they
-    are held over each step. Each member of a batch of at most 8 is drawn as a thin
-    line. A larger batch is drawn as the median and the band between the quartiles of
-    the members that have not ended. Several trajectories are drawn over each other,
-    with a panel for each state.
+    States with the same unit are drawn in the same panel. Controls are drawn as steps,
+    because they are held over each step. Each member of a batch of at most 8 is drawn
+    as a thin line. A larger batch is drawn as the median and the band between the
+    quartiles of the members that have not ended. Several trajectories are drawn over
+    each other, with a panel for each state.
 
-    A ring marks where an episode terminated, and a cross where it failed. A tick above
-    the controls marks a step at which something went wrong in the controller, such as a
-    failed plan. For a single trajectory, ticks also mark the steps at which the bounds
-    clipped the control. Events, if they were kept, break the lines of the states. A
-    dotted line across the panels of the states marks each event. If there are many
-    events, or several trajectories, a tick above the panels marks each event instead.
+    A ring marks the point at which an episode terminated, and a cross the point at
+    which it failed. A tick above the controls marks a step at which something went
+    wrong in the controller, such as a failed plan. For a single trajectory, ticks also
+    mark the steps at which the bounds clipped the control. Events, if they were kept,
+    break the lines of the states. A dotted line across the panels of the states marks
+    each event. If there are many events, or several trajectories, a tick above the
+    panels marks each event instead.
 
-    The figure is not registered with pyplot. A notebook shows it, and
+    The figure is not registered with pyplot. A notebook shows the figure, and
     `figure.savefig("run.pdf")` writes it to a file.
 
     **Arguments:**
 
-    - `trajectory`: a [`delucax.Trajectory`][], a batch of them, or several to compare:
-        a dictionary from labels to trajectories, or a sequence.
+    - `trajectory`: a [`delucax.Trajectory`][], a batch of trajectories, or several
+        trajectories to compare: a dictionary from labels to trajectories, or a
+        sequence.
     - `labels`: one label for each trajectory of a sequence, or the title of a single
         trajectory. None by default.
-    - `environment`: the environment that was run. If it is given, its control bounds
-        are drawn as dashed lines. None by default.
+    - `environment`: the environment that was run. If the environment is given, its
+        control bounds are drawn as dashed lines. None by default.
     - `show`: what to draw, and in which order: `"states"`, `"controls"`, `"costs"`,
         `"observations"`, `"disturbances"`, or the name of one state or control. By
-        default states, controls and costs, if they were kept.
+        default the states, controls and costs that the trajectory holds.
 
-    **Returns:** a `matplotlib.figure.Figure`. Its `axes` has one entry for each panel.
+    **Returns:** a `matplotlib.figure.Figure`. The `axes` of the figure have one entry
+    for each panel.
 
     **Raises:** `ValueError` if there is nothing to draw, if states were not kept, if
     the trajectories are not of the same plant, or if `show` names something that the

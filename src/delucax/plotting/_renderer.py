@@ -76,7 +76,7 @@ class Renderer:
     - `environment`: a [`delucax.Environment`][].
     - `window`: whether to also show each picture in a window; `False` by default.
 
-    **Raises:** `RuntimeError` if a window is asked for and there is no display.
+    **Raises:** `RuntimeError` if `window` is true and no display is available.
 
     !!! example
 

@@ -55,14 +55,15 @@ class Simulated(NamedTuple):
 class OptimalControl(eqx.Module):
     """A discretised optimal control problem, with a first guess and its known optimum.
 
-    [`delucax.planning.SQP`][] solves it. Use double precision (`JAX_ENABLE_X64=1`). In
-    single precision some of the problems do not converge, and the objective of others
-    is wrong by a percent.
+    [`delucax.planning.SQP`][] solves such problems. Use double precision
+    (`JAX_ENABLE_X64=1`). In single precision the solver does not converge on some of
+    the problems, and the objective of other problems has an error of about one percent.
 
     **Arguments:**
 
     - `dynamics`: the discretised dynamics. Controls are held over each step.
-    - `cost`: the stage and final cost; minus the objective if that is maximised.
+    - `cost`: the stage and final cost; for a maximised objective, the cost is minus the
+        objective.
     - `x0`: the first state, shape `(n,)`.
     - `controls`: the first guess of the controls, shape `(T, m)`.
     - `reference`: the published objective.
@@ -141,14 +142,14 @@ class OptimalControl(eqx.Module):
     def simulate(self, plan: Plan, points: int = 10, rtol: float = 1e-10) -> Simulated:
         """Simulate the controls of a plan with an accurate solver, to check the plan.
 
-        The solver is Dormand and Prince's of order 8 with adaptive steps. The unknowns
-        have their values in the plan.
+        The solver is the method of Dormand and Prince of order 8 with adaptive steps.
+        The unknowns of the problem keep the values of the plan.
 
         **Arguments:**
 
         - `plan`: a plan that `solve` returned for this problem.
-        - `points`: the constraints are checked at this number of points in each step,
-            10 by default.
+        - `points`: the number of points in each step at which the constraints are
+            checked, 10 by default.
         - `rtol`: the relative and absolute tolerance of the solver, 1e-10 by default,
             which needs double precision.
 

@@ -110,7 +110,7 @@ class HangingChain(AbstractSystem):
 
 
 def hanging_chain(steps: int = 100) -> OptimalControl:
-    r"""Find the shape of a hanging chain, the one with the least potential energy.
+    r"""Find the shape of a hanging chain, which has the least potential energy.
 
     The chain has length 4 and hangs between the heights 1 at position 0 and 3 at
     position 1. The minimum is 5.06848, the energy of the catenary. `reference` is the

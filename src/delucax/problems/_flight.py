@@ -20,7 +20,7 @@ class GoddardRocket(AbstractSystem):
     \dot m = -\frac{u}{c}, \qquad D = \mathrm{drag}\, v^2 e^{-\mathrm{decay}\,(h - 1)}$$
 
     The height $h$ is the distance from the centre of the earth. The units are the
-    radius of the earth, its gravity, and the initial mass of the rocket.
+    radius of the earth, the gravity at its surface, and the initial mass of the rocket.
 
     **Arguments:**
 
@@ -61,9 +61,10 @@ def goddard_rocket(steps: int = 100) -> OptimalControl:
 
     The final height is maximised. The rocket starts at rest at height 1 with mass 1,
     and ends with mass 0.6. The bounds are $0 \le u \le 3.5$, $h \ge 1$ and $v \ge 0$;
-    the duration is free. The bounds $0.6 \le m \le 1$ of the benchmark follow from
-    these. The published maximum is 1.01283. The optimal thrust is full at first, then
-    between its bounds (a singular arc), then zero.
+    the duration is free. The bounds $0.6 \le m \le 1$ of the benchmark need not be
+    imposed, because they follow from the initial and the final mass. The published
+    maximum is 1.01283. The optimal thrust is full at first, then between its bounds (a
+    singular arc), then zero.
 
     The first guess is a straight line to height 1.01, half thrust, and a duration of
     0.2.
@@ -171,10 +172,10 @@ def hang_glider(steps: int = 200) -> OptimalControl:
     r"""Glide as far as possible through an updraft.
 
     The final distance $x$ is maximised. The glider starts at $(0, 1000)$ and ends at a
-    height of 900, both times with the velocity $(13.23, -1.288)$. The bounds are
-    $0 \le u \le 1.4$, $x \ge 0$ and $v_x \ge 0$; the duration is free.
+    height of 900. Its velocity is $(13.23, -1.288)$ at the start and at the end. The
+    bounds are $0 \le u \le 1.4$, $x \ge 0$ and $v_x \ge 0$; the duration is free.
 
-    The maximum is 1248.03 m (Betts). The benchmark gives 1255.05 m, which contains the
+    The maximum is 1248.03 m (Betts). The benchmark gives 1255.05 m, which includes the
     error of a discretisation by the trapezoidal rule. The first guess is a lift of 0.7
     for 100 s.
 

@@ -30,7 +30,7 @@ class Reactions(AbstractSystem):
     **Arguments:**
 
     - `rates`: the rates of the reactions, shape `(p,)`.
-    - `function`: the function $f$. It returns a vector of the size of `y`.
+    - `function`: the function $f$. This function returns a vector of the size of `y`.
     - `size`: the size of `y`.
 
     !!! example
@@ -65,13 +65,13 @@ class Reactions(AbstractSystem):
 class Sampled(AbstractDynamics):
     """A discretised system whose step `k` has the length `widths[k]`.
 
-    Its time counts the steps, so `dt` is 1 by default.
+    The time of these dynamics is the number of steps, so `dt` is 1 by default.
 
     **Arguments:**
 
     - `inner`: a [`delucax.Discretized`][] system. Its `dt` is not used.
     - `widths`: the lengths of the steps, shape `(T,)`.
-    - `dt`: the step of the time that counts the steps, 1 by default.
+    - `dt`: the increase of this time in one step, 1 by default.
 
     !!! example
 
@@ -114,8 +114,8 @@ class Sampled(AbstractDynamics):
     def refined(self, points: int, inner: Callable[[Any], Any]) -> "Sampled":
         """The same dynamics with each step cut into parts, and another discretisation.
 
-        **Arguments:** `points`: the number of parts. `inner`: a function from the old
-        inner dynamics to the new.
+        **Arguments:** `points`: the number of parts. `inner`: a function that takes the
+        old inner dynamics and returns the new inner dynamics.
 
         **Returns:** a [`delucax.problems.Sampled`][].
         """

@@ -133,8 +133,8 @@ def robot_arm(steps: int = 90) -> OptimalControl:
     $0 \le \phi \le \pi$. The published minimum time is 9.14138. The first guess is a
     straight line between the ends, controls of zero, and a duration of 10.
 
-    For some numbers of steps, for example 100, a control switches exactly at a step.
-    The derivatives of the solution are then NaN.
+    For some numbers of steps, for example 100, a control switches exactly at a step. In
+    these cases, the derivatives of the solution are NaN.
 
     **Arguments:** `steps`: T, the number of steps, 90 by default.
 

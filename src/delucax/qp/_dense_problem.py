@@ -180,7 +180,7 @@ class Dense(eqx.Module):
         return [self.P]
 
     def primal(self, x: Array) -> tuple[Array, None]:
-        """The variables for the unknowns `x` of the form, and `None` for the controls."""
+        """The variables for the unknowns `x`, and `None` for the controls."""
         return x, None
 
     def multipliers(self, p: Array, sides: Array) -> DenseMultipliers:

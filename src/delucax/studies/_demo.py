@@ -54,7 +54,7 @@ def demo(
     - `steps`: the number of optimiser steps for each MLP, 800 by default.
     - `say`: a function that gets each line of text; `print` by default.
 
-    **Returns:** the table of the pendulum, a `pandas.DataFrame`.
+    **Returns:** a `pandas.DataFrame` with the results for the pendulum.
 
     **Raises:** `OSError` if the folder cannot be written; `ValueError` if `seeds` is
     below 1.

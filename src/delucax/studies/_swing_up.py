@@ -31,10 +31,11 @@ def train_swing_up(
 ) -> Fitted:
     """Train an MLP that swings up a pendulum and holds it, through the ODE.
 
-    The gradient of a long swing explodes at the unstable upright, and plain gradient
-    descent then ends in spinning. The gradient is therefore damped by 0.92 per step
-    back in time. The network has one hidden layer of width 32. Each step of Adam, with
-    cosine decay from 0.01, uses 128 new starts and a horizon of 100 steps.
+    The gradient through a long swing explodes at the unstable upright position, so
+    plain gradient descent ends with a pendulum that spins. The gradient is therefore
+    damped by 0.92 per step back in time. The network has one hidden layer of width 32.
+    Each step of Adam, with cosine decay from 0.01, uses 128 new starts and a horizon of
+    100 steps.
 
     **Arguments:**
 
@@ -87,7 +88,8 @@ def holds_upright(
     **Arguments:**
 
     - `trajectory`: a trajectory of a pendulum, or a batch of them.
-    - `seconds`: the time to look at [s], 5 by default.
+    - `seconds`: the length of the final part of the trajectory that is checked [s], 5
+        by default.
     - `tolerance`: the largest angle [rad], 0.2 by default.
 
     **Returns:** a boolean for each trajectory.

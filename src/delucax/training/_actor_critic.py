@@ -33,7 +33,7 @@ class ActorCritic(eqx.Module):
     $$V(t, y) = a + b\, c(t, y)$$
 
     Here $c$ is the output of the critic. [`delucax.training.PPO`][] and
-    [`delucax.training.SHAC`][] train such a model.
+    [`delucax.training.SHAC`][] train an `ActorCritic`.
 
     **Arguments:**
 

@@ -131,6 +131,9 @@ class AbstractSurrogate(eqx.Module):
     def finished(self, model: PyTree, memory: PyTree) -> PyTree:
         """The model that `fit` returns.
 
+        Override this method to copy values from the memory into the model, such as
+        statistics. By default the model is returned as it is.
+
         **Arguments:** `model`: the model. `memory`: the memory of the last step.
 
         **Returns:** the model.

@@ -80,10 +80,11 @@ class GymnaxDynamics(AbstractDynamics):
     """The step of an environment in gymnax's protocol, as dynamics.
     [`delucax.interop.gymnax.from_gymnax`][] makes it.
 
-    The state is a vector. It holds the entries of all leaves of the state of the
-    environment; if steps draw random numbers, four numbers for a random key; and at the
-    end 1 if the episode is over, else 0. Integers and booleans are floats, which are
-    exact up to 2^24 in float32. The disturbance `w` is added to the next state.
+    The state is a vector. This vector consists of three parts: the entries of all
+    leaves of the state of the environment; if steps draw random numbers, four numbers
+    for a random key; and a last entry that is 1 if the episode is over, otherwise 0.
+    Integers and booleans are stored as floats, which are exact up to 2^24 in float32.
+    The disturbance `w` is added to the next state.
 
     The step is differentiable if the step of the environment is. Derivatives with
     respect to integers are 0.
@@ -91,7 +92,7 @@ class GymnaxDynamics(AbstractDynamics):
     **Arguments:**
 
     - `env`: the environment.
-    - `params`: its parameters.
+    - `params`: the parameters of the environment.
     - `dt`: the duration of a step, 1 by default.
 
     **Raises:** `ValueError` if the environment does not implement the protocol, or `dt`
@@ -175,8 +176,8 @@ class GymnaxDynamics(AbstractDynamics):
         **Arguments:**
 
         - `state`: a state of the environment.
-        - `key`: the random key of the steps, if they draw; `jax.random.key(0)` by
-            default.
+        - `key`: the random key of the steps, if steps draw random numbers;
+            `jax.random.key(0)` by default.
 
         **Returns:** the vector, shape `(state_size,)`.
         """
@@ -278,30 +279,34 @@ def from_gymnax(
     """Convert an environment in gymnax's protocol to a [`delucax.Environment`][].
 
     `env` may be any object with `reset_env`, `step_env`, `action_space`, and `observe`
-    or `get_obs`, if these run under `jax.jit`. Environments of gymnax before and after
-    1.0 are examples.
+    or `get_obs`, if these methods run under `jax.jit`. Environments of gymnax before
+    and after 1.0 are examples.
 
     Controllers observe the whole state as a vector, as in
-    [`delucax.interop.gymnax.GymnaxDynamics`][]. The names of its entries come from the
-    leaves of the state. `encode` returns the observation of the environment. The cost
-    is minus the reward, and a step that is done terminates the episode. A discrete
-    action space becomes the table `actions`; a control between two actions is rounded.
+    [`delucax.interop.gymnax.GymnaxDynamics`][]. The names of the entries of this vector
+    come from the leaves of the state. `encode` returns the observation of the
+    environment. The cost is minus the reward, and a step that returns `done` terminates
+    the episode. A discrete action space becomes the table `actions`; a control between
+    two actions is rounded.
 
-    If a step uses the random key of `step_env`, the state carries it. It is drawn at
-    the start of an episode from the key of the rollout.
+    If a step uses the random key of `step_env`, the state carries this key. At the
+    start of an episode, the key is drawn from the key of the rollout.
 
     The reward may depend on the next state, so `step_env` is evaluated twice: for the
-    dynamics and for the cost. Both hold the parameters. To change the parameters, or to
-    differentiate with respect to them, convert the environment again.
+    dynamics and for the cost. Both the dynamics and the cost hold the parameters. To
+    change the parameters, or to differentiate with respect to them, convert the
+    environment again.
 
-    Gradients pass if the environment passes them. Environments of gymnax stop them. In
-    gymnax 1.0 some have a method `with_transition_gradients`, which is then used.
+    Gradients pass through a step if the environment does not stop them. Environments of
+    gymnax stop gradients. In gymnax 1.0, some environments have a method
+    `with_transition_gradients`, and `from_gymnax` uses it if it exists.
 
     **Arguments:**
 
     - `env`: the environment.
-    - `params`: its parameters; `env.default_params` by default.
-    - `dt`: the duration of a step, 1 by default. The protocol has none.
+    - `params`: the parameters of the environment; `env.default_params` by default.
+    - `dt`: the duration of a step, 1 by default. The protocol does not define a
+        duration.
     - `**environment`: other arguments of [`delucax.Environment`][], such as `encode`,
         or `horizon`, which is `params.max_steps_in_episode` by default.
 
@@ -309,7 +314,7 @@ def from_gymnax(
 
     **Raises:** `ValueError` if the environment does not implement the protocol, if its
     action space is neither a box nor discrete, if the state changes its shape in a
-    step, or if there is no horizon or no observation.
+    step, or if the environment has no horizon or no observation.
 
     !!! example
 

@@ -78,21 +78,21 @@ class GymnaxEnv:
     """A [`delucax.Environment`][] in gymnax's protocol.
     [`delucax.interop.gymnax.to_gymnax`][] makes one.
 
-    It is hashable, so it can be a static argument of `jax.jit`. Two are equal if all
-    their numbers are equal.
+    A `GymnaxEnv` is hashable, so it can be a static argument of `jax.jit`. Two
+    environments are equal if all their numbers are equal.
 
     **Arguments:**
 
     - `env`: the environment. Its numbers are the `default_params`.
-    - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
-        default they are if the environment has such a table.
+    - `discrete`: whether actions are whole numbers, which are indices into
+        `env.actions`. By default true if the environment has a table of actions.
     - `separate_ends`: whether `step` returns `terminated` and `truncated`, as in gymnax
         1.0, in place of `done`. [`delucax.interop.gymnax.to_gymnax`][] describes the
         default.
 
     **Raises:** `ValueError` if an argument is wrong, or `env` is being traced. A step
-    raises it if the action has the wrong size or type, or is not in the table. Traced
-    actions are truncated to whole numbers and clamped to the table.
+    raises a `ValueError` if the action has the wrong size or type, or is not in the
+    table. Traced actions are truncated to whole numbers and clamped to the table.
 
     !!! example
 
@@ -145,7 +145,7 @@ class GymnaxEnv:
 
     @property
     def default_params(self) -> GymnaxParams:
-        """The numbers of the environment that this one was made from."""
+        """The numbers of the original environment."""
         return GymnaxParams(self._made.env)
 
     @property
@@ -178,7 +178,7 @@ class GymnaxEnv:
     def step(
         self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
-        """One step. If it ends the episode, it also starts the next one.
+        """One step. If the step ends the episode, it also starts the next episode.
 
         **Arguments:**
 
@@ -288,8 +288,8 @@ class GymnaxEnv:
             default.
 
         **Returns:** a space with `shape`, `dtype`, `sample(key)` and `contains(x)`, and
-        either `low` and `high`, or `n`. It is a space of gymnax if gymnax has been
-        imported.
+        either `low` and `high`, or `n`. The space is an object of gymnax if gymnax has
+        been imported.
         """
         ends = action_ends(self._environment(params))
         return gymnax_space(self.num_actions if self.discrete else ends)
@@ -300,7 +300,7 @@ class GymnaxEnv:
         **Arguments:** `params`: the numbers of the environment; `default_params` by
             default.
 
-        **Returns:** a space like that of `action_space`.
+        **Returns:** a space with the same attributes as the result of `action_space`.
         """
         return gymnax_space(observation_ends(self._environment(params)))
 
@@ -334,27 +334,27 @@ def to_gymnax(
 
     Libraries that train on environments of gymnax, such as rejax and PureJaxRL, can
     train on the result. The observation is `encode` of the observation of the
-    environment. The reward is minus the cost. The last step adds minus the final cost.
-    The horizon truncates an episode, and `step` then starts the next one. Gradients
-    pass through a step, but not through a reset.
+    environment. The reward is minus the cost. The reward of the last step also includes
+    minus the final cost. The horizon truncates an episode, and `step` then starts the
+    next episode. Gradients pass through a step, but not through a reset.
 
     The numbers of the environment are in `params`, a
     [`delucax.interop.gymnax.GymnaxParams`][]. Use `jax.vmap` over `params` to run many
     plants at once.
 
     A reset draws the disturbances and the sensor noise of a whole episode from its key,
-    and the state carries them. Under `jax.vmap`, each `step` computes a reset for every
-    environment, whether its episode ends or not. If drawing is slow, use `step_env`,
-    which draws nothing.
+    and the state carries these arrays. Under `jax.vmap`, each `step` computes a reset
+    for every environment, whether its episode ends or not. If drawing is slow, use
+    `step_env`, which draws nothing.
 
     **Arguments:**
 
     - `env`: the environment.
-    - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
-        default they are if the environment has such a table.
+    - `discrete`: whether actions are whole numbers, which are indices into
+        `env.actions`. By default true if the environment has a table of actions.
     - `separate_ends`: whether `step` returns `terminated` and `truncated`, as in gymnax
-        1.0, in place of `done`, which rejax and PureJaxRL expect. By default it does if
-        gymnax 1.0 or later has been imported and rejax has not.
+        1.0, instead of `done`, which rejax and PureJaxRL expect. By default true if
+        gymnax 1.0 or later has been imported and rejax has not been imported.
 
     **Returns:** a [`delucax.interop.gymnax.GymnaxEnv`][].
 

@@ -158,8 +158,8 @@ def register_drawing(
 ) -> None:
     """Set how [`delucax.animate`][] draws a kind of plant.
 
-    The drawing is used for environments whose system or dynamics is of this class or a
-    subclass of it. Registering the class again replaces its drawing.
+    The drawing is used for environments whose system or dynamics is of the class
+    `system_class` or of a subclass. Registering the class again replaces its drawing.
 
     **Arguments:**
 
@@ -167,12 +167,13 @@ def register_drawing(
         [`delucax.AbstractDynamics`][].
     - `draw`: a function `draw(ax, x, u)` that draws one moment on Matplotlib axes of
         equal aspect. `x` is the state, shape `(n,)`, and `u` the control, shape `(m,)`,
-        both NumPy arrays. It is called for each frame, and what it drew for the
-        previous frame is removed first.
-    - `setup`: a function `setup(ax, environment, trajectory)` that is called once. It
-        draws what does not move and sets the limits of the axes. It may return a
-        dictionary, with the lengths of the plant, for example: `draw` gets its entries
-        as keyword arguments. None by default: the limits then fit all that is drawn.
+        both NumPy arrays. `draw` is called for each frame, after the drawing of the
+        previous frame has been removed.
+    - `setup`: a function `setup(ax, environment, trajectory)` that is called once.
+        `setup` draws the parts that do not move and sets the limits of the axes. It may
+        return a dictionary, for example with the lengths of the plant, and `draw` gets
+        the entries as keyword arguments. None by default. Without `setup`, the limits
+        of the axes fit everything that is drawn.
 
     **Raises:** `ValueError` if the class is not a subclass of `AbstractSystem` or
     `AbstractDynamics`, or if `draw` or `setup` is not a function.

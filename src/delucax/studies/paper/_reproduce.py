@@ -46,17 +46,17 @@ def reproduce(
     - `names`: `"all"` (default) or some of `oracle-complexity`, `policy-gradient`,
         `estimator-variance`, `wall-clock`, `ventilator`, `pendulum-shock` and
         `lq-perturbations`.
-    - `out`: the folder to write to, `"paper"` by default. It gets `report.html`,
-        `claims.csv` and the figures. The folder `lung` (or `lung-small`) in it gets the
-        files of [`delucax.studies.lung_study`][], which continues there if it was
-        interrupted.
+    - `out`: the folder to write to, `"paper"` by default. The function writes
+        `report.html`, `claims.csv` and the figures to it. The folder `lung` (or
+        `lung-small`) in it contains the files of [`delucax.studies.lung_study`][],
+        which continues from these files if it was interrupted.
     - `small`: whether to use fewer seeds and steps; `False` by default.
     - `say`: a function that gets each line of text; `print` by default.
 
     **Returns:** a dictionary for each claim, with the keys `study`, `claim`, `measured`
     and `holds`.
 
-    **Raises:** `ValueError` if a name is not one of these; `OSError` if the folder
+    **Raises:** `ValueError` if a name in `names` is unknown; `OSError` if the folder
     cannot be written; `ImportError` without pandas or Matplotlib.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,

@@ -42,24 +42,24 @@ def lung_study(
 ) -> list[dict[str, Any]]:
     """Learn simulators of lungs from breaths, and train controllers in the simulators.
 
-    The controllers are then tested in the lungs themselves, beside the best PIDs. The
-    lungs are those of the task `lung/double_compartment`, with the nine pairs of
-    resistance and compliance in the public data set. Their valves lag, and their sensor
-    is two samples late and adds noise of 0.2 cmH2O.
+    The controllers are then tested in the lungs themselves, and compared with the best
+    PIDs. The lungs are the lungs of the task `lung/double_compartment`, with the nine
+    pairs of resistance and compliance in the public data set. Their valves respond with
+    a lag, and their sensor is two samples late and adds noise of 0.2 cmH2O.
 
-    With `data`, the breaths come from a file. The lungs themselves are then unknown, so
-    grey-box lungs that are fitted to the same breaths stand in for them, and no lungs
-    in between are tested. It is assumed that the sensor of the ventilator is
-    `sensor_delay` samples late with noise of 0.2 cmH2O, that the PEEP is about 5 cmH2O,
-    and, except for the learned lungs, that the valves are those of
-    [`delucax.lung.Valves`][].
+    With `data`, the breaths come from a file. In this case the lungs themselves are
+    unknown. The controllers are therefore tested on grey-box lungs that are fitted to
+    the same breaths, and not on lungs with intermediate parameters. The study assumes
+    that the sensor of the ventilator is `sensor_delay` samples late with noise of 0.2
+    cmH2O, that the PEEP is about 5 cmH2O, and, except for the learned lungs, that the
+    valves behave like [`delucax.lung.Valves`][].
 
-    Each part is stored in the folder when it is done, so that an interrupted study
-    continues there.
+    Each part of the study is stored in the folder when it is finished, so that an
+    interrupted study continues from the last finished part.
 
     **Arguments:**
 
-    - `out`: the folder to write to, `"lung"` by default. It gets `report.csv`,
+    - `out`: the folder to write to, `"lung"` by default. The study writes `report.csv`,
         `simulators.csv`, `summary.json`, figures, `breath.gif`, the learned lungs
         (`simulators.dlx`), and the controllers that stayed below the abort limit
         (`controllers/*.dlx`), which `delucax.load` reads.
@@ -68,12 +68,12 @@ def lung_study(
     - `data`: a file that [`delucax.lung.read_breaths`][] reads; none by default.
     - `seeds`: the number of controllers of each kind to train; 3 by default, or 1 with
         `small`.
-    - `sensor_delay`: the delay of the sensor in samples, also of the sensor in `data`;
-        2 by default.
+    - `sensor_delay`: the delay of the sensor in samples, also for the measurements in
+        `data`; 2 by default.
     - `say`: a function that gets each line of text; `print` by default.
     - `progress`: whether trainings show a progress bar; `True` by default.
 
-    **Returns:** the rows of the report, dictionaries.
+    **Returns:** the rows of the report, each a dictionary.
 
     **Raises:** `ValueError` if an argument is invalid, the folder holds a study with
         other settings, a file in it is damaged, or the data are invalid; `OSError` if a
