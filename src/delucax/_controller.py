@@ -184,7 +184,7 @@ class AbstractLearner(AbstractController):
 
     @abc.abstractmethod
     def fresh(self, state: PyTree, key: PRNGKey | None) -> PyTree:
-        """A state that has seen the same observations, but has learned nothing yet.
+        """A state with the observations of `state`, but without anything learned.
 
         **Arguments:** `state`: the learner's state. `key`: a random key, or `None`.
 
@@ -269,7 +269,7 @@ class Tally(eqx.Module):
 
     Keep it in the controller's state. After each step, [`delucax.rollout`][] finds all
     tallies in the state, so wrappers of controllers need not forward them.
-    `trajectory.incidents` tells at which steps a count rose.
+    `trajectory.incidents` records the steps at which a count rose.
 
     **Arguments:**
 
@@ -279,8 +279,8 @@ class Tally(eqx.Module):
 
     - `count`: an integer scalar, 0 at first.
 
-    **Raises:** `ValueError` for the name `"clipped_control"`, which a rollout counts
-    itself.
+    **Raises:** `ValueError` for the name `"clipped_control"`, because a rollout counts
+    clipped controls itself.
 
     !!! example
 

@@ -35,8 +35,8 @@ def frequency_response(
     $$G(s) = C (s I - A)^{-1} B$$
 
     at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. The response is
-    infinite at a frequency at which the model has a pole. It is differentiable with
-    respect to the model and to `omega`.
+    infinite at a frequency at which the model has a pole. The response is
+    differentiable with respect to the model and to `omega`.
 
     **Arguments:**
 
@@ -103,7 +103,7 @@ def dcgain(
     **Returns:** the gain, shape `(p, m)`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
-    unknown. With `throw`, an error at run time if there is an integrator.
+    unknown. With `throw`, an error at run time if the model has an integrator.
 
     !!! example
 
@@ -189,9 +189,10 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 
     $$\sqrt{\mathrm{tr}(C W C^\top)}$$
 
-    with the controllability Gramian $W$. Its square is also the energy of the outputs
-    after a unit impulse, summed over the inputs. The norm is infinite if the model is
-    not stable. It is differentiable to any order, in forward and reverse mode.
+    with the controllability Gramian $W$. The square of the norm is also the energy of
+    the outputs after a unit impulse, summed over the inputs. The norm is infinite if
+    the model is not stable. It is differentiable to any order, in forward and reverse
+    mode.
 
     **Arguments:**
 
@@ -240,8 +241,8 @@ def hinf_norm(
 
     $$\max_\omega \; \sigma_{\max} \left( C (s I - A)^{-1} B \right)$$
 
-    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. It is infinite if
-    the model is not stable.
+    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. The norm is
+    infinite if the model is not stable.
 
     The frequencies at which the gain crosses a level are eigenvalues of a Hamiltonian
     matrix. The search sets a level just above the largest gain found so far, and

@@ -17,8 +17,8 @@ def controllability_matrix(
 ) -> Float[Array, "n nm"]:
     r"""The controllability matrix $[B,\; A B,\; \dots,\; A^{n-1} B]$.
 
-    Its rank is the dimension of the controllable subspace. With more than a few states
-    the matrix is ill-conditioned: to test controllability, use
+    The rank of the matrix is the dimension of the controllable subspace. With more than
+    a few states the matrix is ill-conditioned: to test controllability, use
     [`delucax.analysis.is_controllable`][], which tests each mode.
 
     **Arguments:**
@@ -53,8 +53,9 @@ def controllability_matrix(
 def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
     r"""The observability matrix $[C;\; C A;\; \dots;\; C A^{n-1}]$.
 
-    Its rank is $n$ if the model is observable. With more than a few states the matrix
-    is ill-conditioned: use [`delucax.analysis.is_observable`][] instead.
+    The rank of the matrix is $n$ if the model is observable. With more than a few
+    states the matrix is ill-conditioned: use [`delucax.analysis.is_observable`][]
+    instead.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
     [`delucax.LinearDynamics`][].
@@ -109,14 +110,14 @@ def controllability_gramian(
         discrete time a number of steps. By default the horizon is infinite, which
         requires a stable model.
     - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
-    - `throw`: raise an error if there is no horizon and the model is not stable
+    - `throw`: raise an error if `horizon` is not given and the model is not stable
         (default). If false, return infinity.
 
     **Returns:** the Gramian, shape `(n, n)`, symmetric.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, if `horizon`
     is not positive, or if `inputs` is unknown. With `throw`, an error at run time if
-    there is no horizon and the model is not stable.
+    `horizon` is not given and the model is not stable.
 
     Source: Van Loan, 1978 (finite horizon).
 
@@ -159,14 +160,14 @@ def observability_gramian(
     - `horizon`: $T$: in continuous time a positive number, in units of time; in
         discrete time a number of steps. By default the horizon is infinite, which
         requires a stable model.
-    - `throw`: raise an error if there is no horizon and the model is not stable
+    - `throw`: raise an error if `horizon` is not given and the model is not stable
         (default). If false, return infinity.
 
     **Returns:** the Gramian, shape `(n, n)`, symmetric.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or if
-    `horizon` is not positive. With `throw`, an error at run time if there is no horizon
-    and the model is not stable.
+    `horizon` is not positive. With `throw`, an error at run time if `horizon` is not
+    given and the model is not stable.
 
     Source: Van Loan, 1978 (finite horizon).
 

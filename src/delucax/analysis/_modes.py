@@ -27,7 +27,7 @@ class ModalTest(eqx.Module):
         matrices that makes the mode uncontrollable, so it is zero for a mode that is
         uncontrollable already.
     - `unstable`: which modes are on or outside the boundary of stability, shape `(n,)`.
-    - `tolerance`: a distance up to this number counts as zero.
+    - `tolerance`: a distance up to this number is treated as zero.
 
     The measurements have no gradient.
 
@@ -96,7 +96,7 @@ def modal_controllability(
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
     - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
-    - `tolerance`: a relative distance up to this number counts as zero; by default
+    - `tolerance`: a relative distance up to this number is treated as zero; by default
         `10 n` times machine epsilon.
 
     **Returns:** a [`delucax.analysis.ModalTest`][] of all modes.
@@ -370,9 +370,9 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
 
     $$\begin{bmatrix} A - z I & B \\ C & 0 \end{bmatrix}$$
 
-    The algorithm removes the states that the outputs observe directly. It then does the
-    same for the transposed system. The poles of the remaining system are the zeros. The
-    number of zeros depends on the values of the matrices, so the matrices cannot be
+    The algorithm removes the states that the outputs observe directly. Then it applies
+    this step to the transposed system. The poles of the remaining system are the zeros.
+    The number of zeros depends on the values of the matrices, so the matrices cannot be
     traced.
 
     **Arguments:**

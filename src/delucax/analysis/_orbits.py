@@ -68,8 +68,8 @@ class PeriodicOrbit(eqx.Module):
     - `period`: the period, in units of time, a scalar.
     - `jacobian`: the Jacobian of the map from event to event, shape `(n, n)`.
     - `multipliers`: the eigenvalues of `jacobian`, shape `(n,)`, complex, the largest
-        first. The orbit is stable if all of them are inside the unit circle. At least
-        one multiplier is zero, because every event happens on the same surface.
+        first. The orbit is stable if all multipliers are inside the unit circle. At
+        least one multiplier is zero, because every event happens on the same surface.
     - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
 
     !!! example

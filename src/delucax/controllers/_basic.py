@@ -96,7 +96,7 @@ class Random(AbstractController):
     - `mean`: $\mu$, a number or of shape `(m,)`; 0 by default.
 
     **Raises:** `ValueError` if `std` is not a vector of finite numbers of at least 0,
-    or `mean` does not fit; at run time, if there is no random key.
+    or `mean` has the wrong shape; at run time, if there is no random key.
 
     !!! example
 

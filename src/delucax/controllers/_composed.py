@@ -102,8 +102,9 @@ class History(AbstractController):
     $$u_t = \pi(t, (z_t, z_{t-1}, \dots, z_{t-n}, u_{t-1}, \dots, u_{t-n})),
     \qquad z_t = \phi(y_t)$$
 
-    The past controls are those that were applied, after clipping. At the start of an
-    episode, the past controls are zero and the past observations equal the first one.
+    The past controls in the window are the applied controls, after clipping. At the
+    start of an episode, the past controls are zero and the past observations equal the
+    first one.
 
     **Arguments:**
 

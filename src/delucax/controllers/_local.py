@@ -180,7 +180,7 @@ def local_mpc(
 
     **Returns:** a [`delucax.controllers.MPC`][].
 
-    **Raises:** `ValueError` if the observation and the state differ in size, or
+    **Raises:** `ValueError` if the observation and the state have different sizes, or
     for the same reasons as [`delucax.controllers.MPC`][].
 
     !!! example

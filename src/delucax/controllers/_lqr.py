@@ -49,8 +49,8 @@ class LQR(AbstractController):
     $$u_k = u_{r,k} - K\, \mathrm{difference}(x_k, r_k) -
     (R + B^\top P B)^{-1} B^\top \sum_{j \ge 0} ((A - B K)^\top)^j P\, d_{k+j}$$
 
-    Here $d_k = F(r_k, u_{r,k}, w_k) - r_{k+1}$ is the error after one step $F$ of the
-    linear dynamics from the reference. The feed-forward is optimal if the signals are
+    Here $d_k = F(r_k, u_{r,k}, w_k) - r_{k+1}$ is the error of the reference after one
+    step $F$ of the linear dynamics. The feed-forward is optimal if the signals are
     known `preview` steps ahead and are constant after that. The state reaches a
     constant $r$ exactly only if $u_r$ holds it there, because the cost penalises any
     control other than $u_r$. [`delucax.controllers.LQI`][] reaches it without knowing
@@ -73,8 +73,8 @@ class LQR(AbstractController):
     - `disturbance`: $w$, a disturbance known in advance, a vector of shape `(k,)` or a
         function of time; none by default.
     - `preview`: the number of steps ahead at which the signals are known, 0 by default.
-    - `difference`: a function `(x, x_ref) -> deviation`, such as the `difference` of
-        the system that you linearised, which wraps angles. By default it is subtraction
+    - `difference`: a function `(x, x_ref) -> deviation`, for example the `difference`
+        of the system that you linearised, to wrap angles. By default it is subtraction
         or, with a `point`, the `difference` of nonlinear `dynamics`.
     - `point`: the [`delucax.dynamics.OperatingPoint`][] about which to linearise
         `dynamics` at time 0, from [`delucax.trim`][]. Without it, `dynamics` must be
@@ -204,8 +204,8 @@ class LQI(AbstractController):
 
     where $v$ stacks the deviation of the state and the integral $z$.
 
-    If the applied control differs from the one that the regulator asked for, for
-    example because it was clipped, then back-calculation sets the integral to the value
+    If the applied control differs from the control that the regulator computed, for
+    example because of clipping, then back-calculation sets the integral to the value
     that would have given the applied control. So the integral does not wind up when the
     control is clipped.
 
@@ -217,7 +217,7 @@ class LQI(AbstractController):
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n+p, m)`; zero by default.
     - `output`: $C$, the map from the state to the regulated outputs, shape `(p, n)`.
-        There are at most as many outputs as controls.
+        The number of outputs must not exceed the number of controls.
     - `reference`: $r$, a vector of shape `(p,)` or a function of time that returns such
         a vector; the outputs at the operating point by default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
@@ -228,7 +228,7 @@ class LQI(AbstractController):
     the operating point.
 
     **Raises:** `ValueError` for the same reasons as [`delucax.controllers.LQR`][], or
-    if `output` or `reference` does not fit; an error at run time if there is no
+    if `output` or `reference` has the wrong shape; an error at run time if there is no
     stabilising gain, for example because the controls cannot move the outputs
     independently.
 

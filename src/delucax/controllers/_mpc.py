@@ -131,16 +131,16 @@ class MPC(AbstractController):
         stabilising feedback.
     - `throw`: whether to raise an error at run time if there is no usable plan; true by
         default. If false, the controller uses the last plan for one more step, under
-        its gains, and then discards it. If there is no usable plan in the next step
-        either, it applies the first trajectory of `start`, which is by default the
-        trajectory under the LQR. With `real_time`, the controller keeps following the
-        last plan.
+        the gains of the plan, and then discards the plan. If there is no usable plan in
+        the next step either, it applies the first trajectory of `start`, which is by
+        default the trajectory under the LQR. With `real_time`, the controller keeps
+        following the last plan.
     - `fallback`: a controller that acts in the steps without a usable plan, instead of
         raising. The fallback is called at every step, so that its state is up to date.
         None by default.
     - `real_time`: whether to solve one quadratic program per step; false by default.
-        The planner must then be a [`delucax.planning.SQP`][], which is also the
-        default.
+        With `real_time`, the planner must be a [`delucax.planning.SQP`][], which is
+        also the default.
     - `max_qp_steps`: the largest number of linear systems that are solved for a
         quadratic program, 50 by default.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for

@@ -169,7 +169,7 @@ def mlp_policy(
     [`delucax.controllers.Gaussian`][] around one.
 
     **Raises:** `ValueError` if `environment` is not an environment, `head` is unknown,
-    a size is below 1 or there is no key.
+    a size is below 1 or no `key` is given.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).

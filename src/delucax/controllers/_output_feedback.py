@@ -29,8 +29,8 @@ class OutputFeedback(AbstractController):
     """A state-feedback controller that acts on an estimate of the state.
 
     At each step the estimator updates its estimate with the observation, and the
-    controller acts on the mean of the estimate. Then the estimator predicts, with the
-    control that was applied after clipping.
+    controller acts on the mean of the estimate. Then the estimator predicts the next
+    state, with the control that was applied after clipping.
 
     A rollout counts the steps at which the `status` of the estimator is not successful,
     in `incidents["failed_estimate"]`.

@@ -198,8 +198,8 @@ class PID(_AbstractPID):
     - `derivative_time_constant`: $T_d$, the time constant of the first-order lag of the
         derivative, `dt` by default; 0 for no lag.
     - `derivative_on`: `"measurement"` (default) or `"error"`.
-    - `anti_windup_time`: $T_a$, at least `dt`. By default the integral time `kp / ki`
-        of each loop, but at least `dt`.
+    - `anti_windup_time`: $T_a$, at least `dt`. The default is the integral time
+        `kp / ki` of each loop, but at least `dt`.
 
     **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or a
     time is out of its range; at run time, if the number of outputs is not the number of

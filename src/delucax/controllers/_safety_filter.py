@@ -60,7 +60,7 @@ class SafetyFilterState(NamedTuple):
 
 
 class SafetyFilter(AbstractController):
-    r"""A filter that makes any controller safe, with the least change of its control.
+    r"""A filter that makes any controller safe with the smallest change of its control.
 
     The filter takes the control $n$ of a controller, and keeps barriers $b(t, x)$ at
     zero or above. It solves
@@ -117,11 +117,11 @@ class SafetyFilter(AbstractController):
     and `failures`, the number of failed steps so far.
 
     **Derivatives.** You can train a policy through the filter. The derivatives are
-    exact, in discrete time by the implicit function theorem if the filter converged. A
-    single active condition is solved in closed form, and several active conditions by
-    [`delucax.qp.solve`][]. The control is not smooth at states where a condition
-    becomes active. At such states the derivative is a one-sided derivative, or NaN if a
-    quadratic program was solved.
+    exact. In discrete time, they come from the implicit function theorem and are exact
+    if the filter converged. A single active condition is solved in closed form, and
+    several active conditions by [`delucax.qp.solve`][]. The control is not smooth at
+    states where a condition becomes active. At such states the derivative is a
+    one-sided derivative, or NaN if a quadratic program was solved.
 
     **Arguments:**
 
@@ -137,8 +137,9 @@ class SafetyFilter(AbstractController):
         time, a fraction from 0 to 1 in discrete time. Give a number; or, for degree
         two, a pair of the first and the second decay; or a dictionary from the name of
         a barrier to a number or a pair.
-    - `margin`: the least value of each condition, in its own units; 0 by default. Give
-        a number, or a dictionary from the name of a barrier to a number.
+    - `margin`: the smallest allowed value of each condition, in the units of the
+        condition; 0 by default. Give a number, or a dictionary from the name of a
+        barrier to a number.
     - `disturbance`: the largest absolute value of each disturbance, a number or of
         shape `(k,)`; none by default.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
@@ -285,7 +286,7 @@ class SafetyFilter(AbstractController):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the conditions, one for each value of a barrier."""
+        """The names of the conditions. Each value of a barrier has one condition."""
         return entry_names(self.barriers, self.sizes)
 
     @property
@@ -341,7 +342,7 @@ class SafetyFilter(AbstractController):
         **Raises:** `ValueError` if the filter acts in discrete time or has no finite
         bounds, if the box has the wrong shape, or if the grid is too large.
 
-        Source: Breeden, Garg and Panagou, 2022 (the margin by the second derivative
+        Source: Breeden, Garg and Panagou, 2022 (a margin from the second derivative
         along a step); Cortez et al., 2019.
 
         !!! example

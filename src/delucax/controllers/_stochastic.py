@@ -80,8 +80,8 @@ class Gaussian(_AroundBase):
     - `bounds`: `(low, high)`, each a number or a vector, such as `env.control_bounds`;
         none by default.
 
-    **Raises:** `ValueError` if `base` is not a controller or sizes do not fit; at run
-    time, if there is no random key.
+    **Raises:** `ValueError` if `base` is not a controller or the sizes of the arguments
+    do not fit each other; at run time, if there is no random key.
 
     Source: Williams, 1992; Fujita and Maeda, 2018 (clipped controls).
 
@@ -288,8 +288,8 @@ class Categorical(_AroundBase):
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
         """The log-probability with which `__call__(t, y, state)` returns `u`.
 
-        **Arguments:** `t`, `y`, `state`: as in a call. `u`: a control, shape `(m,)`. It
-        counts as the nearest of the `actions`.
+        **Arguments:** `t`, `y`, `state`: as in a call. `u`: a control, shape `(m,)`.
+        The control `u` is replaced by the nearest of the `actions`.
 
         **Returns:** a scalar.
         """

@@ -152,8 +152,8 @@ class AbstractEstimator(eqx.Module):
 
         **Arguments:** `state`: the state of the estimator after the call.
 
-        **Returns:** one of `delucax.RESULTS`. By default it is `RESULTS.diverged` if
-        the estimate is not finite, and success otherwise.
+        **Returns:** one of `delucax.RESULTS`. By default the status is
+        `RESULTS.diverged` if the estimate is not finite, and success otherwise.
         """
         finite = self.estimate(state).is_finite
         return choose(finite, RESULTS.successful, RESULTS.diverged)

@@ -72,9 +72,9 @@ class KalmanFilter(AbstractGaussianFilter):
     measurement update, shape `(n, n)`. They are `None` otherwise.
 
     **Raises:** `ValueError` if `dynamics` is not linear, a covariance is not symmetric
-    and semidefinite, or sizes do not fit; or if `steady_state` is combined with
-    time-varying dynamics or with `covariance`. An error at run time if the filter has
-    no steady state.
+    and semidefinite, or the sizes of the arguments do not fit each other; or if
+    `steady_state` is combined with time-varying dynamics or with `covariance`. An error
+    at run time if the filter has no steady state.
 
     Source: Kalman, 1960; Bucy and Joseph, 1968.
 
@@ -237,7 +237,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     This filter is the [`delucax.estimators.KalmanFilter`][] with
     $A = \partial F / \partial x$, $E = \partial F / \partial w$ and
     $C = \partial h / \partial x$, computed at each step by automatic differentiation.
-    For linear dynamics both filters are the same.
+    For linear dynamics, the extended Kalman filter is the same as the Kalman filter.
 
     **Arguments:**
 
@@ -254,7 +254,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
         use `dynamics.difference`.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
-    symmetric and semidefinite, or sizes do not fit.
+    symmetric and semidefinite, or the sizes of the arguments do not fit each other.
 
     Source: Schmidt, 1966; Jazwinski, 1970.
 
@@ -340,7 +340,8 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
     - `kappa`: $\kappa$, additional spread, a number above `-n`; 0 by default.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
-    symmetric and semidefinite, a number is out of its range, or sizes do not fit.
+    symmetric and semidefinite, a number is out of its range, or the sizes of the
+    arguments do not fit each other.
 
     Source: Julier and Uhlmann, 1997; Wan and van der Merwe, 2000.
 

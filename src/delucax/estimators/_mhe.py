@@ -81,7 +81,7 @@ class MHE(AbstractEstimator):
         angles among the observations; subtraction by default.
 
     If a reading is missing, do not call `update` at this step. An observation that is
-    not finite is left out, and counts as a failure. `status` is
+    not finite is left out, and `status` reports a failure. `status` is
 
     - `diverged` if an observation or the solution is not finite. If the solution is not
         finite, the window keeps the estimate before the update.
@@ -91,9 +91,9 @@ class MHE(AbstractEstimator):
         if more iterations would change the estimate.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
-    symmetric and semidefinite, sizes do not fit, bounds are not numbers with
-    `low <= high`, a parameter is not finite in the dynamics, or a number is out of its
-    range.
+    symmetric and semidefinite, the sizes of the arguments do not fit each other, bounds
+    are not numbers with `low <= high`, a parameter is not finite in the dynamics, or a
+    number is out of its range.
 
     Source: Rao, Rawlings and Mayne, 2003; Haseltine and Rawlings, 2005; Kühl et al.,
     2011 (the prior); Diehl et al., 2005 (the real-time iteration); Huber, 1964.

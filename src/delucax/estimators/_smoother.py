@@ -87,9 +87,10 @@ def run_filter(
         size `T`;
     - `log_likelihoods`: the log-density of each observation given those before it,
         shape `(T,)`, and `log_likelihood`, their sum;
-    - `result`: one of `delucax.RESULTS`. It is `diverged` if a belief is not finite;
-        all results from this step on are NaN. It is `ill_posed` if only the likelihood
-        is not finite, because the covariance of an observation is not definite.
+    - `result`: one of `delucax.RESULTS`. The result is `diverged` if a belief is not
+        finite; all results from this step on are NaN. The result is `ill_posed` if only
+        the likelihood is not finite, because the covariance of an observation is not
+        definite.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
     finite; with `throw`, an error at run time if a belief or the likelihood is not

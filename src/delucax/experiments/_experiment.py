@@ -230,8 +230,8 @@ class experiment:  # noqa: N801
     """Make an experiment from a function. Its decorators are like those of pytest.
 
     The function is called for each case, with the parameters and fixtures as arguments.
-    It returns a number, or a dictionary from names to numbers, strings or arrays. The
-    arguments of the function decide how the function is called:
+    The function must return a number, or a dictionary from names to numbers, strings or
+    arrays. The arguments of the function decide how the function is called:
 
     - with `key`: the function is traced, compiled, and called for all seeds at once by
         `vmap`, each with `jax.random.key(seed)`. Arrays, the arrays of modules, and

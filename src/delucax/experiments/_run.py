@@ -59,8 +59,8 @@ def run(
 
     If a case fails, its traceback is recorded and the other cases are still run, even
     if the case kills its worker process. Each result is stored at once. A stored case
-    is not run again unless its code or parameters changed, so the same call continues a
-    run that was killed.
+    is run again only if its code or parameters changed. So if a run was killed, the
+    same call of `run` continues it.
 
     **Arguments:**
 

@@ -28,7 +28,7 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
 
     **Returns:** a number, or an array without that axis.
 
-    **Raises:** `ValueError` if there are no values.
+    **Raises:** `ValueError` if `values` is empty.
 
     !!! example
 
@@ -245,7 +245,7 @@ class Bootstrap:
         - `ratio`: whether to compute the ratio instead of the difference; `False` by
             default.
 
-        **Returns:** `(value, low, high)`; NaN if there are no pairs.
+        **Returns:** `(value, low, high)`; NaN if no pairs are given.
         """
         if not groups:
             return np.nan, np.nan, np.nan

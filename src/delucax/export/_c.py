@@ -35,7 +35,8 @@ def c(
     The files are `NAME.h` and `NAME.c` in `directory`. The files are C99 and need only
     the C standard library. The program uses the stack only: it allocates no memory. The
     program has no recursion and no global or static variables. Every loop has a bound.
-    Whatever does not depend on the inputs, such as weights, becomes a constant.
+    Every value that does not depend on the inputs, such as the weights of a network,
+    becomes a constant.
 
     A controller becomes three functions, which do what its `init`, `__call__` and
     `applied` do: `NAME_init(state)`, `NAME_step(state, t, y, u)` and
@@ -61,21 +62,22 @@ def c(
         of arrays.
     - `directory`: the folder to write to. The folder is created if it does not exist.
     - `name`: an identifier in C. All public names in the C code begin with `name`.
-    - `dtype`: the type of all real numbers, `"float32"` or `"float64"`. By default it
-        is the type of the arrays in `function_or_controller` and `example`. The type
-        may differ from the precision of JAX in this process.
+    - `dtype`: the type of all real numbers, `"float32"` or `"float64"`. By default the
+        type is the type of the arrays in `function_or_controller` and `example`. The
+        type may differ from the precision of JAX in this process.
     - `example`: for a function, a tuple of its inputs: arrays, numbers,
         `jax.ShapeDtypeStruct`, or pytrees of them. Only the shapes and types of the
         inputs are used. For a controller, an observation, which you need to give only
         if the controller does not fix the size of the observation.
-    - `fallback`: the control of a step that fails, shape `(m,)`. By default it is the
-        control of the last step that succeeded, or zeros if no step has succeeded yet.
+    - `fallback`: the control of a step that fails, shape `(m,)`. By default the
+        fallback is the control of the last step that succeeded, or zeros if no step has
+        succeeded yet.
     - `key`: a random key, for a controller that draws random numbers, such as
         [`delucax.controllers.BPC`][]. The state in C holds the two words of the key.
         The C code draws the numbers that JAX would draw after `init(key=key)`, and the
         same numbers again after each `NAME_init`.
     - `plant`: a plant whose names and units are written into the header of a
-        controller. By default it is a plant that the controller holds.
+        controller. By default the plant is taken from the controller, if it holds one.
     - `max_iterations`: the largest number of rounds of a loop for which no bound is
         found. A loop that would need more rounds stops after `max_iterations` rounds,
         and the flag is `NAME_BAD_RESULT`.

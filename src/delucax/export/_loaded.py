@@ -38,8 +38,8 @@ class LoadedController(AbstractController):
     computes in the precision of the export. It has no derivative.
 
     If a number is not finite, the control is the `fallback` of [`delucax.export.c`][]:
-    by default the control of the last step that succeeded. A rollout records each such
-    step in `trajectory.incidents` as `"declared_answer"`, and
+    by default the control of the last step that succeeded. A rollout records each step
+    with a fallback in `trajectory.incidents` as `"declared_answer"`, and
     [`delucax.export.Running`][] warns.
 
     **Arguments:**
@@ -216,8 +216,8 @@ class LoadedFunction:
     It takes and returns NumPy arrays. If one of the arguments is a JAX array, the
     function returns JAX arrays, also under `jit` and `vmap`. The results are those of
     the exported function, as a flat tuple if there are several results. It has no
-    derivative. A result that is not finite is returned as it is; with NumPy arrays
-    there is a warning.
+    derivative. A result that is not finite is returned unchanged. With NumPy arrays the
+    function also warns.
 
     **Arguments:**
 
@@ -278,8 +278,8 @@ class LoadedFunction:
         return results[0] if len(results) == 1 else tuple(results)
 
     def bind(self, *arrays: np.ndarray) -> Callable[[], int]:
-        """Bind the function to arrays that it reads and writes. A call then takes a
-        fraction of a microsecond.
+        """Bind the function to arrays that it reads and writes. A call of the bound
+        function takes a fraction of a microsecond.
 
         **Arguments:** `*arrays`: the arrays to read, then the arrays to write the
         results to. The arrays must be contiguous NumPy arrays with the types of the C

@@ -23,7 +23,8 @@ def read_linear(
 
     The model is $\dot x = A x + B u + E w$ in continuous time, or
     $x_{k+1} = A x_k + B u_k + E w_k$, with the observation $y = C x$. The file must
-    hold `A` and `B`. It may also hold `C`, `E`, the step `dt`, and a `D` that is zero.
+    hold `A` and `B`. The file may also hold `C`, `E`, the step `dt`, and a `D` that is
+    zero.
 
     **Arguments:**
 
@@ -35,8 +36,8 @@ def read_linear(
     [`delucax.LinearDynamics`][].
 
     **Raises:** `ValueError` if the file has another format, lacks `A`, `B` or a step,
-    holds a step that differs from `dt` or a `D` that is not zero, or if shapes do not
-    fit. `OSError` if the file cannot be read.
+    holds a step that differs from `dt` or a `D` that is not zero, or if the shapes do
+    not fit each other. `OSError` if the file cannot be read.
 
     !!! example
 

@@ -30,7 +30,7 @@ class Evaluations(NamedTuple):
 def count_evaluations(
     function: Callable[[AbstractDynamics], Any], dynamics: AbstractDynamics
 ) -> tuple[Any, Evaluations]:
-    """Run a function of dynamics, and count how often it evaluates them.
+    """Run a function of dynamics, and count its evaluations of the dynamics.
 
     The function gets dynamics that report each evaluation to the host at run time. The
     count is therefore exact in compiled loops too. Under `jax.vmap` the evaluations of

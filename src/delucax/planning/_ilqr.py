@@ -55,9 +55,9 @@ class ILQR(AbstractPlanner):
     Todorov.
 
     The iteration has converged if the projected gradient with respect to each control
-    is at most `tolerance` times one plus the size of the terms that cancel in it. It
-    has also converged if full steps no longer lower the gradient, and the predicted
-    decrease is below the rounding of the cost.
+    is at most `tolerance` times one plus the size of the terms that cancel in this
+    gradient. The iteration has also converged if full steps no longer lower the
+    gradient, and the predicted decrease is below the rounding error of the cost.
 
     Call the planner like every [`delucax.planning.AbstractPlanner`][]. ILQR handles
     hard constraints by the method of multipliers.

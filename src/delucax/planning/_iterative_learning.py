@@ -77,7 +77,8 @@ def ilc(
     **Arguments:**
 
     - `plant`: the true dynamics, which are simulated but not differentiated.
-    - `model`: the dynamics to differentiate, with the same sizes of state and control.
+    - `model`: the dynamics to differentiate, with the same numbers of states and
+        controls as the plant.
     - `cost`: the stage and final cost.
     - `plan`: the [`delucax.planning.Plan`][] to start from, made with the model. Each
         run has the first state, the time and the bounds of this plan. The first run

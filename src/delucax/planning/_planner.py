@@ -94,8 +94,8 @@ class AbstractPlanner(eqx.Module):
 
     If the planner draws random numbers, set `is_stochastic = True`.
 
-    Your planner then also works in [`delucax.controllers.MPC`][]. The derivatives of
-    the plan are the derivatives of `solve`.
+    Such a planner also works in [`delucax.controllers.MPC`][]. The derivatives of the
+    plan are the derivatives of `solve`.
 
     !!! example
 
@@ -155,7 +155,7 @@ class AbstractPlanner(eqx.Module):
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         """Solve a checked problem.
 
-        A failure is reported by the `result` of the plan, not by an error.
+        `solve` must report a failure by the `result` of the plan, not by an error.
 
         **Arguments:**
 

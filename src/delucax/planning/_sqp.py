@@ -67,8 +67,9 @@ class SQP(AbstractPlanner):
 
     The iteration has converged if three conditions hold. The gradient of the Lagrangian
     and the error of complementarity are at most `tolerance` times one plus the size of
-    the terms that cancel in them. The states follow the dynamics to the same relative
-    tolerance. No constraint is violated by more than `constraint_tolerance`.
+    the terms that cancel in these quantities. The states follow the dynamics to the
+    same relative tolerance. No constraint is violated by more than
+    `constraint_tolerance`.
 
     The initial guess of the states is the trajectory under the initial controls, or the
     first state repeated at every stage. The planner takes the guess with the smaller
@@ -220,9 +221,9 @@ class SQP(AbstractPlanner):
         - `ready`: what `prepare` returned.
         - `max_steps`: the largest number of linear systems to solve; 50 by default.
 
-        **Returns:** a [`delucax.planning.Plan`][]. Its `result` is `successful` if the
-        quadratic program was solved. `residual`, `violation` and `iterations` are the
-        numbers of the quadratic program.
+        **Returns:** a [`delucax.planning.Plan`][]. The `result` of the plan is
+        `successful` if the quadratic program was solved. `residual`, `violation` and
+        `iterations` are the numbers of the quadratic program.
         """
         return fed_back(problem, ready, max_steps)
 

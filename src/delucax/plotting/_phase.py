@@ -51,7 +51,7 @@ def phase_portrait(
         high))`.
     - `control`: a vector, shape `(m,)`, or a function from the state to such a vector
         (for a closed loop); zero by default.
-    - `trajectories`: a [`delucax.Trajectory`][], a batch of them, a sequence of them,
+    - `trajectories`: a [`delucax.Trajectory`][], a batch or a sequence of trajectories,
         or a dictionary from labels to trajectories; none by default.
 
     **Returns:** a `matplotlib.figure.Figure`.

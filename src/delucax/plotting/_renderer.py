@@ -134,6 +134,6 @@ class Renderer:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if one is open."""
         if self.pyplot is not None:
             self.pyplot.close(self.figure)

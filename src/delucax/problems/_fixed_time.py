@@ -44,11 +44,11 @@ class CatalystMixing(AbstractSystem):
 
 
 def catalyst_mixing(steps: int = 100) -> OptimalControl:
-    r"""Mix two catalysts along a tube such that the most product leaves it.
+    r"""Mix two catalysts along a tube such that as much product as possible leaves it.
 
     The final cost $-1 + x_1 + x_2$ at time 1 is minimised, from $(1, 0)$, with
-    $0 \le u \le 1$. The published minimum is -0.0480556. The first guess is a mixture
-    of 0.5.
+    $0 \le u \le 1$. The published minimum is -0.0480556. The first guess is the
+    constant mixture $u = 0.5$.
 
     **Arguments:** `steps`: T, the number of steps, 100 by default.
 

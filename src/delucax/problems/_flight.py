@@ -176,8 +176,8 @@ def hang_glider(steps: int = 200) -> OptimalControl:
     bounds are $0 \le u \le 1.4$, $x \ge 0$ and $v_x \ge 0$; the duration is free.
 
     The maximum is 1248.03 m (Betts). The benchmark gives 1255.05 m, which includes the
-    error of a discretisation by the trapezoidal rule. The first guess is a lift of 0.7
-    for 100 s.
+    error of a discretisation by the trapezoidal rule. The first guess is the constant
+    lift coefficient $u = 0.7$ for 100 s.
 
     **Arguments:** `steps`: T, the number of steps, 200 by default.
 

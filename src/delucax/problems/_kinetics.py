@@ -112,7 +112,7 @@ class Sampled(AbstractDynamics):
         return inner.advance(jnp.zeros_like(x[0]), x, u, None)
 
     def refined(self, points: int, inner: Callable[[Any], Any]) -> "Sampled":
-        """The same dynamics with each step cut into parts, and another discretisation.
+        """The same dynamics with each step cut into parts, and with new inner dynamics.
 
         **Arguments:** `points`: the number of parts. `inner`: a function that takes the
         old inner dynamics and returns the new inner dynamics.

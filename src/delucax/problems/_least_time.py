@@ -49,9 +49,10 @@ class ParticleSteering(AbstractSystem):
 def particle_steering(steps: int = 100) -> OptimalControl:
     r"""Steer a particle to a height and a velocity in the least time.
 
-    The particle starts at rest at the origin. It ends at $y = 5$ with the velocity
-    $(45, 0)$, and $|u| \le \pi / 2$. The published minimum time is 0.554577. The first
-    guess is a straight line between the ends, an angle of zero, and a duration of 1.
+    The particle starts at rest at the origin. The particle ends at $y = 5$ with the
+    velocity $(45, 0)$. The bounds are $|u| \le \pi / 2$. The published minimum time is
+    0.554577. The first guess is a straight line between the ends, an angle of zero, and
+    a duration of 1.
 
     **Arguments:** `steps`: T, the number of steps, 100 by default.
 

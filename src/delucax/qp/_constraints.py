@@ -16,14 +16,14 @@ class Soft(eqx.Module):
     r"""Bounds that may be violated at a cost.
 
     A violation $t \ge 0$ of a bound costs $v\, t + \tfrac12 W t^2$. The penalty is
-    exact if $v$ is larger than the multiplier of the hard bound: the solution then
-    violates the bound only if the constraints leave no other choice.
+    exact if $v$ is larger than the multiplier of the hard bound: with such a $v$, the
+    solution violates the bound only if no feasible point satisfies it.
 
     **Arguments:**
 
     - `low`, `high`: the bounds, numbers or arrays, which may be infinite.
-    - `linear`: the weight $v$, at least 0; a number, or of the shape of the bounds; 0
-        by default. If the weight is infinite, the bound is hard.
+    - `linear`: the weight $v$, at least 0: a number, or an array of the shape of the
+        bounds; 0 by default. If the weight is infinite, the bound is hard.
     - `quadratic`: the weight $W$, like `linear`.
 
     **Raises:** `ValueError` if a weight is negative or NaN, or if no finite number lies

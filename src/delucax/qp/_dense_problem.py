@@ -36,9 +36,9 @@ class DenseMultipliers(eqx.Module):
 
     - `equalities`: $y$, shape `(e,)`.
     - `bounds`: $\lambda$, a pair `(lower, upper)` of non-negative arrays of shape
-        `(n,)`; `None` if there are no bounds.
+        `(n,)`; `None` without bounds.
     - `rows`: $\mu$, a pair `(lower, upper)` of non-negative arrays of shape `(p,)`;
-        `None` if there are no rows.
+        `None` without rows.
 
     !!! example
 

@@ -76,7 +76,7 @@ def solve(
     - `RESULTS.not_converged`: the solver ended in another way.
 
     **Raises:** `ValueError` if an argument has the wrong type, shape or value. With
-    `throw`, an error at run time if there is no solution.
+    `throw`, an error at run time if the solver finds no solution.
 
     Source: Hintermueller, Ito and Kunisch, 2002 (active sides); Mehrotra, 1992;
     Andersen and Ye, 1999; Goulart and Chen, 2024.

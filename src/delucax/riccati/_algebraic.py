@@ -55,7 +55,7 @@ def dare(
         singular, even zero.
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
-    - `throw`: raise an error unless there is a stabilising solution (default). If
+    - `throw`: raise an error if the solver finds no stabilising solution (default). If
         false, check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. The solve is successful if the
@@ -192,7 +192,7 @@ def filter_dare(
     - `V`: covariance of the measurement noise, shape `(p, p)`, symmetric, positive
         semidefinite.
     - `S`: cross-covariance of the two noises, shape `(n, p)`; zero by default.
-    - `throw`: raise an error unless there is a stabilising solution (default). If
+    - `throw`: raise an error if the solver finds no stabilising solution (default). If
         false, check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. `K` has the shape `(n, p)`.

@@ -138,7 +138,7 @@ def dre(
 
     **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. If
     $R + B^\top X_{t+1} B$ is not positive definite at a step, this step and all steps
-    before it have no minimum, and the solution is NaN there.
+    before it have no minimum, and the solution is NaN at all these steps.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
     weight is not symmetric, or if neither `horizon` nor a time axis gives the number of

@@ -176,9 +176,9 @@ def sylvester(
     $$A X + X B = C$$
 
     The solver is a shift followed by the sign iteration if a vertical line
-    $\mathrm{Re}\, z = s$ separates the eigenvalues of $A$ from those of $-B$. Otherwise
-    it solves the equation as one dense linear system up to 256 unknowns. For more
-    unknowns, `result` is `RESULTS.not_separated`.
+    $\mathrm{Re}\, z = s$ separates the eigenvalues of $A$ from the eigenvalues of $-B$.
+    Otherwise it solves the equation as one dense linear system up to 256 unknowns. For
+    more unknowns, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 

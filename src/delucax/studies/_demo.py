@@ -41,11 +41,11 @@ def demo(
     Deluca paper with fewer seeds and steps.
 
     The first part designs an LQR about the upright, and trains MLPs by differentiating
-    the rollout. It runs zero control, the LQR and the first MLP from the same 100
-    starts, without and with a shock in the middle. It writes a table, the MLP, a figure
-    and an animation. The second part calls [`delucax.studies.reproduce`][] with
-    `small=True` for all studies except the ventilator, and writes to the folder
-    `paper` inside `out`.
+    the rollout. Then it runs zero control, the LQR and the first MLP from the same 100
+    initial states, without and with a shock in the middle of the run. The first part
+    writes a table, the MLP, a figure and an animation. The second part calls
+    [`delucax.studies.reproduce`][] with `small=True` for all studies except the
+    ventilator, and writes to the folder `paper` inside `out`.
 
     **Arguments:**
 

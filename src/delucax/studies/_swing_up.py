@@ -82,8 +82,8 @@ def holds_upright(
 ) -> Bool[Array, "..."]:
     r"""Whether the pendulum stayed upright to the end.
 
-    This means that $|\theta| < \mathrm{tolerance}$ over the last `seconds`, where
-    $\theta$ is the angle from upright.
+    A pendulum counts as upright if $|\theta| < \mathrm{tolerance}$ over the last
+    `seconds`, where $\theta$ is the angle from upright.
 
     **Arguments:**
 

@@ -80,8 +80,8 @@ def expected_cost(
     $$\ell(\theta, \text{key}) = \frac{1}{B} \sum_{i=1}^{B} J(\theta; x_0^i, w^i)$$
 
     Initial states, disturbances and noise are drawn from the key. If a rollout diverges
-    or its solver fails, the loss is NaN or infinite; [`delucax.training.fit`][] then
-    reports the step.
+    or its solver fails, the loss is NaN or infinite, and [`delucax.training.fit`][]
+    reports the step at which this happens.
 
     **Arguments:**
 

@@ -105,9 +105,10 @@ def fit(
 
     The steps run in compiled blocks. The result does not depend on `block`. A run that
     resumes from its checkpoint, on the same kind of machine, gives the same bits as a
-    run without interruption. A second call does not compile again if the loss is the
-    same function, the optimiser is made in the same way, such as a new
-    `optax.adam(1e-3)`, and the model has the same structure and shapes.
+    run without interruption. A second call of `fit` does not compile again if three
+    things are the same as in the first call: the loss function, the way in which the
+    optimiser is made, such as `optax.adam(1e-3)`, and the structure and shapes of the
+    model.
 
     You cannot call `fit` under `jax.jit` or `jax.vmap`. To train an ensemble, pass a
     batch of keys and a batch of models: `fit` trains all models at once, independently
@@ -120,9 +121,9 @@ def fit(
         the loss is a module, for example from [`delucax.training.expected_cost`][], its
         arrays can change without a new compilation. A loss with a memory, such as
         [`delucax.training.PPO`][], is an [`delucax.training.AbstractSurrogate`][].
-    - `model`: any pytree: a controller, an environment, a network, or several of them.
-        With a batch of keys, every array has a leading axis over the seeds, as
-        `eqx.filter_vmap(make)(keys)` returns it.
+    - `model`: any pytree, for example a controller, an environment, a network, or a
+        tuple of these. With a batch of keys, every array has a leading axis over the
+        seeds, as `eqx.filter_vmap(make)(keys)` returns it.
     - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. The parameters that
         the optimiser gets are a dictionary from the path of each trainable leaf to the
         unconstrained value of the leaf.
@@ -149,8 +150,8 @@ def fit(
         default. `step` is the number of finished steps, and `metrics` is a dictionary
         of the numbers of the last step, averaged over the seeds. You can use callbacks
         to log to TensorBoard, for example.
-    - `checkpoint`: the path of a file for checkpoints; none by default. If the file
-        exists, the run resumes from it.
+    - `checkpoint`: the path of a file for checkpoints; none by default. If this file
+        exists, the run resumes from the checkpoint in it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. A checkpoint is always written at the end of the run.
     - `throw`: whether to raise an error if the loss, its gradient or an update is NaN

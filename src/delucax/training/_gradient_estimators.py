@@ -81,7 +81,7 @@ def gradient_of_weights(
 
 
 class ClippedSamples(eqx.Module):
-    r"""The mean gradient of several samples, after clipping the norm of each of them.
+    r"""The mean gradient of several samples, after clipping the norm of each gradient.
 
     Over the $n$ samples whose cost and gradient $g_i$ are finite:
 
@@ -291,8 +291,8 @@ class LikelihoodRatio(eqx.Module):
     the cost or the plant.
 
     The loss must return `(cost, {"log_prob": ...})` for one draw.
-    [`delucax.training.scored_cost`][] makes such a loss from an environment. If you
-    write such a loss yourself, follow two rules. Compute the log-probability of
+    [`delucax.training.scored_cost`][] makes a loss of this kind from an environment. If
+    you write such a loss yourself, follow two rules. Compute the log-probability of
     `jax.lax.stop_gradient(u)`, because with a draw such as `u = mean + std * e` the
     gradient of the log-probability would cancel. And let the cost depend on the weights
     only through the draw.

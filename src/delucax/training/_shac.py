@@ -36,16 +36,16 @@ class SHAC(AbstractActorCriticLoss):
     previous window. So the gradient cannot explode over more than a window, and $V$
     estimates the cost after the window. The loss of the critic is the mean over all
     steps of $(V_\phi - \hat V)^2 / b^2$. Here $V_\phi$ is the critic, $b$ its `scale`,
-    and $\hat V$ its target, the return of TD($\lambda$). $V$ in the loss of the policy
-    and in the targets is a target network. The weights $\phi'$ of the target network
-    follow the weights $\phi$ of the critic at each step:
+    and $\hat V$ its target, the return of TD($\lambda$). The $V$ in the loss of the
+    policy and in the targets is a target network. The weights $\phi'$ of the target
+    network follow the weights $\phi$ of the critic at each step:
     $\phi' \leftarrow \phi' + r\, (\phi - \phi')$.
 
-    Train it like any loss. One gradient per step trains both networks. The model is a
-    [`delucax.training.ActorCritic`][], whose policy may be stochastic or not. The
-    trained controller is `fitted.model.policy`. Each step of `fit` takes
-    `batch * horizon` steps of the environment. Every `refresh`-th step takes another
-    `batch * horizon` steps, to set the scale of the critic and each
+    Train it like any loss. In each step, one gradient trains both the policy and the
+    critic. The model is a [`delucax.training.ActorCritic`][], whose policy may be
+    stochastic or not. The trained controller is `fitted.model.policy`. Each step of
+    `fit` takes `batch * horizon` steps of the environment. Every `refresh`-th step
+    takes another `batch * horizon` steps, to set the scale of the critic and each
     [`delucax.controllers.Standardise`][] of the model. Metrics: `total_cost` and
     `value_loss`.
 

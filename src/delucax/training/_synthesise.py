@@ -146,10 +146,10 @@ def synthesise(
 
     **Arguments:**
 
-    - `environment`: the environment. Its dynamics and cost must be differentiable. If a
-        control has no bounds, the range of a network is plus and minus two standard
-        deviations of the LQR's control, or -2 to 2 if there is no LQR. If the control
-        has one bound, the range has the same width and begins at the bound.
+    - `environment`: the environment. The dynamics and the cost must be differentiable.
+        If a control has no bounds, the range of a network is plus and minus two
+        standard deviations of the LQR's control, or -2 to 2 if there is no LQR. If the
+        control has one bound, the range has the same width and begins at the bound.
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
         default, at least 5. The search finishes a training or comparison that has

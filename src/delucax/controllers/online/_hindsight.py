@@ -44,12 +44,13 @@ def best_in_hindsight(
 
     Here $\theta$ are the trainable weights of `controller`. For `learner.fixed()`,
     $\theta$ are the weights of the policy, without the weights of the base controller.
-    The run has the same start, disturbances and sensor noise as `trajectory`.
+    Every run of the search has the same first state, disturbances and sensor noise as
+    `trajectory`.
 
     The search is Newton's method with Levenberg's damping, with derivatives through the
-    rollout. It finds the global minimum if the cost is convex in $\theta$. The cost is
-    convex for a disturbance-action policy on a linear plant with a convex cost, but in
-    general not for a linear gain.
+    rollout. The search finds the global minimum if the cost is convex in $\theta$. The
+    cost is convex for a disturbance-action policy on a linear plant with a convex cost,
+    but in general not for a linear gain.
 
     - `gpc(...).fixed()`: the best disturbance-action policy.
     - `drc(...).fixed()`: the best disturbance-response policy.

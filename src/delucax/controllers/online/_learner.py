@@ -72,8 +72,8 @@ class OnlineLearner(AbstractLearner):
 
     Here $G_j$ is the response of the closed loop to an impulse $j$ steps ago,
     $v_s(\theta)$ the control that $\theta$ would have added at step $s$, and $v_s$ the
-    control that was added, after clipping. $u_t(\theta)$ is computed in the same way.
-    Nonlinear dynamics are linearised along the run.
+    control that was added, after clipping. The control $u_t(\theta)$ is computed like
+    $y_t(\theta)$. Nonlinear dynamics are linearised along the run.
 
     [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
     [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make online

@@ -176,8 +176,8 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     So the prior has the weight of $n$ average steps, for any scale of cost, disturbance
     and weights.
 
-    With quadratic costs this is recursive least squares, and its regret grows as
-    $\log T$.
+    With quadratic costs, the optimiser is recursive least squares, and its regret grows
+    as $\log T$.
 
     Only an [`delucax.controllers.OnlineLearner`][] can use it, because it provides the
     curvature. The memory and the time of a step grow with the square of the number of

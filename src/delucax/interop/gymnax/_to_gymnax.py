@@ -332,11 +332,11 @@ def to_gymnax(
 ) -> GymnaxEnv:
     """Convert an environment to gymnax's protocol. This does not need gymnax.
 
-    Libraries that train on environments of gymnax, such as rejax and PureJaxRL, can
-    train on the result. The observation is `encode` of the observation of the
-    environment. The reward is minus the cost. The reward of the last step also includes
-    minus the final cost. The horizon truncates an episode, and `step` then starts the
-    next episode. Gradients pass through a step, but not through a reset.
+    Libraries such as rejax and PureJaxRL, which train on environments of gymnax, can
+    train on the converted environment. The observation is `encode` of the observation
+    of the environment. The reward is minus the cost. The reward of the last step also
+    includes minus the final cost. The horizon truncates an episode, and `step` then
+    starts the next episode. Gradients pass through a step, but not through a reset.
 
     The numbers of the environment are in `params`, a
     [`delucax.interop.gymnax.GymnaxParams`][]. Use `jax.vmap` over `params` to run many

@@ -38,8 +38,8 @@ def reproduce(
     """Regenerate the figures and tables of the Deluca paper, and check its claims.
 
     The report says whether each claim holds, with the measured number. If a study
-    raises an error, it counts as a claim that does not hold, and the other studies go
-    on.
+    raises an error, the report lists a claim that does not hold, and the other studies
+    are still run.
 
     **Arguments:**
 

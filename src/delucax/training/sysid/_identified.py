@@ -33,13 +33,13 @@ class Identified(eqx.Module):
 
     A direction is a combination of relative changes of the parameters (in a linear fit,
     of changes in units of the size of the regressors). The directions are the singular
-    vectors of the sensitivity of the data to such changes. The spread of a direction is
-    the standard deviation of the estimate along it. A direction is not identifiable if
-    the data do not depend on it, or if its spread is as large as the parameters
-    themselves. In such a direction, the parameters can change together without a clear
-    effect on the data. A parameter without a constraint may be zero, so its size is not
-    used for this test. If its estimate is near zero, its change is measured in units of
-    a hundred standard deviations.
+    vectors of the sensitivity of the data to relative changes of the parameters. The
+    spread of a direction is the standard deviation of the estimate along it. A
+    direction is not identifiable if the data do not depend on it, or if its spread is
+    as large as the parameters themselves. In such a direction, the parameters can
+    change together without a clear effect on the data. A parameter without a constraint
+    may be zero, so its size is not used for this test. If its estimate is near zero,
+    its change is measured in units of a hundred standard deviations.
 
     Printing the object prints the table of `report`.
 
@@ -54,7 +54,8 @@ class Identified(eqx.Module):
     - `low`, `high`: the ends of the confidence intervals of the parameters, same shape.
         If a parameter is not identifiable, its interval spans all valid values, for
         example 0 to infinity. NaN if the fit did not converge.
-    - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
+    - `directions`: shape `(p, p)`, a unit vector in each row, starting with the
+        direction that the data determine least.
     - `spread`: the standard deviation along each direction, shape `(p,)`; NaN if the
         fit did not converge.
     - `identifiable`: whether each direction is identifiable, shape `(p,)`; false if the

@@ -70,10 +70,11 @@ def physical(
     often several times as precise. A fit on short windows gives a good first guess for
     it.
 
-    The method is Levenberg-Marquardt. Its steps are scaled by the sensitivities of the
-    data, so that parameters of very different size can be estimated together.
-    Constrained parameters are estimated in the unconstrained space, as in
-    [`delucax.training.fit`][], so their confidence intervals satisfy the constraints.
+    The method is Levenberg-Marquardt. The steps of the method are scaled by the
+    sensitivities of the data, so that parameters of very different size can be
+    estimated together. Constrained parameters are estimated in the unconstrained space,
+    as in [`delucax.training.fit`][], so their confidence intervals satisfy the
+    constraints.
 
     The fit has converged if no step of the linearised problem is longer than a
     twentieth of the standard deviation that the noise causes. If the fit has not
@@ -93,8 +94,8 @@ def physical(
         of each step of the record.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
-        of paths, or a dictionary from path to constraint, as `trainable` of
-        [`delucax.training.fit`][].
+        of paths, or a dictionary from path to constraint, like the argument `trainable`
+        of [`delucax.training.fit`][].
     - `x0`: a guess of the first state, shape `(n,)`, or one guess for each record. A
         simulation from `x0` gives the first guess of the states at which the windows
         begin. By default the first guess consists of the measurements, which must then

@@ -34,7 +34,7 @@ _GAP, _USUAL = 5, 0.9
 class Record(eqx.Module):
     """The measurements of one experiment: outputs and controls at N times.
 
-    A slice of a record is a record of these samples, and `len` is N.
+    A slice of a record is a record of the selected samples, and `len(record)` is N.
 
     **Arguments:**
 

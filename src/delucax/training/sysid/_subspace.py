@@ -80,7 +80,7 @@ class Subspace(eqx.Module):
         **Returns:** shape `(n,)`, or `(records, n)` for a list.
 
         **Raises:** `ValueError` if `record` is not a uniform record or a list of them,
-        or has another number of outputs or controls than the model.
+        or does not have the numbers of outputs and controls of the model.
         """
         where = "Subspace.start"
         records = uniform_records(record, where)
@@ -108,13 +108,13 @@ def subspace(
     $$x_{k+1} = A x_k + B u_k + K e_k, \qquad y_k = C x_k + e_k, \qquad
     e \text{ white noise}$$
 
-    The method needs no first guess and no iterations. It predicts the outputs of the
-    next `horizon` steps from the past, and removes the effect of the controls of these
-    steps. The remaining prediction has as many independent directions as the system has
-    states. These directions are the singular vectors of a block of a triangular factor
-    of the Hankel matrices, and they give $A$, $C$ and $K$. Then $B$, the first states
-    and the operating point follow by linear least squares on the errors of a free run.
-    Time and memory are linear in the number of samples.
+    The method needs no first guess and no iterations. The method predicts the outputs
+    of the next `horizon` steps from the past, and removes the effect of the controls of
+    these steps. The remaining prediction has as many independent directions as the
+    system has states. These directions are the singular vectors of a block of a
+    triangular factor of the Hankel matrices, and the vectors give $A$, $C$ and $K$.
+    Then linear least squares gives $B$, the first states and the operating point, based
+    on the errors of a free run. Time and memory are linear in the number of samples.
 
     The model is strictly proper: a control affects the outputs from the next sample on,
     as in all dynamics of this library. If your control affects the output of the same

@@ -108,8 +108,9 @@ def validate(
 
     - `model`: the dynamics.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
-    - `x0`: a guess of the first state, shape `(n,)`, or one for each record; by default
-        the first measurement, which must then be the state, or zero for
+    - `x0`: a guess of the first state, shape `(n,)`, or one guess for each record. The
+        default is the first measurement, so the outputs must be the state. For other
+        models give a guess; the default is zero for
         [`delucax.training.sysid.LatentDynamics`][].
     - `start`: the number of samples from which a state is estimated, 10 by default.
         These samples are left out of the errors.
