@@ -191,8 +191,8 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 
     with the controllability Gramian $W$. The square of the norm is also the energy of
     the outputs after a unit impulse, summed over the inputs. The norm is infinite if
-    the model is not stable. It is differentiable to any order, in forward and reverse
-    mode.
+    the model is not stable. The norm is differentiable to any order, in forward and
+    reverse mode.
 
     **Arguments:**
 

@@ -34,9 +34,9 @@ def c(
 
     The files are `NAME.h` and `NAME.c` in `directory`. The files are C99 and need only
     the C standard library. The program uses the stack only: it allocates no memory. The
-    program has no recursion and no global or static variables. Every loop has a bound.
-    Every value that does not depend on the inputs, such as the weights of a network,
-    becomes a constant.
+    program has no recursion, and no variable keeps its value from one call to the next.
+    Every loop has a bound. Every value that does not depend on the inputs, such as the
+    weights of a network, becomes a constant.
 
     A controller becomes three functions, which do what its `init`, `__call__` and
     `applied` do: `NAME_init(state)`, `NAME_step(state, t, y, u)` and

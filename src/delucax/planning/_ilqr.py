@@ -48,11 +48,10 @@ class ILQR(AbstractPlanner):
     problem.
 
     The line search tries the steps $\alpha = 1, 1/2, \dots, 1/2048$. The line search
-    accepts a step if the cost falls by at least 1e-4 of the predicted decrease. The
-    line search rejects a step if the trajectory diverges. The regularisation $\mu$
-    rises if no step is accepted or the control Hessian is not positive definite. The
-    regularisation falls after each accepted step, by the schedule of Tassa, Erez and
-    Todorov.
+    accepts a step if the cost falls by at least 1e-4 of the predicted decrease, and
+    rejects a step if the trajectory diverges. The regularisation $\mu$ rises if no step
+    is accepted or the control Hessian is not positive definite. The regularisation
+    falls after each accepted step, by the schedule of Tassa, Erez and Todorov.
 
     The iteration has converged if the projected gradient with respect to each control
     is at most `tolerance` times one plus the size of the terms that cancel in this
@@ -64,11 +63,11 @@ class ILQR(AbstractPlanner):
 
     You can differentiate the plan, in forward and reverse mode and to any order, with
     respect to every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The
-    derivative comes from the implicit function theorem: it solves one linear-quadratic
-    problem at the solution, with exact second derivatives even if the iteration did not
-    use second derivatives. Derivatives are NaN unless the plan converged to a strict
-    minimum. The derivatives with respect to `controls` and `states`, where the
-    iteration starts, are zero.
+    derivative comes from the implicit function theorem. Its computation solves one
+    linear-quadratic problem at the solution, with exact second derivatives even if the
+    iteration did not use second derivatives. Derivatives are NaN unless the plan
+    converged to a strict minimum. The derivatives with respect to `controls` and
+    `states`, where the iteration starts, are zero.
 
     The minimum is local, so it depends on the start. On an unstable plant, controls
     without feedback lead far away, and the iteration may end at a stationary point far

@@ -174,9 +174,9 @@ def igpc(
         acted; `"deluca"`, for comparison, uses it one step early, as the original
         library does.
     - `anneal`: if true (default), a line search tries up to 6 step sizes until a run
-        has a lower cost. If no run has, the learning rate is divided by 100. If false,
-        a line search tries up to 10 step sizes until a run does not have a higher cost.
-        If all runs have, learning stops.
+        has a lower cost. If no run has a lower cost, the learning rate is divided by
+        100. If false, a line search tries up to 10 step sizes until a run does not have
+            a higher cost. If every run has a higher cost, learning stops.
 
     **Returns:** a [`delucax.planning.Plan`][] with the fields of
     [`delucax.planning.ilc`][]: the best run of the plant, with the applied controls,

@@ -48,8 +48,8 @@ class SQP(AbstractPlanner):
 
     Each iteration solves a quadratic program about the current trajectory, as
     [`delucax.qp.solve`][] does. Far from a solution, this program has the Hessian of
-    the cost. As soon as the relative error is below 0.01, the program has the Hessian
-    of the Lagrangian. It always has the Hessian of the Lagrangian if the program with
+    the cost. Once the relative error is below 0.01, the program has the Hessian of the
+    Lagrangian. The program always has the Hessian of the Lagrangian if the program with
     the Hessian of the cost has no unique minimum. If the Hessian is not convex along
     the dynamics, the planner adds the squares of the active constraints to it, and if
     necessary a multiple of the identity.
@@ -81,11 +81,11 @@ class SQP(AbstractPlanner):
 
     You can differentiate the plan, in forward and reverse mode, with respect to every
     array in `dynamics`, `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`. The
-    derivative comes from the implicit function theorem: it solves one quadratic program
-    at the solution, with exact second derivatives. Derivatives are NaN unless the plan
-    converged to a strict minimum whose active constraints are independent and have
-    positive multipliers. The derivatives with respect to `controls` and `states`, where
-    the iteration starts, are zero.
+    derivative comes from the implicit function theorem. Its computation solves one
+    quadratic program at the solution, with exact second derivatives. Derivatives are
+    NaN unless the plan converged to a strict minimum whose active constraints are
+    independent and have positive multipliers. The derivatives with respect to
+    `controls` and `states`, where the iteration starts, are zero.
 
     The planner does not track the events of a hybrid plant. If the solution is at a
     kink, where the events change, the result is `not_converged` or `no_descent`.
@@ -181,9 +181,9 @@ class SQP(AbstractPlanner):
     def prepare(self, problem: Problem, start: Start) -> PyTree:
         """Prepare a real-time iteration: set up its quadratic program.
 
-        The program is an expansion about the states and controls of `start`, which need
-        not follow the dynamics. The program does not depend on `problem.x0`, so you can
-        prepare it before the state is measured.
+        The program approximates the problem about the states and controls of `start`,
+        which need not follow the dynamics. The program does not depend on `problem.x0`,
+        so you can prepare it before the state is measured.
 
         **Arguments:**
 

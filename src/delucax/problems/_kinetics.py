@@ -71,7 +71,7 @@ class Sampled(AbstractDynamics):
 
     - `inner`: a [`delucax.Discretized`][] system. Its `dt` is not used.
     - `widths`: the lengths of the steps, shape `(T,)`.
-    - `dt`: the increase of this time in one step, 1 by default.
+    - `dt`: the increase of the time of these dynamics in one step, 1 by default.
 
     !!! example
 

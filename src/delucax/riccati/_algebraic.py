@@ -116,7 +116,7 @@ def care(
     and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 
     The solver is the scaled sign iteration of the Hamiltonian matrix. If it fails, the
-    solver starts once more, with $X$ in a larger unit that suits controls with a weak
+    solver starts once more, with $X$ in another unit, which suits controls with a weak
     effect. What [`delucax.riccati.dare`][] says about Newton steps, accelerators,
     batches, derivatives and undetectable modes also holds here.
 

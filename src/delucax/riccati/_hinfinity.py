@@ -85,10 +85,11 @@ def hinf_dare(
     and reverse mode, by the implicit function theorem.
 
     Without `gamma`, a search by secants and bisection finds the smallest level that a
-    controller can attain. It has first derivatives only. The derivatives of the other
-    results then hold the level fixed. These derivatives may be large, because the
-    saddle point vanishes just below the level. For a design whose derivatives include
-    the change of the level, give `gamma=1.05 * hinf_dare(...).gamma`.
+    controller can attain. The smallest level has first derivatives only. The
+    derivatives of the other results then hold the level fixed. These derivatives may be
+    large, because the saddle point vanishes just below the level. For a design whose
+    derivatives include the change of the level, give
+    `gamma=1.05 * hinf_dare(...).gamma`.
 
     **Arguments:**
 

@@ -74,7 +74,7 @@ def hinf_dre(
 
     All matrices except `final` may vary in time. The solution is differentiable to any
     order at a given `gamma`. Without `gamma`, the smallest level has first derivatives,
-    and the other results are differentiated with the level held fixed, as in
+    and the derivatives of the other results hold the level fixed, as in
     [`delucax.riccati.hinf_dare`][].
 
     **Arguments:**
@@ -160,10 +160,10 @@ def hinf_cre(
 
     The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. The
     solution is differentiable to any order at a given `gamma`. Without `gamma`, the
-    smallest level has first derivatives, and the other results are differentiated with
-    the level held fixed, as in [`delucax.riccati.hinf_dare`][]. As `gamma` approaches
-    the smallest level, $X$ grows without bound at the first time: for a controller,
-    take a `gamma` a few percent higher.
+    smallest level has first derivatives, and the derivatives of the other results hold
+    the level fixed, as in [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the
+    smallest level, $X$ grows without bound at the first time: for a controller, take a
+    `gamma` a few percent higher.
 
     **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as in
     [`delucax.riccati.hinf_care`][].

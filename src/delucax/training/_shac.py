@@ -41,13 +41,13 @@ class SHAC(AbstractActorCriticLoss):
     network follow the weights $\phi$ of the critic at each step:
     $\phi' \leftarrow \phi' + r\, (\phi - \phi')$.
 
-    Train it like any loss. In each step, one gradient trains both the policy and the
-    critic. The model is a [`delucax.training.ActorCritic`][], whose policy may be
-    stochastic or not. The trained controller is `fitted.model.policy`. Each step of
-    `fit` takes `batch * horizon` steps of the environment. Every `refresh`-th step
-    takes another `batch * horizon` steps, to set the scale of the critic and each
-    [`delucax.controllers.Standardise`][] of the model. Metrics: `total_cost` and
-    `value_loss`.
+    Train with this loss like with any other loss. In each step, one gradient trains
+    both the policy and the critic. The model is a [`delucax.training.ActorCritic`][],
+    whose policy may be stochastic or not. The trained controller is
+    `fitted.model.policy`. Each step of `fit` takes `batch * horizon` steps of the
+    environment. Every `refresh`-th step takes another `batch * horizon` steps, to set
+    the scale of the critic and each [`delucax.controllers.Standardise`][] of the model.
+    Metrics: `total_cost` and `value_loss`.
 
     The end of an episode and `bootstrap` are handled as in [`delucax.training.PPO`][].
     Unlike in the paper, each step of training uses all windows of new, whole episodes,

@@ -299,7 +299,7 @@ def from_gymnax(
 
     Gradients pass through a step if the environment does not stop them. Environments of
     gymnax stop gradients. In gymnax 1.0, some environments have a method
-    `with_transition_gradients`, and `from_gymnax` uses it if it exists.
+    `with_transition_gradients`, which `from_gymnax` uses if it exists.
 
     **Arguments:**
 

@@ -44,8 +44,8 @@ def lung_study(
 
     The controllers are then tested in the lungs themselves, and compared with the best
     PIDs. The lungs are the lungs of the task `lung/double_compartment`, with the nine
-    pairs of resistance and compliance in the public data set. Their valves respond with
-    a lag, and their sensor is two samples late and adds noise of 0.2 cmH2O.
+    pairs of resistance and compliance in the public data set. The valves of these lungs
+    respond with a lag, and the sensor is two samples late and adds noise of 0.2 cmH2O.
 
     With `data`, the breaths come from a file. In this case the lungs themselves are
     unknown. The controllers are therefore tested on grey-box lungs that are fitted to

@@ -102,16 +102,16 @@ def validate(
     the first samples by least squares. From this state, the free run simulates the
     model with the recorded controls. With `ahead`, shorter predictions are compared
     too. These predictions begin throughout the record, at states that are estimated in
-    the same way from the samples before.
+    the same way.
 
     **Arguments:**
 
     - `model`: the dynamics.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
-    - `x0`: a guess of the first state, shape `(n,)`, or one guess for each record. The
-        default is the first measurement, so the outputs must be the state. For other
-        models give a guess; the default is zero for
-        [`delucax.training.sysid.LatentDynamics`][].
+    - `x0`: a guess of the first state, shape `(n,)`, or one guess for each record. By
+        default the guess is the first measurement, which is possible only if the
+        outputs are the state. For [`delucax.training.sysid.LatentDynamics`][] the
+        default is zero.
     - `start`: the number of samples from which a state is estimated, 10 by default.
         These samples are left out of the errors.
     - `ahead`: the largest number of steps of a prediction; 0 by default, for no
