@@ -19,50 +19,54 @@ python -m benchmarks.identification --data DIR           # fits what is not stor
 python -m benchmarks.identification --data DIR --again   # fits all anew: over an hour
 ```
 
-`DIR` is a folder with the files that are named below. delucax does not ship them,
-because they have no licence that allows it.
+`DIR` is a folder with the data files that this page names. delucax does not include
+these files, because they have no licence that allows it.
 
-Each model is fitted to the estimation half alone, in double precision. On the test it
-runs freely: it gets the recorded input and a state that is estimated from the first 50
-samples. The error is the root mean square error after these 50 samples. Networks are
-trained from ten seeds, and the table shows the median, the least and the largest error.
+Each model is fitted to the estimation half of the data alone, in double precision. On
+the test data the model is simulated: it gets the recorded input and a state that is
+estimated from the first 50 samples. The error is the root mean square error over the
+samples after the first 50. Networks are trained from ten seeds, and the table shows the
+median, the smallest and the largest error.
 
 - **linear** is `subspace` with an offset.
-- **physics** has the parameters of the equations alone, and **grey box** adds a network
-  to their rates. How much the network may correct is chosen on the last quarter of the
-  estimation half, except for Bouc-Wen, which has one setting.
+- **physics** fits only the parameters of the physical equations, and **grey box** also
+  fits a network that is added to the derivatives of the states. The allowed size of the
+  correction by the network is chosen on the last quarter of the estimation half. For
+  Bouc-Wen it has a fixed value.
 - **neural state space** is `state_space` with its defaults and an encoder of 20
-  samples. It knows no physics, and nothing is tuned.
+  samples. This model uses no physics, and none of its settings are tuned.
 
 The equations, the sizes of the networks and the windows of the grey boxes were set by
 hand while the models were written. One setting was changed after a test error was
 known: the first fits of Bouc-Wen stopped after 50 iterations, before they had
-converged, with an error of 19 um on the multisine. Now they may take 150.
+converged, with an error of 19 um on the multisine. Now these fits may take 150
+iterations.
 
-The splits are those of the package `nonlinear_benchmarks` 1.0.1; older published
-results may be of other splits.
+The data are split into estimation and test data as in the package
+`nonlinear_benchmarks` 1.0.1. Older published results may use other splits.
 """
 _TITLES = {
     "tanks": (
         "Cascaded tanks",
         "A pump fills the upper of two tanks, which drains into the lower one. Both "
         "can overflow, and only the level of the lower one is measured. The "
-        "estimation and the test have 1,024 samples each, one every 4 s. The data are"
-        " those of [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) "
+        "estimation data and the test data have 1,024 samples each, one every 4 s. The "
+        "data are from [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) "
         "(Schoukens, Mattsson, Wigren and Noël, 2016). The file is "
         "`cascaded_tanks/dataBenchmark.csv`, with the columns `uEst`, `yEst`, `uVal` "
-        "and `yVal`. The physical model has Bernoulli's law, the overflow, an offset "
-        "of the pump and the depth of the outlet. The error is in V.",
+        "and `yVal`. The physical model contains Bernoulli's law, the overflow, an "
+        "offset of the pump and the depth of the outlet. The error is in V.",
     ),
     "silverbox": (
         "Silverbox",
         "The Silverbox is an electronic oscillator with a cubic spring. The data are "
-        "those of [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) (Wigren "
-        "and Schoukens, 2013). The file is `SNLS80mV.csv` of its archive with the "
-        "columns `V1` and `V2`, compressed as `silverbox/SNLS80mV.csv.gz`. There "
-        "are three tests: the last quarter of the multisine, the whole arrow, and the "
-        "part of the arrow whose amplitudes occur in the estimation half. The error is "
-        "in mV. Our models are fitted to the first 16,000 of the 65,062 samples.",
+        "from [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) (Wigren "
+        "and Schoukens, 2013). The file is `SNLS80mV.csv` of the archive on that site, "
+        "with the columns `V1` and `V2`, compressed as `silverbox/SNLS80mV.csv.gz`. "
+        "There are three tests: the last quarter of the multisine signal, the whole "
+        "arrow-shaped signal, and the part of the arrow whose amplitudes also occur in "
+        "the estimation half. The error is in mV. Our models are fitted to "
+        "the first 16,000 of the 65,062 samples.",
     ),
     "bouc_wen": (
         "Bouc-Wen",
@@ -70,10 +74,10 @@ _TITLES = {
         "data are generated here from the published equations, constants and signals, "
         "and no file is needed. The random phases and "
         "the integrator are our own, so the test records are not the official ones. "
-        "The physical model knows the oscillator and that a hidden force acts; a "
-        "network learns the rate of that force. The error is in micrometres, and the "
-        "noise of the estimation data is 8 micrometres. Our models are fitted to the "
-        "first 8,192 of the 40,960 samples.",
+        "The physical model contains the oscillator and one hidden state for the "
+        "hysteretic force. A network learns the derivative of that force. The error is in "
+        "micrometres, and the noise of the estimation data is 8 micrometres. Our "
+        "models are fitted to the first 8,192 of the 40,960 samples.",
     ),
 }
 
@@ -81,10 +85,11 @@ _TITLES = {
 _BEST_SWEEP = min(errors.get("sweep", 9e9) for _, errors, _ in PUBLISHED["bouc_wen"])
 _OTHERS = """## Your own files
 
-With the part `others` the command runs the two models that need no physics on every
-folder `DIR/others/NAME` with an `estimation.csv` and one or more `test.csv`, and prints
-their errors. The columns begin with `u` and `y`. The other sets of
-nonlinearbenchmark.org become such files like this:
+With `--part others` the command fits the two models that need no physics to every
+folder `DIR/others/NAME` that has a file `estimation.csv` and one or more test files,
+and prints the errors of the models. The names of the columns begin with `u` for inputs
+and with `y` for outputs. This code writes such files for another data set of
+nonlinearbenchmark.org:
 
 <!-- notest: downloads the data -->
 ```python
@@ -129,14 +134,15 @@ def _summary(stored: dict[str, Any]) -> str:
         for part in list(row)[2:]
     }
     return (
-        "In the median of ten seeds, physics with a network has an error of "
-        f"{median['tanks', 'test']:.3f} V on the cascaded tanks, "
+        "In the median of ten seeds, the grey box (physics with a network) has an "
+        f"error of {median['tanks', 'test']:.3f} V on the cascaded tanks, "
         f"{median['silverbox', 'multisine']:.3f} mV on the multisine of the Silverbox "
         f"and {median['silverbox', 'arrow']:.3f} mV on its arrow, and "
         f"{median['bouc_wen', 'multisine']:.1f} um on the multisine of Bouc-Wen. On "
-        f"the sweep of Bouc-Wen its error is {median['bouc_wen', 'sweep']:.1f} um, "
+        f"the sweep of Bouc-Wen the error of the grey box is "
+        f"{median['bouc_wen', 'sweep']:.1f} um, "
         f"{median['bouc_wen', 'sweep'] / _BEST_SWEEP:.1f} times that of the published "
-        "fit that knows the equation of the hysteresis."
+        "fit that uses the equation of the hysteresis."
     )
 
 
@@ -171,18 +177,19 @@ def _coverage(rows: list[dict[str, Any]]) -> str:
     lines = [
         "## Intervals",
         "",
-        f"How often intervals of 95% hold the truth, on {rows[0]['records']:,} "
-        "simulated records of each plant. Each has a hidden state, and records of 200 "
-        "samples. The initial guess of each parameter is 20% off. A fit fails if it "
-        "reports that it did not converge, or that the data do not determine a "
-        "parameter. It then has no intervals.",
+        "The table shows how often intervals of 95% contain the true parameters, on "
+        f"{rows[0]['records']:,} simulated records of each plant. Each plant has a "
+        "hidden state, and each record has 200 samples. The initial guess of each "
+        "parameter is 20% off. A fit fails if it reports that it did not converge, or "
+        "that the data do not determine a parameter. A failed fit has no intervals.",
         "",
-        "The window of a fit matters: a longer one says more about a hidden state, and "
-        "a shorter one converges from further away. The first three rows have windows "
-        "that suit the plant, and their limits are 92.5 to 97.5% covered and at most "
-        "1% failures. The rows with the default window show what a first try gives. In "
-        "the first row of the tanks the upper tank overflows in each record; in the "
-        "last row it seldom does, and the data say less about how full it is.",
+        "The window of a fit matters: a longer window gives more information about a "
+        "hidden state, and a shorter window converges from a worse initial guess. The "
+        "first three rows have windows that suit the plant. The limits for these rows "
+        "are 92.5 to 97.5% covered and at most 1% failures. The rows with the default "
+        "window show the result of a first try without tuning. In the first row of the "
+        "tanks the upper tank overflows in each record. In the last row it seldom "
+        "overflows, and the data then say less about the level of the upper tank.",
         "",
         "| plant | window | covered, % | by parameter, % | failures, % |",
         "|---|---|---|---|---|",
