@@ -75,8 +75,8 @@ _TITLES = {
         "and no file is needed. The random phases and "
         "the integrator are our own, so the test records are not the official ones. "
         "The physical model contains the oscillator and one hidden state for the "
-        "hysteretic force. A network learns the derivative of that force. The error is in "
-        "micrometres, and the noise of the estimation data is 8 micrometres. Our "
+        "hysteretic force. A network learns the derivative of that force. The error is "
+        "in micrometres, and the noise of the estimation data is 8 micrometres. Our "
         "models are fitted to the first 8,192 of the 40,960 samples.",
     ),
 }
