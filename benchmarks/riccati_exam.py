@@ -43,25 +43,28 @@ and delucax on published test systems. `python -m benchmarks.riccati_exam` makes
 
 There are 39 systems: the 20 continuous and 15 discrete ones of the collections CAREX
 and DAREX (P. Benner, A. J. Laub and V. Mehrmann, 1995), with the data of SciPy's own
-tests, and four that users of SciPy reported. The second table has families of them over
-their parameters.
+tests, and four systems that users of SciPy reported. The second table varies the
+parameters of some of these systems.
 
 How to read the first table:
 
-- **SciPy**, **slycot**, **delucax**: the relative residual of what each solver finds in
-  double precision. It is the residual of the equation, divided by the sum of the norms
-  of its terms. It is evaluated in 60 digits for all solvers.
-- **reported**: the residual that delucax itself returns. It should never be smaller
-  than the residual before it.
+- **SciPy**, **slycot**, **delucax**: the relative residual of the solution that each
+  solver finds in double precision. The relative residual is the residual of the
+  equation, divided by the sum of the norms of the terms of the equation. It is
+  evaluated in 60 digits for all solvers.
+- **reported**: the residual that delucax itself returns. The returned residual should
+  never be smaller than the residual in the column "delucax".
 - **bound**: the spectral abscissa of the closed loop in continuous time (below 0 if the
-  loop is stable), and its spectral radius in discrete time (below 1). This matters
-  because a small residual does not prove that a solution stabilises.
-- **result**: what delucax says about its solution.
-- **float32**, **its result**: the same in single precision. The data are rounded first,
-  and an equation counts as solved at 1e-5 instead of 1e-12. If the precision does not
-  suffice, the solver says so.
+  loop is stable), and its spectral radius in discrete time (below 1). This column is
+  important because a small residual does not prove that a solution stabilises the
+  plant.
+- **result**: the status of the solution that delucax returns.
+- **float32**, **its result**: the residual and the status of delucax in single
+  precision. The data are rounded to single precision first, and an equation counts as
+  solved at 1e-5 instead of 1e-12. If single precision is not enough, the status of the
+  solution says so.
 
-The loop of CAREX 11 is on the boundary of stability.
+The closed loop of the system CAREX 11 is on the boundary of stability.
 
 """
 
@@ -166,14 +169,17 @@ def page(rows: list[dict[str, Any]], families: list[dict[str, Any]]) -> str:
             "| " + " | ".join(map(str, (*cells, row["result"], *single))) + " |"
         )
     if all(row["slycot"] is None for row in rows):
-        lines.append("\nslycot was not installed where this page was made.")
+        lines.append(
+            "\nslycot was not installed on the machine on which this page was made."
+        )
     lines.append("\n## Families\n")
     lines.append(
         "A family varies the parameters of a system. The columns SciPy and delucax "
-        "count the members that the solver brings below 1e-12; for delucax the "
-        "solution must also be certified as stabilising. The next two have the worst "
-        "residuals. In float32: how many members are certified, and the worst residual "
-        "of these.\n"
+        "show for how many members of the family the solver reaches a residual below "
+        "1e-12; for delucax the solution must also be certified as stabilising. The "
+        "next two columns show the largest residual of each solver. The last two "
+        "columns are for delucax in float32: the number of members that are certified, "
+        "and the largest residual of the certified members.\n"
     )
     head = "| family | members | SciPy | delucax | worst SciPy | worst delucax |"
     lines += [head + " float32 | its worst |", "|---" * 8 + "|"]
