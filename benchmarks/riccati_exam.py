@@ -175,8 +175,8 @@ def page(rows: list[dict[str, Any]], families: list[dict[str, Any]]) -> str:
     lines.append("\n## Families\n")
     lines.append(
         "A family varies the parameters of a system. The columns SciPy and delucax "
-        "show for how many members of the family the solver reaches a residual below "
-        "1e-12; for delucax the solution must also be certified as stabilising. The "
+        "show for how many members of the family the solver brings the residual "
+        "under 1e-12; for delucax the solution must also be certified as stabilising. The "
         "next two columns show the largest residual of each solver. The last two "
         "columns are for delucax in float32: the number of members that are certified, "
         "and the largest residual of the certified members.\n"
