@@ -175,11 +175,11 @@ def page(rows: list[dict[str, Any]], families: list[dict[str, Any]]) -> str:
     lines.append("\n## Families\n")
     lines.append(
         "A family varies the parameters of a system. The columns SciPy and delucax "
-        "show for how many members of the family the solver brings the residual "
-        "under 1e-12; for delucax the solution must also be certified as stabilising. The "
-        "next two columns show the largest residual of each solver. The last two "
-        "columns are for delucax in float32: the number of members that are certified, "
-        "and the largest residual of the certified members.\n"
+        "show how many members of the family the solver solves. A member counts as "
+        "solved at 1e-12, and for delucax the solution must also be certified as "
+        "stabilising. The next two columns show the largest residual of each solver. "
+        "The last two columns are for delucax in float32: the number of members that "
+        "are certified, and the largest residual of the certified members.\n"
     )
     head = "| family | members | SciPy | delucax | worst SciPy | worst delucax |"
     lines += [head + " float32 | its worst |", "|---" * 8 + "|"]
