@@ -82,22 +82,27 @@ def best_table(board: Board) -> str:
 def tables(board: Board) -> str:
     """How often each method is near the best known, scores, costs and speed."""
     made = ["## How often a method is good\n", how_often(board)]
-    made += ["## Score\n\nPercent above the best known. 0 is the best.\n"]
+    made.append(
+        "## Score\n\nThe table shows how much more each controller costs than the best "
+        "known, in percent. The score 0 is the best.\n"
+    )
     made += [_by_task(board, board.methods, board.excess, score)]
     single = [m for m in TRAINED for t in board.names if board.trainings(t, m) == 1]
-    once = " Without brackets there was only one." if single else ""
+    once = " A cost without brackets is from a single training." if single else ""
     made.append(
-        "## Cost\n\nThe cost of an episode, as the interquartile mean over 8 starts. "
-        "Of several trainings this is the middle one, with the least and the most in "
-        f"brackets.{once}\n"
+        "## Cost\n\nThe tables show the cost of an episode, as the interquartile mean "
+        "over 8 initial states. If a controller was trained several times, the cost is "
+        "the median of the trainings, with the lowest and the highest cost in brackets."
+        f"{once}\n"
     )
     for name, family in _families(board):
         show = lambda spread: _spread(spread) if spread else ""
         made.append(f"### {name}: cost\n")
         made.append(_by_task(board, family, board.cost, show, best=True))
     made.append(
-        "## Time\n\nMicroseconds per step of each of a batch of 8, including the "
-        "controller. Two processes ran side by side, on the two threads of one core.\n"
+        "## Time\n\nThe tables show microseconds per step for each member of a batch "
+        "of 8, including the controller. Two processes ran at the same time, on the "
+        "two threads of one core.\n"
     )
     for name, family in _families(board):
         took = lambda task, method: board.speeds.get((task, method))
