@@ -41,7 +41,7 @@ HEAD = """# Riccati equations, system by system
 Does a solver find the right solution of your Riccati equation? This page compares SciPy
 and delucax on published test systems. `python -m benchmarks.riccati_exam` makes it.
 
-There are 39 systems: the 20 continuous and 15 discrete ones of the collections CAREX
+There are 39 systems: the 20 continuous and 15 discrete systems of the collections CAREX
 and DAREX (P. Benner, A. J. Laub and V. Mehrmann, 1995), with the data of SciPy's own
 tests, and four systems that users of SciPy reported. The second table varies the
 parameters of some of these systems.
@@ -50,8 +50,8 @@ How to read the first table:
 
 - **SciPy**, **slycot**, **delucax**: the relative residual of the solution that each
   solver finds in double precision. The relative residual is the residual of the
-  equation, divided by the sum of the norms of the terms of the equation. It is
-  evaluated in 60 digits for all solvers.
+  equation, divided by the sum of the norms of the terms of the equation. This residual
+  is evaluated with 60 digits for all solvers.
 - **reported**: the residual that delucax itself returns. The returned residual should
   never be smaller than the residual in the column "delucax".
 - **bound**: the spectral abscissa of the closed loop in continuous time (below 0 if the

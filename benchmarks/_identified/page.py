@@ -48,8 +48,8 @@ The data are split into estimation and test data as in the package
 _TITLES = {
     "tanks": (
         "Cascaded tanks",
-        "A pump fills the upper of two tanks, which drains into the lower one. Both "
-        "can overflow, and only the level of the lower one is measured. The "
+        "A pump fills the upper of two tanks, which drains into the lower tank. Both "
+        "tanks can overflow, and only the level of the lower tank is measured. The "
         "estimation data and the test data have 1,024 samples each, one every 4 s. The "
         "data are from [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) "
         "(Schoukens, Mattsson, Wigren and Noël, 2016). The file is "
@@ -70,9 +70,9 @@ _TITLES = {
     ),
     "bouc_wen": (
         "Bouc-Wen",
-        "This is an oscillator with a hysteretic force (Noël and Schoukens, 2016). The "
-        "data are generated here from the published equations, constants and signals, "
-        "and no file is needed. The random phases and "
+        "Bouc-Wen is an oscillator with a hysteretic force (Noël and Schoukens, 2016). "
+        "The data are generated here from the published equations, constants and "
+        "signals, and no file is needed. The random phases and "
         "the integrator are our own, so the test records are not the official ones. "
         "The physical model contains the oscillator and one hidden state for the "
         "hysteretic force. A network learns the derivative of that force. The error is "
