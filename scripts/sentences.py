@@ -54,7 +54,9 @@ def sentences(text: str) -> Iterator[str]:
         if paragraph and (is_new or not line.strip() or _SPECIAL.match(line)):
             whole = _LINK.sub(r"\1", " ".join(paragraph))
             for one in _END.split(" ".join(whole.split())):
-                if one.endswith(".") and len(one.split()) in WORDS:
+                # A citation is not a sentence.
+                is_cited = one.startswith(("Source:", "Reference"))
+                if one.endswith(".") and len(one.split()) in WORDS and not is_cited:
                     yield one
             paragraph = []
         if line.strip() and not _SPECIAL.match(line):
