@@ -126,7 +126,7 @@ class SafetyFilter(AbstractController):
     **Arguments:**
 
     - `controller`: any controller.
-    - `plant`: an [`delucax.AbstractSystem`][], affine in the control, or an
+    - `plant`: a [`delucax.AbstractSystem`][], affine in the control, or an
         [`delucax.AbstractDynamics`][]. The filter must observe the state of the plant.
         If the state is not measured, put the filter into a
         [`delucax.controllers.OutputFeedback`][].
@@ -137,7 +137,7 @@ class SafetyFilter(AbstractController):
         time, a fraction from 0 to 1 in discrete time. Give a number; or, for degree
         two, a pair of the first and the second decay; or a dictionary from the name of
         a barrier to a number or a pair.
-    - `margin`: the smallest allowed value of each condition, in the units of the
+    - `margin`: by how much each condition must be above zero, in the units of the
         condition; 0 by default. Give a number, or a dictionary from the name of a
         barrier to a number.
     - `disturbance`: the largest absolute value of each disturbance, a number or of

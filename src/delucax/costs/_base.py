@@ -236,7 +236,7 @@ class Scaled(AbstractCost):
 
     **Arguments:**
 
-    - `cost`: the cost, an [`delucax.AbstractCost`][].
+    - `cost`: the cost, a [`delucax.AbstractCost`][].
     - `factor`: $a$, a number. You can differentiate with respect to it.
 
     **Raises:** `ValueError` if `cost` is not a cost, or `factor` is not a finite
@@ -279,7 +279,7 @@ class Rate(AbstractCost):
 
     **Arguments:**
 
-    - `cost`: the cost per unit of time, an [`delucax.AbstractCost`][].
+    - `cost`: the cost per unit of time, a [`delucax.AbstractCost`][].
     - `dt`: the time step $\Delta t$, in units of time.
 
     **Raises:** `ValueError` if `cost` is not a cost, or `dt` is not positive.

@@ -117,7 +117,7 @@ class Delayed(_AbstractDelay):
 
     **Arguments:**
 
-    - `dynamics`: the plant, an [`delucax.AbstractDynamics`][].
+    - `dynamics`: the plant, a [`delucax.AbstractDynamics`][].
     - `controls`: $c$, the delay of the controls in steps, 0 by default.
     - `sensor`: $s$, the delay of the observations in steps, 0 by default.
 

@@ -90,7 +90,7 @@ def linearize(
 
     **Arguments:**
 
-    - `model`: an [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
+    - `model`: a [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
     - `t`: time, a scalar, 0 by default.
     - `x`, `u`: the state and control to linearise at, shapes `(n,)` and `(m,)`; by
         default the `equilibrium` of the model. You may pass the

@@ -70,7 +70,7 @@ def trim(
 
     **Arguments:**
 
-    - `model`: an [`delucax.AbstractSystem`][] or [`delucax.AbstractDynamics`][]. For
+    - `model`: a [`delucax.AbstractSystem`][] or [`delucax.AbstractDynamics`][]. For
         [`delucax.Discretized`][] dynamics, the operating point is that of the
         continuous-time system.
     - `t`: time, a scalar, 0 by default.

@@ -27,7 +27,7 @@ class WorstCase(AbstractWrapper):
 
     **Arguments:**
 
-    - `dynamics`: the plant, an [`delucax.AbstractDynamics`][] with an `equilibrium`.
+    - `dynamics`: the plant, a [`delucax.AbstractDynamics`][] with an `equilibrium`.
     - `L`: the gain of the adversary, shape `(k, n)`.
     - `bound`: the largest Euclidean norm of the adversary's disturbance; a larger
         disturbance is scaled back to this norm. None by default.

@@ -86,12 +86,12 @@ class Environment(eqx.Module):
 
     **Arguments:**
 
-    - `dynamics`: the discrete-time dynamics, an [`delucax.AbstractDynamics`][].
-    - `cost`: the stage and final cost, an [`delucax.AbstractCost`][]. A cost is minus a
+    - `dynamics`: the discrete-time dynamics, a [`delucax.AbstractDynamics`][].
+    - `cost`: the stage and final cost, a [`delucax.AbstractCost`][]. A cost is minus a
         reward.
-    - `disturbance`: an [`delucax.AbstractDisturbance`][]. By default there is no
+    - `disturbance`: a [`delucax.AbstractDisturbance`][]. By default there is no
         disturbance, except for dynamics with a diffusion: they get Brownian increments.
-    - `sensor_noise`: an [`delucax.AbstractDisturbance`][] that is added to the
+    - `sensor_noise`: a [`delucax.AbstractDisturbance`][] that is added to the
         observation; none by default.
     - `initial_state`: the first state, shape `(n,)`, or a function that draws the first
         state from a random key; zero by default.

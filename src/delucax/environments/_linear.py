@@ -60,7 +60,7 @@ def cartpole_linear(
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
-    **Returns:** an [`delucax.Environment`][] whose dynamics are
+    **Returns:** a [`delucax.Environment`][] whose dynamics are
         [`delucax.LinearDynamics`][].
 
     **Raises:** `ValueError` if a mass, the length or `dt` is not positive, or `gravity`
@@ -157,7 +157,7 @@ def lds(
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if only one of `A` and `B` is given, if there are neither
     matrices nor a key nor a system, or more than one of these, if shapes do not fit, if

@@ -49,7 +49,7 @@ def make(name: str, **kwargs: Any) -> Environment:
     - `**kwargs`: keyword arguments for the function that makes the task, such as
         [`delucax.environments.pendulum`][].
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` on an unknown name, or if the function does not return an
     environment.
@@ -102,7 +102,7 @@ def register(name: str, entry_point: str) -> None:
 
     - `name`: the name of the task.
     - `entry_point`: `"module:function"`. The module is imported when the task is first
-        made. The function must return an [`delucax.Environment`][].
+        made. The function must return a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if the entry point is not of the form `"module:function"`,
     or if another task has this name.

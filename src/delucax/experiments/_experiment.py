@@ -247,7 +247,7 @@ class experiment:  # noqa: N801
 
     - `function`: the function.
 
-    **Returns:** an [`delucax.experiments.Experiment`][].
+    **Returns:** a [`delucax.experiments.Experiment`][].
 
     !!! example
 

@@ -64,7 +64,7 @@ def run(
 
     **Arguments:**
 
-    - `*experiments`: the experiments, each an [`delucax.experiments.Experiment`][].
+    - `*experiments`: the experiments, each a [`delucax.experiments.Experiment`][].
     - `store`: a results file, which is created if it does not exist. By default the
         results are only kept in memory.
     - `workers`: the number of processes. 1 by default, which is this process; -1 means

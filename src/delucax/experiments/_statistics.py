@@ -13,7 +13,7 @@ from ._store import PASSED
 
 
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
-    """The mean of the middle half of the values.
+    """The interquartile mean: the mean of the values between the quartiles.
 
     The interquartile mean ignores outliers, as the median does, but uses more of the
     data. If the number of values is not a multiple of 4, the values at the edges of the

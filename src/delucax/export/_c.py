@@ -58,7 +58,7 @@ def c(
     **Arguments:**
 
     - `function_or_controller`: a [`delucax.AbstractController`][], an
-        [`delucax.AbstractSystem`][], an [`delucax.AbstractDynamics`][], or a function
+        [`delucax.AbstractSystem`][], a [`delucax.AbstractDynamics`][], or a function
         of arrays.
     - `directory`: the folder to write to. The folder is created if it does not exist.
     - `name`: an identifier in C. All public names in the C code begin with `name`.

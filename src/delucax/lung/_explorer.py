@@ -126,7 +126,7 @@ def explore(
     resistance: Any = None,
     compliance: Any = None,
 ) -> Breaths:
-    """Collect breaths of a lung with an [`delucax.lung.Explorer`][].
+    """Collect breaths of a lung with a [`delucax.lung.Explorer`][].
 
     Each breath begins at the start of the task. Breaths whose pressure exceeds the
     abort limit are left out, because a real machine would not finish them. Other

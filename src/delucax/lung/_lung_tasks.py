@@ -96,7 +96,7 @@ def balloon_lung(
         `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; and those
         of [`delucax.Environment`][].
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
     below the PEEP of the valves.
@@ -135,7 +135,7 @@ def delay_lung(
     - `**options`: those of `lung/balloon_lung`. `substeps` is 4 by default, because the
         pipe empties in about 25 ms.
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
     below the PEEP of the valves.
@@ -169,7 +169,7 @@ def single_compartment(
     - `horizon`: the number of steps per episode, 100 by default.
     - `**options`: those of `lung/balloon_lung`.
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
     below the PEEP of the valves.
@@ -202,7 +202,7 @@ def double_compartment(
         and `noise` is 0.2 cmH2O. `substeps` is 2, because the fast compartment of a
         narrow lung empties in about 10 ms when the expiratory valve is open.
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if a number is invalid, or if the PEEP of `waveform` is
     below the PEEP of the valves.
@@ -245,7 +245,7 @@ def learned_lung(
     - `**options`: `waveform`, `noise`, `limit` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if `model` has another type, or if a number is invalid.
 

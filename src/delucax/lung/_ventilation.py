@@ -321,7 +321,7 @@ def ventilation(
     - `**options`: other arguments of [`delucax.Environment`][], which replace the
         values that the task gives them.
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if a number is invalid, or if `waveform` is not a
     `BreathWaveform`.

@@ -110,7 +110,7 @@ class OptimalControl(eqx.Module):
 
         **Arguments:**
 
-        - `planner`: an [`delucax.planning.AbstractPlanner`][]; by default a
+        - `planner`: a [`delucax.planning.AbstractPlanner`][]; by default a
             [`delucax.planning.SQP`][] that starts at `states`.
         - `throw`: raise an error if the plan is not a solution; true by default.
 

@@ -104,7 +104,7 @@ class Calibrated(AbstractSystemWrapper):
 
     **Arguments:**
 
-    - `system`: the system inside, an [`delucax.AbstractSystem`][].
+    - `system`: the system inside, a [`delucax.AbstractSystem`][].
     - `control_scale`, `control_offset`: $a_u$ and $b_u$, each a number or shape `(m,)`;
         1 and 0 by default.
     - `output_scale`, `output_offset`: $a_y$ and $b_y$, each a number or shape `(p,)`; 1
@@ -165,7 +165,7 @@ class Corrected(AbstractSystemWrapper):
 
     **Arguments:**
 
-    - `system`: the known part, an [`delucax.AbstractSystem`][].
+    - `system`: the known part, a [`delucax.AbstractSystem`][].
     - `width`, `depth`: units in each hidden layer and number of hidden layers of the
         network, 16 and 1 by default.
     - `size`: $s$, the size of the correction to the derivative of each state, shape

@@ -211,7 +211,7 @@ class Episodes(NamedTuple):
 
 
 class AbstractActorCriticLoss(AbstractSurrogate):
-    """A loss of an [`delucax.training.ActorCritic`][], from episodes of its policy."""
+    """A loss of a [`delucax.training.ActorCritic`][], from episodes of its policy."""
 
     environment: eqx.AbstractVar[Environment]
     batch: eqx.AbstractVar[int]

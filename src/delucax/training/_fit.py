@@ -120,7 +120,7 @@ def fit(
         The loss returns a scalar, or a scalar and a dictionary of scalar metrics. If
         the loss is a module, for example from [`delucax.training.expected_cost`][], its
         arrays can change without a new compilation. A loss with a memory, such as
-        [`delucax.training.PPO`][], is an [`delucax.training.AbstractSurrogate`][].
+        [`delucax.training.PPO`][], is a [`delucax.training.AbstractSurrogate`][].
     - `model`: any pytree, for example a controller, an environment, a network, or a
         tuple of these. With a batch of keys, every array has a leading axis over the
         seeds, as `eqx.filter_vmap(make)(keys)` returns it.

@@ -72,7 +72,7 @@ class Adaptive(AbstractController):
 
     **Arguments:**
 
-    - `base`: an [`delucax.AbstractLearner`][], for example from
+    - `base`: a [`delucax.AbstractLearner`][], for example from
         [`delucax.controllers.gpc`][].
     - `slots`: the largest number of active experts, 8 by default.
     - `every`: the number of steps between the starts of two experts, 64 by default.

@@ -50,7 +50,7 @@ def gpc(
 
     **Arguments:**
 
-    - `dynamics`: the model, an [`delucax.AbstractDynamics`][] that observes its state.
+    - `dynamics`: the model, a [`delucax.AbstractDynamics`][] that observes its state.
     - `cost`: the stage cost, a differentiable function of `(t, x, u)` such as
         `env.cost`.
     - `base`: a controller that stabilises the dynamics; by default the

@@ -179,7 +179,7 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     With quadratic costs, the optimiser is recursive least squares, and its regret grows
     as $\log T$.
 
-    Only an [`delucax.controllers.OnlineLearner`][] can use it, because it provides the
+    Only a [`delucax.controllers.OnlineLearner`][] can use it, because it provides the
     curvature. The memory and the time of a step grow with the square of the number of
     weights.
 

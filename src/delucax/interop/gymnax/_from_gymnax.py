@@ -310,7 +310,7 @@ def from_gymnax(
     - `**environment`: other arguments of [`delucax.Environment`][], such as `encode`,
         or `horizon`, which is `params.max_steps_in_episode` by default.
 
-    **Returns:** an [`delucax.Environment`][].
+    **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if the environment does not implement the protocol, if its
     action space is neither a box nor discrete, if the state changes its shape in a
