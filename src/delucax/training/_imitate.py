@@ -62,7 +62,7 @@ def imitate(
     recover from its own mistakes. Each round trains on the states of all rounds so far:
 
     $$\ell(\theta) = \operatorname{mean}_{(t, y)} \;
-    \bigl\lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \bigr\rVert^2$$
+    \lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \rVert^2$$
 
     Here $\pi_\theta$ is the policy, $u^*$ the expert, and $S$ the diagonal matrix of
     the standard deviations of the expert's controls in the first round.
