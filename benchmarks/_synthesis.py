@@ -87,6 +87,11 @@ def regret(row: dict[str, Any], of: str = "policy") -> float:
     return float((np.mean(costs[of]) - best) / abs(best))
 
 
+def is_compared(row: dict[str, Any]) -> bool:
+    """Whether there was time for MPC or a plan beside the policy."""
+    return not {"MPC", "plan"}.isdisjoint(row["costs"])
+
+
 def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """A row for each task: what its seeds reach, on starts of their own, and, as
     `beside all`, on those of the scoreboard beside everything that ran there."""
@@ -95,7 +100,7 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     board, made = stored(), []
     for task, group in pd.DataFrame(rows).groupby("task"):
         seeds = group.to_dict("records")
-        own = [regret(row) for row in seeds]
+        own = [regret(row) if is_compared(row) else np.nan for row in seeds]
         names = [name for name in ("zero", "LQR") if name in seeds[0]["costs"]]
         floor = [min(regret(row, name) for name in names) for row in seeds]
         made.append(
@@ -104,11 +109,13 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
                 "kind": kind(str(task)),
                 "seeds": len(group),
                 "policy": ", ".join(group["structure"].value_counts().index),
-                "above best": np.median(own),
-                "worst seed": max(own),
+                "above best": np.nanmedian(own) if np.any(np.isfinite(own)) else None,
+                "worst seed": np.nanmax(own) if np.any(np.isfinite(own)) else None,
                 "beside all": board.excess(str(task), "synthesise"),
                 "floor": np.median(floor),
-                "worst beside floor": max(np.subtract(own, floor)),
+                "worst beside floor": max(
+                    np.subtract([regret(row) for row in seeds], floor)
+                ),
                 "seconds": group["seconds"].max(),
             }
         )
@@ -134,6 +141,7 @@ def tasks(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, An
         near, beside = (group[c] <= within for c in ("above best", "beside all"))
         simple = near & group["policy"].isin(["LQR", "zero"])
         counts = {"tasks": len(group), "near": near.sum(), "by LQR": simple.sum()}
+        counts["compared"] = group["above best"].notna().sum()
         counts["near beside all"] = beside.sum()
         summary.append({"kind": name} | {k: int(v) for k, v in counts.items()})
         print(f"{name}: {near.sum()} of {len(group)} within {within:.0%}", end="")

@@ -313,13 +313,21 @@ def draw(rows: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the parts that are named."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.policies")
-    parser.add_argument("--part", choices=PARTS, action="append")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.policies",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--part", choices=PARTS, action="append", help="all by default")
     parser.add_argument("--steps", type=int, choices=BUDGETS, help="one budget, again")
     parser.add_argument("--task", action="append", default=[], help="one task alone")
     parser.add_argument("--seeds", type=int, help="of each case; 5, or 3 of rivals")
-    parser.add_argument("--at-once", type=int, default=1, help="cases")
-    parser.add_argument("--small", action="store_true", help="to try it; not written")
+    parser.add_argument("--at-once", type=int, default=1, help="cases at a time")
+    parser.add_argument(
+        "--small",
+        action="store_true",
+        help="to try swing-up, tuning or learning; not written",
+    )
     options = parser.parse_args()
     compile_anew()
     about = {"machine": describe()}
@@ -332,7 +340,10 @@ def main() -> None:
         "rivals": lambda: rivals(options.task, options.at_once, **seeds),
         "export": lambda: exported(options.task, options.at_once),
     }
-    for part in options.part or PARTS:
+    parts = options.part or PARTS
+    if options.small and not row_by_row.keys().isdisjoint(parts):
+        parser.error(f"--small is not for {', '.join(row_by_row)}: use --task, --seeds")
+    for part in parts:
         print(f"\n== {part}", flush=True)
         if part in row_by_row:
             reached = row_by_row[part]()
