@@ -65,8 +65,9 @@ def case(task: str, without: str, seed: int) -> dict[str, Any]:
     }.get(without, lambda name: False)
     search.methods = {n: m for n, m in search.methods.items() if not dropped(n)}
     search.run(width=32, depth=1)
+    search.choose()
     structure, policy = search.chosen()
-    costs = {n: cost.tolist() for n, cost in search.compared(policy).items()}
+    costs = {n: cost.tolist() for n, cost in search.compared(policy)}
     seconds = time.perf_counter() - began
     return {"structure": structure, "costs": costs, "seconds": seconds}
 

@@ -59,7 +59,7 @@ def test_a_family_tells_its_worst_plant():
     search = PolicySearch(env(), ranges, KEY, 0.0, progress=False)
     drawn = search.plants()[path]
     zero = dlx.controllers.Zero(1)
-    costs = search.compared(zero)
+    costs = dict(search.compared(zero))
     assert drawn.shape == costs["policy"].shape and np.ptp(drawn) > 1
     made = dlx.training.Synthesis(zero, "zero", costs, [], 1.0, {path: drawn})
     worst = made.to_pandas().loc["policy"]
@@ -117,7 +117,8 @@ def test_the_last_choice_is_made_on_more_starts(monkeypatch):
         policy = dlx.controllers.Constant([value])
         search.enter(known(name, policy, *np.full(len(first), 1.0 / value)))
     assert search.chosen()[0] == "LQR"
-    name, policy = search.choose()
+    search.choose()
+    name, policy = search.chosen()
     assert name == "LQR + network" and policy.value == 2.0
     assert len(search.best[name].costs) == 8 * module.CHOICE
 
@@ -185,6 +186,20 @@ def test_an_interrupt_before_anything_is_known(monkeypatch):
     assert stopped.structure == "zero" and np.all(np.isfinite(stopped.costs["zero"]))
 
 
+@pytest.mark.parametrize("part", ["choose", "costs_of_rival"])
+def test_an_interrupt_at_the_end(monkeypatch, part):
+    def interrupted(self, *_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(
+        PolicySearch, "run", lambda self, *_: self.enter(self.best["zero"])
+    )
+    monkeypatch.setattr(PolicySearch, part, interrupted)
+    stopped = synthesise(env(), key=KEY, budget=5.0, progress=False)
+    assert stopped.structure == "zero" and len(stopped.costs["policy"])
+    assert ("MPC" in stopped.costs) == (part == "choose")
+
+
 class NoDerivative(dlx.AbstractSystem):
     state_names, control_names = ("x",), ("u",)
 
@@ -227,7 +242,7 @@ def test_it_cannot_be_traced():
 def test_a_cost_that_stays_infinite(monkeypatch):
     costs = {"policy": np.array([1.0, np.inf])}
     monkeypatch.setattr(PolicySearch, "run", lambda *_: None)
-    monkeypatch.setattr(PolicySearch, "compared", lambda *_: costs)
+    monkeypatch.setattr(PolicySearch, "compared", lambda *_: costs.items())
     with pytest.warns(UserWarning, match="'zero', which .* from 1 of 2"):
         synthesise(env(), key=KEY, progress=False)
 

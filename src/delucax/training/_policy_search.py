@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -333,10 +334,9 @@ class PolicySearch:
         costs = np.inf if line.costs is None else line.costs
         return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
 
-    def choose(self) -> tuple[str, AbstractController]:
-        """The final choice among the best policies, zero control and the LQR.
-
-        They are compared on more initial states.
+    def choose(self) -> None:
+        """Prepare the final choice among the best policies, zero control and the LQR:
+        compare them on more initial states.
 
         Good policies often differ only in a rare episode in which the plant runs away,
         and the first 64 initial states may have none.
@@ -356,7 +356,6 @@ class PolicySearch:
         for line in lines:
             own = [other for other in lines if other.structure == line.structure]
             self.best[line.structure] = min(own, key=self.score)
-        return self.chosen()
 
     def chosen(self) -> tuple[str, AbstractController]:
         """The best policy, or zero control or the LQR if they are about as good."""
@@ -381,14 +380,15 @@ class PolicySearch:
         drawn = on_plants(self.environment, ranges, self.comparison, of)
         return {path: np.asarray(values) for path, values in drawn.items()}
 
-    def compared(self, policy: AbstractController) -> dict[str, np.ndarray]:
-        """The costs of the policy and of other controllers, in episodes that were used
-        for nothing else."""
+    def compared(self, policy: AbstractController) -> Iterator[tuple[str, np.ndarray]]:
+        """The costs of the policy and of other controllers, one after the other, in
+        episodes that were used for nothing else."""
         env, ranges, keys = self.environment, self.ranges, self.comparison
         floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
         laws = {"policy": policy, **floor}
-        costs = {name: costs_of(env, ranges, law, keys) for name, law in laws.items()}
+        for name, law in laws.items():
+            yield name, np.asarray(costs_of(env, ranges, law, keys), float)
         for name in ("MPC", "plan") if env.dynamics.observes_state else ("plan",):
             if self.may_compare(name):
-                costs[name] = self.costs_of_rival(name, policy, keys)
-        return {name: np.asarray(cost, float) for name, cost in costs.items()}
+                costs = self.costs_of_rival(name, policy, keys)
+                yield name, np.asarray(costs, float)

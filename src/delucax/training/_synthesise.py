@@ -1,5 +1,6 @@
 """Policy synthesis: a trained policy for an environment, without settings."""
 
+import contextlib
 import warnings
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -200,16 +201,22 @@ def synthesise(
     search = PolicySearch(environment, ranges, key, float(budget), progress)
     with search.bar:
         _check_environment(environment, ranges, search.keys(CHOICE))
-        try:
+        # An interrupt ends each of the three parts, and the next one goes on with what
+        # is known. So two in a row return the best policy at once.
+        with contextlib.suppress(KeyboardInterrupt):
             search.run(width, depth)
-        except KeyboardInterrupt:
-            pass
-        structure, policy = search.choose()
-        costs = search.compared(policy)
-    if lost := np.sum(~np.isfinite(costs["policy"])):
+        with contextlib.suppress(KeyboardInterrupt):
+            search.choose()
+        structure, policy = search.chosen()
+        costs: dict[str, np.ndarray] = {}
+        with contextlib.suppress(KeyboardInterrupt):
+            for name, values in search.compared(policy):
+                costs[name] = values
+    own = costs.get("policy", np.zeros(0))
+    if lost := np.sum(~np.isfinite(own)):
         warnings.warn(
             f"{_WHERE}: the cost of {structure!r}, which is returned, is not finite "
-            f"from {lost} of {len(costs['policy'])} initial states.",
+            f"from {lost} of {len(own)} initial states.",
             stacklevel=2,
         )
     tried, plants = search.tried, search.plants()
