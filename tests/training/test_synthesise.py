@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 import sys
 
 import jax
@@ -265,6 +266,30 @@ def test_bad_tasks(change, match):
     task = dataclasses.replace(env(), **change)
     with pytest.raises(ValueError, match=f"synthesise: the {match}"):
         synthesise(task, key=KEY)
+
+
+def test_starts_that_are_lost_are_named_before_the_training(monkeypatch):
+    class Cubic(dlx.AbstractSystem):
+        state_names, control_names = ("x",), ("u",)
+
+        def vector_field(self, t, x, u, w):
+            return x**3 + u
+
+        def equilibrium(self):
+            return jnp.zeros(1), jnp.zeros(1)
+
+    def interrupted(self, *_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PolicySearch, "attempt", interrupted)
+    start = dlx.environments.UniformState([-4.0], [4.0])
+    task = dataclasses.replace(
+        plain(Cubic()), initial_state=start, control_bounds=(-1.0, 1.0), horizon=40
+    )
+    with pytest.warns(UserWarning) as warned:
+        synthesise(task, key=KEY, budget=5.0, progress=False)
+    words = r"not finite from \d+ of 64 initial states under zero control and the LQR"
+    assert re.search(words, str(warned[0].message))
 
 
 def test_a_start_that_no_control_keeps():

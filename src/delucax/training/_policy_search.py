@@ -153,6 +153,7 @@ class PolicySearch:
         self.lqr = self.regulator()
         if self.lqr is not None:
             self.enter(Line("LQR", "none", self.lqr))
+        self.warn_of_lost_starts()
         family = self.ranges is not None
         made = structures(env, self.lqr, family, width, depth, self.fresh_key())
         pairs = [(name, method) for method in self.methods for name in made]
@@ -179,6 +180,20 @@ class PolicySearch:
             share *= _FEWER
         if lines:
             self.finish(lines[0], made[lines[0].structure])
+
+    def warn_of_lost_starts(self) -> None:
+        """Warn before the training if plants run away under all laws so far."""
+        known = [line.costs for line in self.best.values() if line.costs is not None]
+        lost = np.all([~np.isfinite(costs) for costs in known], axis=0)
+        if np.any(lost):
+            laws = "zero control and the LQR" if self.lqr else "zero control"
+            warnings.warn(
+                f"synthesise: the cost is not finite from {np.sum(lost)} of "
+                f"{len(lost)} initial states under {laws}. If no control keeps the "
+                "plant finite from there, no policy will: draw other initial states, "
+                "or end the episode before (`terminated`).",
+                stacklevel=4,
+            )
 
     def regulator(self) -> LQR | None:
         """The LQR, or `None` if it does not exist for this environment."""
