@@ -130,6 +130,13 @@ def test_wrong_arguments(tmp_path, given, words):
     assert not any(tmp_path.iterdir())
 
 
+def test_a_plant_gives_the_size_of_an_observation(tmp_path):
+    total = dlx.controllers.Constant([1.0])
+    export.c(total, tmp_path, name="held", plant=PLANT)
+    header = (tmp_path / "held.h").read_text()
+    assert f"HELD_OBSERVATION_SIZE {PLANT.observation_size}" in header
+
+
 def test_no_half_written_files(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="directory must be one that can be written"):

@@ -140,8 +140,8 @@ def _observation(
             )
         return jax.ShapeDtypeStruct(tuple(y.shape), dtype)
     fitting = []
-    for size in range(1, _MOST_TRIED + 1):
-        y = jax.ShapeDtypeStruct((size,), dtype)
+    for tried in range(1, _MOST_TRIED + 1):
+        y = jax.ShapeDtypeStruct((tried,), dtype)
         try:
             jax.eval_shape(step, number, y, *state)
         except Exception:  # noqa: BLE001 - a controller may raise anything
