@@ -127,6 +127,12 @@ def check_real(array: Array, name: str, where: str) -> None:
 def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     """`value` as a floating-point array of `ndim` axes with finite entries."""
     fits = lambda shape: len(shape) == ndim
+    array = as_float_array(value)
+    if ndim == 2 and eqx.is_array(array) and array.ndim == 1:
+        raise ValueError(
+            f"{where}: {name} must be a matrix, got shape {array.shape}. `jnp.diag` "
+            "makes a diagonal matrix of a vector."
+        )
     return as_finite(value, name, where, "be a matrix", fits)
 
 

@@ -260,6 +260,9 @@ def test_bad_arguments_are_named():
         MPC(*given, 0)
     with user_error(match="constraints must be a Constraints"):
         MPC(*given, 5, constraints=lambda t, x, u: x)
+    limits = dlx.planning.Constraints(states=(-1.0, 1.0))
+    with user_error(match="MPC: planner must be a .*SQP.* got an ILQR"):
+        MPC(*given, 5, constraints=limits)
     with user_error(match="planner must be an AbstractPlanner"):
         MPC(*given, 5, planner=3)
     with user_error(match="bounds must be numbers or have shape"):

@@ -237,6 +237,11 @@ class MPC(AbstractController):
         if self.constraints is not None:
             hint = " (`delucax.planning.Constraints`)"
             check_instance(self.constraints, Constraints, "constraints", where, hint)
+            if isinstance(self.planner, ILQR) and not self.constraints.is_hard:
+                raise ValueError(
+                    f"{where}: planner must be a `delucax.planning.SQP` for bounds of "
+                    "states and soft constraints, got an ILQR, the default."
+                )
         check_instance(self.start, Start, "start", where)
         start = self.start.checked(n, m, "start", where)
         if start.controls.ndim != 3 or start.states is None or start.gains is None:

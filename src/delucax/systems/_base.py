@@ -145,7 +145,8 @@ class AbstractPlant(eqx.Module):
         """
         raise ValueError(
             f"{type(self).__name__} defines no equilibrium: override `equilibrium`, or "
-            "pass the state and control yourself."
+            "pass both the state and the control. `delucax.trim` computes such a point "
+            "from a guess of both."
         )
 
 
