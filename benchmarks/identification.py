@@ -34,7 +34,7 @@ import numpy as np
 
 from benchmarks import _cases
 from benchmarks._identified import others
-from benchmarks._identified.case import DATA, GREY_BOX, LINEAR, module_of, NEURAL
+from benchmarks._identified.case import DATA, GREY_BOX, KNOWN, LINEAR, module_of, NEURAL
 from benchmarks._identified.page import page
 from benchmarks._machine import describe, limit_cores
 from benchmarks._results import updated
@@ -65,6 +65,8 @@ def problem(
         for method in several
         for k in range(seeds)
     ]
+    if hasattr(module, "known"):
+        cases.append({"problem": name, "method": KNOWN, "seed": 0})
     os.environ[DATA] = str(data)
     if again:
         _cases.forget(store, problem=name)

@@ -15,6 +15,7 @@ from benchmarks._identified import others
 DATA = "DELUCAX_DATA"
 """The variable that names the folder of the data."""
 LINEAR, NEURAL, GREY_BOX = "linear", "neural state space", "grey box"
+KNOWN = "physics, structure known"
 START, PAST = 50, 20
 """The samples from which the state is estimated, as `nonlinear_benchmarks` has it, and
 those that the encoder takes."""
@@ -37,13 +38,15 @@ def case(problem: str, method: str, seed: int) -> dict[str, Any]:
     estimation, tests = module.records(folder)
     began = time.perf_counter()
     extra: dict[str, Any] = {}
-    if method != GREY_BOX:
+    if method not in (GREY_BOX, KNOWN):
         # A model in discrete time knows the controls at the samples alone.
         estimation, *parts = map(_held, (estimation, *tests.values()))
         tests = dict(zip(tests, parts, strict=True))
     order = len(module.first(estimation))
     first = lambda record: [0.0] * order
-    if method == LINEAR:
+    if method == KNOWN:
+        models = {KNOWN: module.known(estimation).model}
+    elif method == LINEAR:
         models = {LINEAR: sysid.subspace(estimation, order, affine=True).model}
     elif method == NEURAL:
         options: Any = dict(past=PAST, progress=False, key=jax.random.key(seed))
