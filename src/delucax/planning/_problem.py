@@ -188,7 +188,8 @@ class Problem(eqx.Module):
         return values_of(self.constraints, True, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The constraint values along a trajectory, at each step and at the end."""
+        """The stage and final constraint functions along a trajectory, `states` and
+        `controls`."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
