@@ -195,11 +195,13 @@ class Problem(eqx.Module):
         return stage, self.final_constraints(times[-1], states[-1])
 
     def with_multipliers(self, multipliers: Augmentation | None) -> "Problem":
-        """The same problem, with the augmented Lagrangian as its cost."""
+        """The same problem, with the augmented Lagrangian for `multipliers` as its
+        cost."""
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
-        """The cost of a step, plus the terms of its constraints for multipliers `y`."""
+        """The cost of a step at time `t` with state `x` and control `u`, plus the terms
+        of its constraints for multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
             # `+ 0.0`, because an integer has no gradient.
