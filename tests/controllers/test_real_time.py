@@ -126,7 +126,9 @@ def test_wrong_use():
     with user_error(match="planner must be a `delucax.planning.SQP`"):
         controller(planner=dlx.planning.ILQR())
     with user_error(match="real_time must be True"):
-        (mpc := controller(real_time=False)).prepare(0.0, mpc.init())
+        (mpc := controller(real_time=False, planner=dlx.planning.SQP())).prepare(
+            0.0, mpc.init()
+        )
     with user_error(match="state must come from prepare"):
         (mpc := controller()).feedback(0.0, X0, mpc.init())
     with user_error(match="fallback"):
