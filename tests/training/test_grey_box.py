@@ -136,7 +136,8 @@ def test_a_parameter_that_is_zero_has_an_interval():
     log = sysid.Record(x + [0.2, 0.0] + 0.01 * rng.normal(size=x.shape), u / 2, dt=0.05)
     rig = dlx.systems.Calibrated(system, output_offset=[0.0, 0.0])
     names = ["system.control_scale", "system.output_offset"]
-    fit = sysid.physical(dlx.Discretized(rig, 0.05), log, names, x0=[0.0, 0.0])
+    options = dict(x0=[0.0, 0.0], level=0.999)
+    fit = sysid.physical(dlx.Discretized(rig, 0.05), log, names, **options)
     truth = np.array([2.0, 0.2, 0.0])
     assert np.all(np.asarray(fit.identifiable))
     assert np.all((fit.low < truth) & (truth < fit.high))
