@@ -1,9 +1,10 @@
 """What policies cost in C: the part `export` of `benchmarks.policies`.
 
-Every structure that `training.synthesise` may return for a task is trained for some
-steps and written by `export.c`. The C takes its place in the closed loop, from the same
-starts. The costs differ by rounding, which an unstable or chaotic loop amplifies; so
-beside the C stands what JAX itself gives from starts that are moved by one rounding.
+The policy that `training.synthesise` returns for a task within 30 s, and every other
+structure that it may return, trained for some steps, are written by `export.c`. The C
+takes its place in the closed loop, from the same starts. The costs differ by rounding,
+which an unstable or chaotic loop amplifies; so beside the C stands what JAX itself
+gives from starts that are moved by one rounding.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ FAMILIES = ("pendulum", "cartpole_linear")
 PRECISIONS = ("float64", "float32")
 WITHOUT_GRADIENT = ("mountain_car",)
 """Tasks whose cost has no gradient to speak of: evolution trains their policies."""
-STARTS, STEPS, LONGEST = 16, 200, 100
+STARTS, STEPS, LONGEST, BUDGET = 16, 200, 100, 30.0
 
 
 class AngleAlone(dlx.systems.Pendulum):
@@ -68,20 +69,24 @@ def task_of(name: str) -> dlx.Environment:
 
 def policies(env: Any, task: str) -> dict[str, Any]:
     """One of each structure, trained."""
-    from delucax.training._policy_search import PolicySearch
+    from delucax.training._regulator import regulator
     from delucax.training._structures import structures
 
     key = jr.key(0)
-    lqr = PolicySearch(env, None, key, budget=1.0, progress=False).regulator()
-    made: dict[str, Any] = {"zero": dlx.controllers.Zero(env.control_size)}
-    if lqr is not None:
-        made["LQR"] = lqr
+    found = dlx.training.synthesise(env, key=key, budget=BUDGET, progress=False)
+    made = {f"synthesise ({found.structure})": found.policy}
+    try:
+        law = regulator(env, key)
+    except (ValueError, RuntimeError):
+        law = None
+    if law is not None:
+        made[type(law).__name__] = law
     horizon = min(env.horizon, LONGEST)
     loss = dlx.training.expected_cost(env, batch=8, horizon=horizon, gradient_decay=0.9)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(5e-3))
-    untrained = structures(env, lqr, False, 32, 1, key)
+    untrained = structures(env, law, False, 32, 1, key)
     if task in FAMILIES:
-        untrained |= structures(env, lqr, True, 32, 1, key)
+        untrained |= structures(env, law, True, 32, 1, key)
     for name, policy in untrained.items():
         part = "correction" if isinstance(policy, dlx.controllers.Residual) else None
         how: Any = dict(key=key, trainable=part, progress=False, throw=False)

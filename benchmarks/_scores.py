@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from delucax.experiments import interquartile_mean, Results
+from delucax.experiments import Results
 from delucax.lung import BreathCost
 from delucax.studies._scoreboard import FAMILIES, is_disturbed, task_of
 
@@ -84,7 +84,7 @@ class Board:
         costs = self.costs.get((task, method))
         if costs is None:
             return None
-        each = [interquartile_mean(row) for row in costs]
+        each = [float(np.mean(row)) for row in costs]
         return Spread(float(np.median(each)), min(each), max(each), len(each))
 
     def best(self, task: str) -> float:
@@ -92,10 +92,10 @@ class Board:
         of the best single controller, as the least of several draws is luck."""
         ran = [c for (name, m), c in self.costs.items() if name == task and m != PLAN]
         if task in self.disturbed:
-            return min(interquartile_mean(row) for costs in ran for row in costs)
+            return min(float(np.mean(row)) for costs in ran for row in costs)
         if (task, PLAN) in self.costs:
             ran.append(self.costs[task, PLAN])
-        return interquartile_mean(np.min(np.concatenate(ran), axis=0))
+        return float(np.mean(np.min(np.concatenate(ran), axis=0)))
 
     def trainings(self, task: str, method: str) -> int:
         """How many trainings were run."""

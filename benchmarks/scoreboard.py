@@ -90,7 +90,7 @@ def tables(board: Board) -> str:
     single = [m for m in TRAINED for t in board.names if board.trainings(t, m) == 1]
     once = " A cost without brackets is from a single training." if single else ""
     made.append(
-        "## Cost\n\nThe tables show the cost of an episode, as the interquartile mean "
+        "## Cost\n\nThe tables show the cost of an episode, as the mean "
         "over 8 initial states. If a controller was trained several times, the cost is "
         "the median of the trainings, with the lowest and the highest cost in brackets."
         f"{once}\n"

@@ -288,6 +288,22 @@ def test_callbacks_are_told_of_each_block():
 
 
 @once
+def test_a_callback_stops_the_training(tmp_path):
+    heard = []
+
+    def stop(step, metrics):
+        heard.append(step)
+        return step >= 4
+
+    options = dict(block=2, checkpoint=tmp_path / "run")
+    short = train(callbacks=[stop, lambda *_: None], **options)
+    assert heard == [2, 4] and len(short.history) == 4
+    # The checkpoint has the steps so far.
+    resumed = train(callbacks=[lambda step, _: heard.append(step)], **options)
+    assert heard[2:] == list(range(6, 21, 2)) and len(resumed.history) == 20
+
+
+@once
 def test_the_bar_ticks_once_a_block(capsys):
     train(steps=10, block=5, progress=True)
     assert "10/10" in capsys.readouterr().err

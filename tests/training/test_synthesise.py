@@ -16,6 +16,7 @@ from delucax.training import synthesise
 from delucax.training._attempt import Line
 from delucax.training._episode_costs import tamed
 from delucax.training._policy_search import PolicySearch
+from delucax.training._regulator import regulator
 from delucax.training._structures import structures
 
 
@@ -30,7 +31,7 @@ def env():
 
 @functools.cache
 def result():
-    return synthesise(env(), key=KEY, budget=6.0, width=8, progress=False)
+    return synthesise(env(), key=KEY, budget=10.0, width=8, progress=False)
 
 
 def test_a_linear_plant_gets_its_regulator():
@@ -93,6 +94,19 @@ def known(name, policy, *costs):
     return Line(name, "none", policy, np.array(costs))
 
 
+class Position(dlx.systems.DoubleIntegrator):
+    """Without a sensor of the velocity."""
+
+    def observe(self, t, x):
+        return x[:1]
+
+
+def hidden():
+    dynamics = dlx.Discretized(Position(), dt=0.1)
+    noise = dlx.disturbances.Gaussian(0.01, size=1)
+    return dataclasses.replace(env(), dynamics=dynamics, sensor_noise=noise)
+
+
 def test_a_policy_that_seldom_fails_is_better_than_one_that_never_works():
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     lqr, net = (dlx.controllers.Constant([float(i)]) for i in range(2))
@@ -135,17 +149,86 @@ def test_a_reward_is_a_large_usual_cost():
 
 
 def test_each_kind_of_plant_gets_its_structures():
-    class Position(dlx.systems.DoubleIntegrator):
-        def observe(self, t, x):
-            return x[:1]
-
     lqr = dlx.controllers.local_lqr(env())
     names = lambda env, *given: set(structures(env, *given, 4, 1, KEY))
     assert names(env(), lqr, False) == {"LQR + network", "network"}
     assert names(env(), lqr, True) == {"LQR + memory", "network"}
     assert names(env(), None, True) == {"memory", "network"}
-    hidden = dlx.Environment(dlx.Discretized(Position(), dt=0.1), env().cost)
-    assert names(hidden, None, False) == {"memory"}
+    assert names(hidden(), None, False) == {"memory"}
+    lqg = regulator(hidden(), KEY)
+    assert names(hidden(), lqg, False) == {"memory", "LQG + memory"}
+
+
+def test_where_the_state_is_hidden_the_regulator_is_an_lqg():
+    task, key = hidden(), jax.random.key(1)
+    lqg = regulator(task, key)
+    assert isinstance(lqg, dlx.controllers.LQG)
+    run = dlx.rollout(task, lqg, key=key)
+    zero = dlx.rollout(task, dlx.controllers.Zero(1), key=key)
+    assert run.total_cost < 0.2 * zero.total_cost
+    assert jnp.all(jnp.abs(run.states[-1]) < 0.2)
+    # Its gain is that of the covariances that the noise has, to the sampling error.
+    assert lqg.estimator.V[0, 0] == pytest.approx(1e-4, rel=0.2)
+    floor = {"zero": np.full(2, 9.0), "LQG": np.full(2, 1.0)}
+    search = PolicySearch(task, None, key, 10.0, progress=False)
+    for name, costs in floor.items():
+        search.enter(known(name, lqg, *costs))
+    assert search.chosen() == ("LQG", lqg)
+    # A plan knows the velocity, so it cannot tell that the LQG is enough.
+    search.law = lqg
+    assert not search.is_settled()
+
+
+def test_a_plant_that_cannot_rest_has_no_regulator():
+    class Drifts(Position):
+        def equilibrium(self):
+            raise ValueError("no equilibrium")
+
+        def vector_field(self, t, x, u, w):
+            return jnp.array([x[1] ** 2 + 1.0, u[0]])
+
+    dynamics = dlx.Discretized(Drifts(), dt=0.1)
+    task = dataclasses.replace(hidden(), dynamics=dynamics)
+    search = PolicySearch(task, None, KEY, 10.0, progress=False)
+    with pytest.warns(UserWarning, match="no LQG and no network around one"):
+        assert search.regulator() is None
+
+
+def test_a_policy_starts_with_the_costs_of_its_regulator(monkeypatch):
+    """A round of training that harms an LQR leaves the LQR."""
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    lqr = dlx.controllers.local_lqr(env())
+    policy = structures(env(), lqr, False, 4, 1, KEY)["LQR + network"]
+    before = Line("LQR + network", "none", policy, search.costs(policy))
+    np.testing.assert_allclose(before.costs, search.costs(lqr), rtol=1e-4)
+    worse = dlx.controllers.Constant([100.0])
+    monkeypatch.setattr(PolicySearch, "trained", lambda *_: worse)
+    assert search.attempt(before, "gradient").policy is policy
+    assert search.tried[-1].cost > search.mean(before)
+
+
+def test_a_long_round_ends_with_its_time():
+    task = dataclasses.replace(env(), horizon=2000)
+    search = PolicySearch(task, None, KEY, 10.0, progress=False)
+    policy = structures(task, None, False, 4, 1, KEY)["network"]
+    line = Line("network", "none", policy, np.full(64, np.inf))
+    search.trained(line, "evolution")
+    compiled = search.seconds
+    # A whole round, of 150 generations, would take much longer.
+    search.trained(line, "evolution")
+    assert search.seconds - compiled < 3
+
+
+def test_a_comparison_ends_with_the_time(monkeypatch):
+    module = sys.modules[PolicySearch.__module__]
+    ran = []
+    plan = lambda *given: ran.append(1) or jnp.zeros(len(given[-1]))
+    monkeypatch.setattr(module, "costs_of_plan", plan)
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    assert len(search.costs_of_rival("plan", None, search.comparison)) == 16
+    search.began -= 12
+    assert search.costs_of_rival("plan", None, search.comparison) is None
+    assert len(ran) == 4
 
 
 def test_a_range_reaches_from_a_bound_on_one_side():
@@ -174,7 +257,7 @@ def test_it_stops_where_the_user_does(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(PolicySearch, "attempt", interrupted)
-    stopped = synthesise(env(), key=KEY, budget=5.0, width=8, progress=False)
+    stopped = synthesise(env(), key=KEY, budget=10.0, width=8, progress=False)
     assert stopped.structure == "LQR" and not stopped.tried
 
 
@@ -183,7 +266,7 @@ def test_an_interrupt_before_anything_is_known(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(PolicySearch, "run", interrupted)
-    stopped = synthesise(env(), key=KEY, budget=5.0, progress=False)
+    stopped = synthesise(env(), key=KEY, budget=10.0, progress=False)
     assert stopped.structure == "zero" and np.all(np.isfinite(stopped.costs["zero"]))
 
 
@@ -196,7 +279,7 @@ def test_an_interrupt_at_the_end(monkeypatch, part):
         PolicySearch, "run", lambda self, *_: self.enter(self.best["zero"])
     )
     monkeypatch.setattr(PolicySearch, part, interrupted)
-    stopped = synthesise(env(), key=KEY, budget=5.0, progress=False)
+    stopped = synthesise(env(), key=KEY, budget=10.0, progress=False)
     assert stopped.structure == "zero" and len(stopped.costs["policy"])
     assert ("MPC" in stopped.costs) == (part == "choose")
 
@@ -287,7 +370,7 @@ def test_starts_that_are_lost_are_named_before_the_training(monkeypatch):
         plain(Cubic()), initial_state=start, control_bounds=(-1.0, 1.0), horizon=40
     )
     with pytest.warns(UserWarning) as warned:
-        synthesise(task, key=KEY, budget=5.0, progress=False)
+        synthesise(task, key=KEY, budget=10.0, progress=False)
     words = r"not finite from \d+ of 64 initial states under zero control and the LQR"
     assert re.search(words, str(warned[0].message))
 
@@ -307,10 +390,11 @@ def test_a_start_that_no_control_keeps():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        (dict(budget=1.0), "budget must be at least 5 s"),
+        (dict(budget=9.0), "budget must be at least 10 s"),
         (dict(budget=jnp.nan), "budget must be"),
         (dict(width=0), "width must be"),
         (dict(ranges={"dynamics.system.weight": (1, 2)}), "weight"),
+        (dict(ranges={}), "ranges must name at least one parameter"),
     ],
 )
 def test_bad_arguments(options, match):

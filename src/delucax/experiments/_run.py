@@ -365,7 +365,7 @@ def _progress(
     total: int, workers: int, shown: bool
 ) -> Iterator[Callable[[int, str, str], None]]:
     """A progress bar for the whole run, and one for each worker that has answered."""
-    from tqdm.auto import tqdm
+    from .._progress import tqdm
 
     make = functools.partial(tqdm, unit="case", disable=not shown)
     bars: dict[int, Any] = {}

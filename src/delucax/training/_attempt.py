@@ -38,9 +38,10 @@ class Attempt(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A policy, the method that trains it, and its costs (`None` before training)."""
+    """A policy in training: the method of its last gain (`"none"` before training), and
+    its costs."""
 
     structure: str
     method: str
     policy: AbstractController
-    costs: np.ndarray | None = None
+    costs: np.ndarray

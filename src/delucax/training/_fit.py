@@ -2,7 +2,6 @@
 
 import os
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from jaxtyping import Array, PyTree
 
 from .._check import check_at_most, check_count, check_function, check_key, is_concrete
 from .._module import shown
+from .._progress import tqdm
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._gradient_estimators import analytic
@@ -23,12 +23,6 @@ from ._optimiser import Optimiser
 from ._record import Checkpoint, checkpoint_path, COLUMNS, describe_run, History
 from ._steps import AbstractSurrogate, CAPACITY, FAULTS, State, Steps
 from ._trainable import partition_trainable
-
-
-with warnings.catch_warnings():
-    # Without ipywidgets, tqdm warns in a notebook, but the text bar still works.
-    warnings.simplefilter("ignore")
-    from tqdm.auto import tqdm
 
 
 _WHERE = "fit"
@@ -149,7 +143,8 @@ def fit(
     - `callbacks`: functions `callback(step, metrics)`, called after each block; none by
         default. `step` is the number of finished steps, and `metrics` is a dictionary
         of the numbers of the last step, averaged over the seeds. You can use callbacks
-        to log to TensorBoard, for example.
+        to log to TensorBoard, for example. If a callback returns `True`, training stops
+        after this block, for example because the loss is low enough or the time is up.
     - `checkpoint`: the path of a file for checkpoints; none by default. If this file
         exists, the run resumes from the checkpoint in it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
@@ -278,8 +273,11 @@ def fit(
                 blocks = [_joined(blocks)]
                 saved.write(state[:3], blocks[0], seconds)
                 written = done
-            for callback in callbacks:
-                callback(done, last)
+            stops = [callback(done, last) for callback in callbacks]
+            if any(isinstance(stop, bool | np.bool_) and stop for stop in stops):
+                if saved is not None and written < done and not np.any(faults):
+                    saved.write(state[:3], _joined(blocks), seconds)
+                break
 
     if np.any(faults) and throw:
         raise RuntimeError(_failure(faults, blocks[-1], done))

@@ -13,8 +13,9 @@ from jaxtyping import Array
 
 from .._controller import AbstractController
 from .._module import get_path
+from .._progress import tqdm
 from .._typing import PRNGKey
-from ..controllers import local_lqr, local_mpc, LQR, Residual, Zero
+from ..controllers import LQG, LQR, Residual, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
 from ._attempt import Attempt, Line
@@ -30,14 +31,8 @@ from ._episode_costs import (
 from ._evolve import evolve
 from ._fit import fit
 from ._gradient_estimators import ClippedSamples
-from ._imitate import imitate
+from ._regulator import regulator
 from ._structures import structures
-
-
-with warnings.catch_warnings():
-    # Without ipywidgets, tqdm warns in a notebook, but the text bar still works.
-    warnings.simplefilter("ignore")
-    from tqdm.auto import tqdm
 
 
 # After this number of trials the search checks whether the LQR is enough.
@@ -56,8 +51,12 @@ _TRAINING, _CHOOSING = 0.7, 0.75
 # A comparison starts only if it is likely to end within `_OVERRUN` times the budget. It
 # is expected to take as long as the longest step so far, and MPC `_MPC` times as long.
 _OVERRUN, _MPC = 1.1, 2
-# Steps in a round of gradient training, and generations in a round of evolution.
-_STEPS, _GENERATIONS = 300, 150
+# Episodes of a comparison with MPC or plans that run together.
+_TOGETHER = 4
+# Steps in a round of gradient training, and generations in a round of evolution. A
+# round ends early if it has taken the share `_ROUND` of the budget since its first
+# block, which compiles.
+_STEPS, _GENERATIONS, _BLOCK, _ROUND = 300, 150, 5, 0.05
 # Initial learning rates of a round. The second one is used when no method gains.
 _RATE, _FINE_RATE = 2e-2, 2e-3
 # Gradients in a batch, and the longest rollout that is differentiated.
@@ -66,10 +65,10 @@ _BATCH, _LONGEST = 32, 200
 _EVALUATIONS = 8
 # The usual cost before it is known, so large that no cost is far above it.
 _ANY = 1e30
-# The shares of the budget for a trial and for a later attempt, after the first round.
-# After each pass the best 1 / `_FEWER` of the trials go on, `_FEWER` times as long.
-_TRIAL, _ATTEMPT, _FEWER = 0.01, 0.03, 3
-# A trial is dropped if it costs more than the best by this share.
+# The share of the budget for an attempt, after its first round, and for each policy of
+# the second pass. After each pass the best half goes on, for twice as long.
+_ATTEMPT, _SHARE, _FEWER = 0.02, 0.1, 2
+# A policy is dropped if it costs more than the best by this share.
 _CLOSE = 0.5
 # Relative gains. Below the first, a method counts as one that does not gain. Below the
 # second, a gain does not justify a network or an expert.
@@ -77,6 +76,7 @@ _GAIN, _WORTH = 1e-3, 5e-3
 # Initial standard deviations of an evolution: of a network, of other policies, and of a
 # policy that is already trained.
 _WIDE, _NARROW, _NEAR = 1.0, 0.3, 0.05
+_EVOLUTION = "evolution"
 
 
 def _is_better(other: Any, own: Any) -> bool:
@@ -105,16 +105,20 @@ class PolicySearch:
         self.bar = tqdm(total=round(budget), **options)
         # If an interrupt comes before the first trial, this is the result.
         zero = Zero(environment.control_size)
-        self.best = {"zero": Line("zero", "none", zero)}
+        unknown = np.full(CHOICE, np.inf)
+        self.best = {"zero": Line("zero", "none", zero, unknown)}
         self.last: list[Line] = []
         self.tried: list[Attempt] = []
-        self.lqr: LQR | None = None
+        self.law: LQR | LQG | None = None
+        name = "LQR" if environment.dynamics.observes_state else "LQG"
+        # The structures that need no training.
+        self.floor = "zero", name
         self.steps = min(environment.horizon, _LONGEST)
         lasting = self.steps * float(environment.dt)
         unit, times = environment.dynamics.time_unit, [lasting * m for m in _MEMORIES]
         # From the name of a method to the time constant of its damped gradient.
         damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
-        self.methods = damped | {"gradient": jnp.inf, "evolution": None}
+        self.methods = damped | {"gradient": jnp.inf, _EVOLUTION: None}
         self.rate = _RATE
         # The least median cost so far, and its absolute value.
         self.least, self.usual = np.inf, _ANY
@@ -148,45 +152,58 @@ class PolicySearch:
 
     def run(self, width: int, depth: int) -> None:
         """Train until the time is up or no method gains."""
-        env = self.environment
-        self.enter(self.best["zero"])
-        self.lqr = self.regulator()
-        if self.lqr is not None:
-            self.enter(Line("LQR", "none", self.lqr))
+        self.law = self.regulator()
+        floor = self.best["zero"].policy, self.law
+        for name, law in zip(self.floor, floor, strict=True):
+            if law is not None:
+                self.enter(Line(name, "none", law, self.costs(law)))
         self.warn_of_lost_starts()
-        family = self.ranges is not None
-        made = structures(env, self.lqr, family, width, depth, self.fresh_key())
-        pairs = [(name, method) for method in self.methods for name in made]
-        # The trials that show whether the LQR is enough come first.
-        first = [("LQR + memory" if family else "LQR + network", "gradient")]
-        first.append(("network", "evolution"))
-        pairs = sorted(pairs, key=lambda pair: pair not in first)
-        lines = [Line(name, method, made[name]) for name, method in pairs]
-        # Successive halving: the best third goes on, for three times as long.
-        share = _TRIAL
-        while (self.may_train or not self.tried) and len(lines) > 1:
-            after = []
-            for line in lines:
-                if not self.may_train and after:
-                    break
-                after.append(self.attempt(line, share))
-                if len(self.tried) == _FIRST and self.is_settled():
-                    return
-            left = max(1, round(len(lines) / _FEWER))
-            after = sorted(after, key=self.score)[:left]
-            least = self.score(after[0])
+        family, key = self.ranges is not None, self.fresh_key()
+        made = structures(self.environment, self.law, family, width, depth, key)
+        # Each policy is trained from the start by the gradient, with less and less
+        # damping, and by evolution.
+        gradients = [name for name in self.methods if name != _EVOLUTION]
+        evolution = [name for name in self.methods if name == _EVOLUTION]
+        first, last = list(made)[0], list(made)[-1]
+        trials = [(first, gradients), (last, evolution)]
+        trials += [(first, evolution), (last, gradients)] if first != last else []
+        lines = []
+        for name, methods in trials:
+            line = Line(name, "none", made[name], self.costs(made[name]))
+            for method in methods:
+                if self.may_train or not self.tried:
+                    line = self.attempt(line, method)
+            lines.append(line)
+            if len(lines) == _FIRST and self.is_settled():
+                return
+        self.refine(lines)
+
+    def refine(self, lines: list[Line]) -> None:
+        """Train the best of the lines, and the others if time is left."""
+        share, dropped = _SHARE * self.budget, []
+        while len(lines) > 1:
+            lines = sorted(lines, key=self.score)
+            least = self.score(lines[0])
             most = least + _CLOSE * abs(least)
-            lines = [line for line in after if self.score(line) <= most]
+            half = lines[: len(lines) // _FEWER]
+            kept = [line for line in half if self.score(line) <= most]
+            dropped += lines[len(kept) :]
+            lines = kept
+            if len(lines) > 1:
+                lines = [self.improve(line, share) for line in lines]
             share *= _FEWER
-        if lines:
-            self.finish(lines[0], made[lines[0].structure])
+        for line in [*lines, *sorted(dropped, key=self.score)]:
+            self.rate = _RATE
+            after = self.improve(line)
+            self.rate = _FINE_RATE
+            self.improve(after)
 
     def warn_of_lost_starts(self) -> None:
         """Warn before the training if plants run away under all laws so far."""
-        known = [line.costs for line in self.best.values() if line.costs is not None]
-        lost = np.all([~np.isfinite(costs) for costs in known], axis=0)
+        known = [line.costs for line in self.best.values()]
+        lost = np.all(~np.isfinite(known), axis=0)
         if np.any(lost):
-            laws = "zero control and the LQR" if self.lqr else "zero control"
+            laws = " and the ".join(["zero control", self.floor[1]][: len(known)])
             warnings.warn(
                 f"synthesise: the cost is not finite from {np.sum(lost)} of "
                 f"{len(lost)} initial states under {laws}. If no control keeps the "
@@ -195,17 +212,16 @@ class PolicySearch:
                 stacklevel=4,
             )
 
-    def regulator(self) -> LQR | None:
-        """The LQR, or `None` if it does not exist for this environment."""
-        if not self.environment.dynamics.observes_state:
-            return None
+    def regulator(self) -> LQR | LQG | None:
+        """The LQR or LQG, or `None` if it does not exist for this environment."""
         try:
-            return local_lqr(self.environment)
+            return regulator(self.environment, self.fresh_key())
         except (ValueError, RuntimeError) as error:
+            name = self.floor[1]
             warnings.warn(
-                "synthesise: no LQR and no network around one is tried, because there "
-                f"is no LQR: {error} If the plant can rest somewhere, define its "
-                "`equilibrium`, or give the cost a target.",
+                f"synthesise: no {name} and no network around one is tried, because "
+                f"there is no {name}: {error} If the plant can rest somewhere, define "
+                "its `equilibrium`, or give the cost a target.",
                 stacklevel=4,
             )
             return None
@@ -216,36 +232,50 @@ class PolicySearch:
         if self.chosen()[0] != "LQR":
             return False
         keys = self.keys(CHOICE)[: len(self.comparison)]
-        own = np.mean(costs_of(self.environment, self.ranges, self.lqr, keys))
+        own = np.mean(costs_of(self.environment, self.ranges, self.law, keys))
         known = isinstance(self.environment.disturbance, NoDisturbance)
-        other = np.mean(self.costs_of_rival("plan" if known else "MPC", self.lqr, keys))
-        return bool(np.isfinite(own)) and not _is_better(other, own)
+        other = self.costs_of_rival("plan" if known else "MPC", self.law, keys)
+        if other is None or not np.isfinite(own):
+            return False
+        return not _is_better(np.mean(other), own)
 
-    def costs_of_rival(self, name: str, policy: Any, keys: Array) -> np.ndarray:
-        """The costs of MPC, or of a plan that starts from the controls of `policy`."""
-        began = self.seconds
+    def costs_of_rival(self, name: str, policy: Any, keys: Array) -> np.ndarray | None:
+        """The costs of MPC, or of a plan that starts from the controls of `policy`;
+        `None` if the time does not suffice."""
+        began, parts = self.seconds, []
         given = self.environment, self.ranges
-        costs = np.asarray(
-            costs_of_mpc(*given, self.lqr, keys)
-            if name == "MPC"
-            else costs_of_plan(*given, policy, keys)
-        )
+        for start in range(0, len(keys), _TOGETHER):
+            if self.seconds > _OVERRUN * self.budget:
+                return None
+            some = keys[start : start + _TOGETHER]
+            costs = (
+                costs_of_mpc(*given, self.law, some)
+                if name == "MPC"
+                else costs_of_plan(*given, policy, some)
+            )
+            parts.append(np.asarray(costs, float))
         # The next comparison may take as long.
         self.longest = max(self.longest, self.seconds - began)
-        return costs
+        return np.concatenate(parts)
 
-    def trained(self, line: Line) -> AbstractController:
-        """The policy of a line after one round of training with its method."""
-        env, policy, method = self.environment, line.policy, line.method
+    def trained(self, line: Line, method: str) -> AbstractController:
+        """The policy of a line after one round of training with a method."""
+        env, policy = self.environment, line.policy
         options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
         if isinstance(policy, Residual):
             options["trainable"] = "correction"  # not the LQR
-        if method == "imitation":
-            expert = local_mpc(env, self.lqr, throw=False)
-            return imitate(env, expert, policy, **options).model
-        if method == "evolution":
+        ends: list[float] = []
+
+        def is_over(*_: Any) -> bool:
+            self.show()
+            # The first block compiles.
+            ends.append(ends[0] if ends else self.seconds + _ROUND * self.budget)
+            return not self.may_train or self.seconds > ends[0]
+
+        options |= dict(callbacks=(is_over,), block=_BLOCK)
+        if method == _EVOLUTION:
             width = _WIDE if line.structure == "network" else _NARROW
-            options["sigma"] = width if line.costs is None else _NEAR
+            options["sigma"] = width if line.method == "none" else _NEAR
             episode = expected_cost(env, batch=1, ranges=self.ranges)
             loss = TamedCost(episode, jnp.asarray(self.usual), _EVALUATIONS)
             return evolve(loss, policy, _GENERATIONS, **options).model
@@ -258,65 +288,48 @@ class PolicySearch:
         options["gradient"] = ClippedSamples(_BATCH)
         return fit(loss, policy, optimiser, _STEPS, **options).model
 
-    def finish(self, line: Line, untrained: AbstractController) -> None:
-        """Refine the last policy.
-
-        Each attempt uses the method with the largest gain in its last attempt. When no
-        method gains, go on with the fine learning rate; after that, try once an
-        imitation of MPC, if MPC costs less.
-        """
-        fresh = dict.fromkeys([line.method, *self.methods], np.inf)
-        gains, has_imitated = fresh.copy(), False
-        while self.may_train:
+    def improve(self, line: Line, seconds: float = np.inf) -> Line:
+        """The line after some seconds of training, or when no method gains. Each round
+        uses the method with the largest gain in its last round."""
+        ends = self.seconds + seconds
+        gains = dict.fromkeys([line.method, *self.methods], np.inf)
+        gains.pop("none", None)
+        while self.may_train and self.seconds < ends and max(gains.values()) > _GAIN:
             method = max(gains, key=lambda method: gains[method])
-            after = self.attempt(line._replace(method=method), _ATTEMPT)
+            after = self.attempt(line, method)
             own = self.score(after)
             gains[method] = (self.score(line) - own) / max(abs(own), 1e-12)
-            line = min(line, after, key=self.score)
-            if max(gains.values()) > _GAIN:
-                continue
-            gains = fresh.copy()
-            if self.rate != _FINE_RATE:
-                self.rate = _FINE_RATE
-            elif not has_imitated and self.expert_is_better(line.policy):
-                has_imitated, self.rate = True, _RATE
-                clone = Line(line.structure, "imitation", untrained)
-                line = min(line, self.attempt(clone, 0.0), key=self.score)
-            else:
-                break
+            line = after
+        return line
 
-    def expert_is_better(self, policy: AbstractController) -> bool:
-        """Whether MPC costs less than the policy, on a few initial states."""
-        if not self.environment.dynamics.observes_state or self.ranges is not None:
-            return False
-        keys = self.keys(CHOICE)[:_COMPARISON]
-        expert = np.mean(self.costs_of_rival("MPC", policy, keys))
-        own = np.mean(costs_of(self.environment, None, policy, keys))
-        return _is_better(expert, own)
-
-    def attempt(self, line: Line, share: float) -> Line:
-        """The line after some rounds of its method. After the first round, which
-        compiles, they may take `share` of the budget."""
-        began, compiled, best = self.seconds, None, line
-        while compiled is None or self.seconds - compiled < share * self.budget:
-            policy = self.trained(best)
-            now = best._replace(policy=policy, costs=self.costs(policy))
-            if compiled is None:
-                compiled = self.seconds
-                self.longest = max(self.longest, compiled - began)
+    def attempt(self, line: Line, method: str) -> Line:
+        """The line after some rounds of a method, or as it was if none is better."""
+        began, best, ends, least = self.seconds, line, 0.0, np.inf
+        while not ends or self.seconds < ends:
+            policy = self.trained(best, method)
+            after = Line(line.structure, method, policy, self.costs(policy))
+            if not ends:
+                # The first round compiles.
+                self.longest = max(self.longest, self.seconds - began)
+                ends = self.seconds + _ATTEMPT * self.budget
+            least = min(least, self.mean(after))
             # If a round changes nothing, it diverged at its first step.
-            stays = self.score(now) == self.score(best)
-            best = min(best, now, key=self.score)
+            stays = self.score(after) == self.score(best)
+            best = min(after, best, key=self.score)
             if stays or not self.may_train:
                 break
+        self.tried.append(Attempt(line.structure, method, least, self.seconds - began))
         self.enter(best)
-        took = self.seconds - began
-        self.tried.append(Attempt(line.structure, line.method, self.mean(best), took))
+        self.show()
+        return best
+
+    def show(self) -> None:
+        """Update the bar."""
         least = min(self.best.values(), key=self.mean)
-        shown = f"cost {self.mean(least):.5g}, {least.structure}"
+        left = max(0, self.budget - self.seconds)
+        shown = f"{left:.0f} s left, cost {self.mean(least):.5g}, {least.structure}"
         self.bar.set_postfix_str(shown, refresh=False)
         self.bar.update(min(self.seconds, self.bar.total) - self.bar.n)
-        return best
 
     def costs(self, policy: AbstractController, keys: Any = None) -> np.ndarray:
         """The costs of a policy, by default in the episodes for choosing a policy."""
@@ -326,8 +339,6 @@ class PolicySearch:
     def enter(self, line: Line) -> None:
         """Keep the line if it is the best of its structure, and update the usual
         cost."""
-        if line.costs is None:
-            line = line._replace(costs=self.costs(line.policy))
         name = line.structure
         self.last = sorted([*self.last, line], key=self.score)[:_LAST]
         self.best[name] = min(self.best.get(name, line), line, key=self.score)
@@ -340,14 +351,11 @@ class PolicySearch:
 
     def score(self, line: Line) -> float:
         """The mean tamed cost, the criterion for choosing policies."""
-        if line.costs is None:
-            return np.inf
         return float(jnp.mean(tamed(jnp.asarray(line.costs), self.usual)))
 
     def mean(self, line: Line) -> float:
         """The mean cost, or infinity if the cost of an episode is not finite."""
-        costs = np.inf if line.costs is None else line.costs
-        return float(np.mean(np.where(np.isfinite(costs), costs, np.inf)))
+        return float(np.mean(np.where(np.isfinite(line.costs), line.costs, np.inf)))
 
     def choose(self) -> None:
         """Prepare the final choice among the best policies, zero control and the LQR:
@@ -356,9 +364,8 @@ class PolicySearch:
         Good policies often differ only in a rare episode in which the plant runs away,
         and the first 64 initial states may have none.
         """
-        floor = [self.best[name] for name in ("zero", "LQR") if name in self.best]
-        lines = [line for line in self.last if line.costs is not None]
-        lines += [line for line in floor if line.costs is not None]
+        floor = [self.best[name] for name in self.floor if name in self.best]
+        lines = [*self.last, *floor]
         for k in range(1, _ROUNDS):
             if self.seconds > _CHOOSING * self.budget:
                 break
@@ -376,7 +383,7 @@ class PolicySearch:
         """The best policy, or zero control or the LQR if they are about as good."""
         best = min(self.best.values(), key=self.score)
         least = self.score(best)
-        for name in ("zero", "LQR"):
+        for name in self.floor:
             simple = self.best.get(name, best)
             if self.score(simple) - least <= _WORTH * abs(least):
                 best = simple
@@ -399,11 +406,12 @@ class PolicySearch:
         """The costs of the policy and of other controllers, one after the other, in
         episodes that were used for nothing else."""
         env, ranges, keys = self.environment, self.ranges, self.comparison
-        floor = {n: self.best[n].policy for n in ("zero", "LQR") if n in self.best}
+        floor = {n: self.best[n].policy for n in self.floor if n in self.best}
         laws = {"policy": policy, **floor}
         for name, law in laws.items():
             yield name, np.asarray(costs_of(env, ranges, law, keys), float)
         for name in ("MPC", "plan") if env.dynamics.observes_state else ("plan",):
             if self.may_compare(name):
                 costs = self.costs_of_rival(name, policy, keys)
-                yield name, np.asarray(costs, float)
+                if costs is not None:
+                    yield name, costs

@@ -11,7 +11,16 @@ from jaxtyping import Array
 
 from .._controller import AbstractController
 from .._typing import PRNGKey
-from ..controllers import Constant, GRU, LQR, MLP, Residual, Standardise, Zero
+from ..controllers import (
+    Constant,
+    GRU,
+    LQG,
+    LQR,
+    MLP,
+    Residual,
+    Standardise,
+    Zero,
+)
 from ..environments import Environment
 from ..simulation import rollout
 
@@ -22,17 +31,18 @@ _EPISODES = 32
 
 def structures(
     environment: Environment,
-    lqr: LQR | None,
+    law: LQR | LQG | None,
     is_family: bool,
     width: int,
     depth: int,
     key: PRNGKey,
 ) -> dict[str, AbstractController]:
-    """Policies to train, by name.
+    """Policies to train, by name: a network that corrects the LQR, if there is one, and
+    a network alone.
 
-    If the state is observed: a network that corrects the LQR, if there is one, and a
-    network alone. For a family of plants the first network is recurrent, and without an
-    LQR it is the whole policy. If the state is not observed: a recurrent network alone.
+    For a family of plants, the first network is recurrent, and without an LQR it is the
+    whole policy. If the state is not observed, both networks are recurrent, and the
+    first one corrects the LQG.
     """
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds
@@ -42,14 +52,14 @@ def structures(
     bounded = jnp.isfinite(high - low)
 
     drivers: list[AbstractController] = [Zero(m)]
-    if lqr is not None:
-        drivers.append(lqr)
+    if law is not None:
+        drivers.append(law)
     for end in (low, high):
         drivers.append(Constant(jnp.where(jnp.isfinite(end), end, 0)))
     visits = _visits(environment, drivers, jr.split(visits_key, _EPISODES))
     features = _standardised(environment, np.concatenate([y for y, _ in visits]))
-    # A control without bounds gets a range from the controls of the LQR, or [-2, 2].
-    reach = np.ones(m) if lqr is None else _spread(np.asarray(visits[1][1]), 1e-3)
+    # A control without bounds gets a range from the controls of the law, or [-2, 2].
+    reach = np.ones(m) if law is None else _spread(np.asarray(visits[1][1]), 1e-3)
     half = jnp.where(bounded, (high - low) / 2, 2 * reach)
     # With a bound on one side only, the range begins at that bound.
     below = jnp.where(jnp.isfinite(high), high - 2 * half, -half)
@@ -66,21 +76,22 @@ def structures(
     memory = lambda bounds, key: GRU(
         size, m, width, features=features, bounds=bounds, key=key
     )
-    if not environment.dynamics.observes_state:
-        return {"memory": memory(ends, plain_key)}
+    hidden = not environment.dynamics.observes_state
+    recurrent = is_family or hidden
     made: dict[str, AbstractController] = {}
-    if lqr is not None:
-        # The last layer starts at zero, so the policy starts as the LQR.
-        make: Any = memory if is_family else network
-        correction = make((-half, half), residual_key)
-        last = lambda c: c.readout if is_family else c.network.layers[-1]
+    if law is not None:
+        # The last layer starts at zero, so the policy starts as the law.
+        correction = (memory if recurrent else network)((-half, half), residual_key)
+        last: Any = lambda c: c.readout if recurrent else c.network.layers[-1]
         zero = jax.tree.map(jnp.zeros_like, last(correction))
         correction = eqx.tree_at(last, correction, zero)
-        name = "LQR + memory" if is_family else "LQR + network"
-        made[name] = Residual(lqr, correction, bounds)
-    elif is_family:
-        made["memory"] = memory(ends, residual_key)
-    return made | {"network": network(ends, plain_key)}
+        name = f"{type(law).__name__} + {'memory' if recurrent else 'network'}"
+        made[name] = Residual(law, correction, bounds)
+    if hidden or is_family and law is None:
+        made["memory"] = memory(ends, plain_key)
+    if not hidden:
+        made["network"] = network(ends, plain_key)
+    return made
 
 
 @eqx.filter_jit

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _WHERE = "synthesise"
 # In less time, in seconds, not even the first programs compile.
-_LEAST_BUDGET = 5.0
+_LEAST_BUDGET = 10.0
 
 
 class Synthesis(NamedTuple):
@@ -43,13 +43,13 @@ class Synthesis(NamedTuple):
     **Attributes:**
 
     - `policy`: the controller that was chosen.
-    - `structure`: its structure: `"zero"`, `"LQR"`, `"network"`, `"memory"` (a
-        recurrent network), `"LQR + network"` or `"LQR + memory"`.
-    - `costs`: a dictionary of the total costs of `"policy"`, `"zero"`, `"LQR"`, `"MPC"`
-        and `"plan"`, with an entry for each episode. All controllers run the same
-        episodes, which were not used for training or for the choice of the policy. A
-        controller is missing if it does not exist for the environment or if the budget
-        left no time for it.
+    - `structure`: its structure: `"zero"`, `"LQR"`, `"LQG"`, `"network"`, `"memory"` (a
+        recurrent network), `"LQR + network"`, `"LQR + memory"` or `"LQG + memory"`.
+    - `costs`: a dictionary of the total costs of `"policy"`, `"zero"`, `"LQR"` or
+        `"LQG"`, `"MPC"` and `"plan"`, with an entry for each episode. All controllers
+        run the same episodes, which were not used for training or for the choice of the
+        policy. A controller is missing if it does not exist for the environment or if
+        the budget left no time for it.
     - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings.
     - `seconds`: the time it took.
     - `plants`: for a family of plants, a dictionary from each path of `ranges` to the
@@ -119,28 +119,31 @@ def synthesise(
     The search tries several structures and training methods, refines the best of them,
     and compares the result with known controllers:
 
-    1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][] if
-        this LQR exists.
-    2. Trials. The structures are a network that corrects the LQR
-        ([`delucax.controllers.Residual`][]) and a network alone. With `ranges`, the
-        network that corrects the LQR is recurrent, so that it can identify the plant
-        from past observations. If the state is not observed, a recurrent network alone
-        is tried. There are three training methods. The first method is the gradient of
-        a rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]). The
-        second method is the same gradient, damped with a time constant of a quarter, a
-        tenth or a thirtieth of the rollout. The third method is
+    1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][]. If
+        the state is not observed, the second baseline is an LQG
+        ([`delucax.controllers.LQG`][]) for the same linear model. A baseline is left
+        out, with a warning, if it does not exist for the environment.
+    2. Trials. The policies are a network that corrects the LQR
+        ([`delucax.controllers.Residual`][]) and a network alone. The correction is
+        recurrent with `ranges`, so that it can identify the plant from past
+        observations. If the state is not observed, both policies are recurrent. Each
+        policy is trained from the start in two ways. The first way is the gradient of a
+        rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]). At first
+        it is damped with a time constant of a thirtieth of the rollout, then of a tenth
+        and of a quarter, and then it is not damped. The second way is
         [`delucax.training.evolve`][], which needs no gradient. If neither the first two
         trials nor a plan is better than the LQR, the search returns the LQR.
-    3. Refinement. The best third of the trials is trained for three times as long, and
-        this is repeated until one policy is left. The search trains this policy with
-        the methods that still lower its cost, and then at a tenth of the learning rate.
-        When no method lowers the cost any more, the search tries to imitate MPC
-        ([`delucax.training.imitate`][]), if MPC costs less.
+    3. Refinement. The better half of the trained policies is trained further, with the
+        methods that still lower their cost, until one of them is left. When no method
+        lowers its cost any more, the learning rate is reduced to a tenth, and after
+        that the search continues with the next best policy.
     4. Choice. The candidates are the four best policies and the baselines. The
         criterion is the mean cost over up to 512 initial states that were not used for
         training. In this mean, a cost above 20 times the usual cost grows only
         logarithmically. If the cost of a baseline is at most half a percent higher than
         the best, the search returns the baseline.
+    5. Comparison. The baselines, MPC and the best plan run the episodes of the policy,
+        if time is left for them. MPC needs an observed state.
 
     An interrupt (`KeyboardInterrupt`) ends the training, and the best policy so far is
     returned.
@@ -153,12 +156,12 @@ def synthesise(
         control has one bound, the range has the same width and begins at the bound.
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
-        default, at least 5. The search finishes a training or comparison that has
-        already begun. The number of trials depends on the speed of the machine, so the
-        result depends on the machine too.
+        default, at least 10. A program that compiles when the time is over finishes
+        first. The number of trials depends on the speed of the machine, so the result
+        depends on the machine too.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
         works on a family of plants: each episode draws a plant. The LQR is designed for
-        the nominal plant; MPC and the plan know each plant. None by default.
+        the nominal plant; MPC and the plan know each plant. None by default: one plant.
     - `width`, `depth`: the units in a hidden layer, and the number of hidden layers of
         the networks; 32 and 1 by default.
     - `progress`: whether to show a bar with the seconds and the cost so far; true by
@@ -178,7 +181,7 @@ def synthesise(
         import jax
 
         env = dlx.make("double_integrator", horizon=20)
-        made = dlx.training.synthesise(env, key=jax.random.key(0), budget=5.0)
+        made = dlx.training.synthesise(env, key=jax.random.key(0), budget=10.0)
         made.structure, made.costs["policy"].mean()
         ```
     """
@@ -194,6 +197,11 @@ def synthesise(
         raise ValueError(
             f"{_WHERE}: budget must be at least {_LEAST_BUDGET:g} s, which the first "
             f"programs take to compile, got {budget}."
+        )
+    if ranges is not None and not ranges:
+        raise ValueError(
+            f"{_WHERE}: ranges must name at least one parameter, or be None for a "
+            f"single plant, got {ranges!r}."
         )
     width = check_count(width, "width", _WHERE)
     depth = check_count(depth, "depth", _WHERE)
