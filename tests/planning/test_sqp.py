@@ -24,7 +24,9 @@ def steered(scale=1.0):
     B = jnp.zeros((4, 2)).at[2, 0].set(dt).at[3, 1].set(dt)
     cost = dlx.costs.Quadratic(0.01 * jnp.ones(4), 0.1 * jnp.ones(2))
     x0 = jnp.array([-1.0, 0.05, 0.0, 0.0])
-    return dlx.LinearDynamics(A, scale * B, dt=dt), cost, x0, jnp.zeros((15, 2))
+    names = ("east", "north", "eastward", "northward")
+    dynamics = dlx.LinearDynamics(A, scale * B, dt=dt, state_names=names)
+    return dynamics, cost, x0, jnp.zeros((15, 2))
 
 
 class Clear(eqx.Module):
@@ -184,9 +186,14 @@ def test_what_cannot_hold_is_named():
     # No derivative of what is no solution.
     f = lambda x0: SQP()(dynamics, cost, x0, U, throw=False, **given).cost
     assert jnp.all(jnp.isnan(jax.grad(f)(x0)))
-    high = Constraints(states=([0.5, -9, -9, -9], jnp.inf))
-    with pytest.raises(RuntimeError, match="`bound of states` .* at stage 1"):
-        SQP()(dynamics, cost, x0, U, bounds=(-2.5, 2.5), constraints=high)
+    late = jnp.full((16, 4), jnp.inf).at[4:, 1].set(-2.0)
+    for states, words in (
+        (([0.5, -9, -9, -9], jnp.inf), r"lower bound of state 0 \(east\) .* stage 1"),
+        ((-jnp.inf, late), r"upper bound of state 1 \(north\) .* at stage 4"),
+    ):
+        with pytest.raises(RuntimeError, match=f"The {words}"):
+            limits = Constraints(states=states)
+            SQP()(dynamics, cost, x0, U, bounds=(-1.0, 1.0), constraints=limits)
 
 
 @needs_x64

@@ -290,29 +290,28 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
             start += row.size
             if row.weights is None and row.size:
                 over = np.abs(c) if row.is_equality else np.maximum(c, 0)
-                violations.append((np.nan_to_num(over, nan=np.inf), row.name, final))
-    for name, value, planned in (
-        ("states", constraints.states, states[1:]),
-        ("controls", constraints.controls, controls),
+                names = [f"constraint `{row.name}`"]
+                if row.size > 1:
+                    names = [f"{names[0]} (entry {i})" for i in range(row.size)]
+                first = None if final else 0
+                violations.append((np.nan_to_num(over, nan=np.inf), names, first))
+    for kind, value, planned, first in (
+        ("state", constraints.states, states, 1),  # the first state is given
+        ("control", constraints.controls, controls, 0),
     ):
         if value is None or isinstance(value, Soft):
             continue
-        low, high = (
-            np.asarray(end)[1:]
-            if name == "states" and np.ndim(end) == 2
-            else np.asarray(end)
-            for end in value
-        )
-        over = np.maximum(np.maximum(low - planned, planned - high), 0)
-        violations.append((over, f"bound of {name}", False))
+        low, high = (e[first:] if e.ndim == 2 else e for e in map(np.asarray, value))
+        planned, known = planned[first:], getattr(problem.dynamics, f"{kind}_names")
+        for side, over in (("lower", low - planned), ("upper", planned - high)):
+            names = [f"{side} bound of {kind} {i} ({n})" for i, n in enumerate(known)]
+            violations.append((np.maximum(over, 0), names, first))
     if not violations:
         return ""
-    over, name, final = max(violations, key=lambda entry: entry[0].max())
+    over, names, first = max(violations, key=lambda entry: entry[0].max())
     # Do not blame a constraint that is violated only by rounding.
     if not over.max() > np.finfo(states.dtype).eps ** 0.5:
         return ""
     k, i = (int(j) for j in np.unravel_index(over.argmax(), over.shape))
-    k += name == "bound of states"
-    entry = f" (entry {i})" if over.shape[1] > 1 else ""
-    at = "at the end" if final else f"at stage {k}"
-    return f"The constraint `{name}`{entry} is violated most, by {over.max():.2g} {at}."
+    at = "at the end" if first is None else f"at stage {k + first}"
+    return f"The {names[i]} is violated most, by {over.max():.2g} {at}."
