@@ -90,21 +90,23 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     unknown_mode = "The mode of a state is not one of the modes of its system."
     plan_failed = (
-        "A plan of the controller did not succeed. `trajectory.incident_counts` has "
-        'their number, if `keep` holds "incidents", as by default.'
+        "At least one plan of the controller did not succeed. "
+        "`trajectory.incident_counts` has the number of such plans, if `keep` holds "
+        '"incidents", as by default.'
     )
     estimate_failed = (
-        "An estimate of the controller failed. `trajectory.incident_counts` has their "
-        'number, if `keep` holds "incidents", as by default.'
+        "At least one estimate of the controller failed. "
+        "`trajectory.incident_counts` has the number of such estimates, if `keep` "
+        'holds "incidents", as by default.'
     )
     filter_failed = (
-        "A safety filter found no control that keeps its barriers. "
+        "A safety filter found no control that keeps its barriers, at least once. "
         "`trajectory.incident_counts` has the number of times, if `keep` holds "
         '"incidents", as by default.'
     )
     update_refused = (
-        "An update of a learner was not finite and was not made. "
-        "`trajectory.incident_counts` has their number, if `keep` holds "
+        "At least one update of a learner was not finite and was not made. "
+        "`trajectory.incident_counts` has the number of such updates, if `keep` holds "
         '"incidents", as by default.'
     )
     delay_beyond_memory = (

@@ -1,5 +1,7 @@
 """What went wrong in a controller reaches the user; how an episode ended; cuts."""
 
+import re
+
 import diffrax
 import equinox as eqx
 import jax
@@ -74,6 +76,15 @@ def test_incidents_need_not_be_kept(key):
     assert "`keep` holds" in dlx.RESULTS[run.result]
     with user_error(match="keep must hold 'incidents'"):
         _ = run.incident_counts
+
+
+@once
+@pytest.mark.parametrize(
+    "status", ["plan_failed", "estimate_failed", "filter_failed", "update_refused"]
+)
+def test_a_message_is_right_for_one_incident_and_for_many(status):
+    message = dlx.RESULTS[getattr(dlx.RESULTS, status)]
+    assert re.search("[Aa]t least on(e|ce)", message) and " number of " in message
 
 
 @once
