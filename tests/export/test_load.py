@@ -149,6 +149,9 @@ def test_memory_of_ones_own(function):
     assert step() == 0
     assert_close(turned, [6, 2, 4])
     assert_close(square, 14)
+    k[...] = 3  # a number is read by `bind`, an array by each call
+    assert step() == 0 and turned[0] == 6
+    assert function.bind(x, k, turned, square)() == 0 and turned[0] == 9
     with user_error(match="rotate: .*contiguous NumPy array"):
         function.bind(x, k, np.zeros(6, dtype())[::2], square)
     with user_error(match="bind takes 4 arrays, got 1"):
@@ -194,11 +197,25 @@ def test_what_cannot_be_loaded(folder, tmp_path, monkeypatch):
         export.load(folder)
     with user_error(match="no export is called 'rotat'.*did you mean 'rotate'"):
         export.load(folder, name="rotat")
-    with user_error(match="directory must be a folder"):
+    with user_error(match="given to delucax.export.c.*none', which does not exist.$"):
         export.load(tmp_path / "none")
+    hint = f"Pass {str(folder)!r} and name='rotate'.$"
+    with user_error(match=f"does not exist. {hint}"):
+        export.load(folder / "rotate")
+    with user_error(match=f"is not a folder. {hint}"):
+        export.load(folder / "rotate.c")
+    monkeypatch.chdir(folder.parent)
+    there = str(folder.parent / "absent")
+    with user_error(match=rf"got 'absent' \({there!r}\), which does not exist.$"):
+        export.load("absent")
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "law.h").touch()
+    with user_error(match=r"holds no export. Its folders with headers are \['below'\]"):
+        export.load(tmp_path)
+    shutil.rmtree(tmp_path / "below")
     (tmp_path / "other.h").write_text("int other(void);\n")
     (tmp_path / "other.c").write_text("int other(void) { return 0; }\n")
-    with user_error(match="directory must hold what delucax.export.c wrote"):
+    with user_error(match=f"{tmp_path.name}', which holds no export.$"):
         export.load(tmp_path)
     with user_error(match="flags must be a sequence"):
         export.load(folder, name="rotate", flags="-O2")

@@ -27,7 +27,8 @@ def load(
 
     **Arguments:**
 
-    - `directory`: the folder that holds `NAME.h` and `NAME.c`.
+    - `directory`: the folder that was given to [`delucax.export.c`][]. It holds
+        `NAME.h` and `NAME.c`.
     - `name`: the name of the export, needed if the folder holds several exports.
     - `compiler`: the command of a C compiler. By default the command is the environment
         variable `CC` or, if `CC` is not set, the first of `cc`, `gcc` and `clang` that
@@ -79,19 +80,21 @@ def load(
 
 def _find(folder: Path, name: str | None, where: str) -> Description:
     """The description of the export `name` in a folder."""
-    if not folder.is_dir():
-        raise ValueError(f"{where}: directory must be a folder, got {str(folder)!r}.")
-    headers = [h for h in sorted(folder.glob("*.h")) if h.with_suffix(".c").exists()]
-    exports: dict[str, Description] = {}
-    for header in headers:
-        with contextlib.suppress(ValueError):  # the header of another program
-            exports[header.stem] = described(header)
+    exports = _exports(folder)
     if not exports:
-        below = [str(h.parent) for h in folder.glob("*/*.h")]
-        hint = f" Its folders with headers are {shortened(below)}." if below else ""
+        # An absolute path shows which working directory a relative path starts from.
+        at = folder.absolute()
+        fault = "holds no export" if at.is_dir() else "is not a folder"
+        fault = fault if at.exists() else "does not exist"
+        hint = ""
+        if at.stem in _exports(at.parent):
+            hint = f" Pass {str(folder.parent)!r} and name={at.stem!r}."
+        elif below := sorted({h.parent.name for h in at.glob("*/*.h")}):
+            hint = f" Its folders with headers are {shortened(below)}."
+        here = "" if folder.is_absolute() else f" ({str(at)!r})"
         raise ValueError(
-            f"{where}: directory must hold what delucax.export.c wrote, got "
-            f"{str(folder)!r}, which holds no export.{hint}"
+            f"{where}: directory must be the folder that was given to delucax.export.c,"
+            f" got {str(folder)!r}{here}, which {fault}.{hint}"
         )
     if name is None and len(exports) > 1:
         raise ValueError(
@@ -105,3 +108,13 @@ def _find(folder: Path, name: str | None, where: str) -> Description:
             f"{did_you_mean(str(which), exports)}"
         )
     return exports[which]
+
+
+def _exports(folder: Path) -> dict[str, Description]:
+    """The descriptions of all exports in a folder, by their names."""
+    exports: dict[str, Description] = {}
+    for header in sorted(folder.glob("*.h")):
+        if header.with_suffix(".c").exists():
+            with contextlib.suppress(ValueError):  # the header of another program
+                exports[header.stem] = described(header)
+    return exports

@@ -283,8 +283,9 @@ class LoadedFunction:
 
         **Arguments:** `*arrays`: the arrays to read, then the arrays to write the
         results to. The arrays must be contiguous NumPy arrays with the types of the C
-        code, and must not overlap. Pass a number as an array of shape `()`. A number
-        that is an input is read only once, when you call `bind`.
+        code, and must not overlap. Pass a number as an array of shape `()`. An input of
+        shape `()` is read only once, when you call `bind`: to change it, call `bind`
+        again, or export the function with an input of shape `(1,)` in its place.
 
         **Returns:** a function without arguments, which returns the flag. The returned
         function holds Python's global interpreter lock while it runs.
