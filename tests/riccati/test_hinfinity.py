@@ -354,3 +354,11 @@ def test_wrong_arguments_over_a_horizon():
         hinf_cre(A, B, None, Q, R, times=[1.0, 0.0])
     with user_error(match="hinf_cre: gamma must be positive"):
         hinf_cre(A, B, None, Q, R, times=[0.0, 1.0], gamma=-1.0)
+    game = dict(A=A, B=B, D=None, Q=Q, R=R, times=[0.0, 1.0])
+    for final, match in (
+        (np.array([[1.0, 1.0], [0.0, 1.0]]), "final must be symmetric"),
+        (np.eye(3), r"final must have shape \(2, 2\)"),
+        (np.diag([1.0, -0.1]), "final must be positive semidefinite, got"),
+    ):
+        with user_error(match=f"hinf_cre: {match}"):
+            hinf_cre(**game, final=final)

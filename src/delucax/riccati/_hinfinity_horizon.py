@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import ArrayLike
 
+from .._check import check_definite
 from .._jax import compiled_unless_on_host, host_unless_traced, vmap, xp
 from .._results import choose, RESULTS
 from .._typing import Array, Numbers
@@ -177,7 +178,7 @@ def hinf_cre(
     from which there is no saddle point, for example because `gamma` is too low.
 
     **Raises:** as in [`delucax.riccati.hinf_care`][], and `ValueError` if the times do
-    not increase.
+    not increase or `final` is not symmetric and positive semidefinite.
 
     Source: Basar and Bernhard, 1995; Davison and Maki, 1973.
 
@@ -200,6 +201,7 @@ def hinf_cre(
     where = "hinf_cre"
     game = checked_game(where, A, B, D, Q, R)
     final = final_weight(final, game[0], where)
+    check_definite(final, "final", where, False)
     times = increasing_times(times, where).astype(game[0].dtype)
     problem = (*game, final, times)
     return at_level(_solution, where, False, problem, gamma, tolerance, throw)
