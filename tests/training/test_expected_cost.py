@@ -150,3 +150,11 @@ def test_losses_are_pytrees():
     again = jax.tree.map(lambda x: x, loss)
     value = eqx.filter_jit(lambda loss: loss(CONTROLLER, jr.key(0)))
     assert value(loss) == value(again)
+
+
+def test_a_loss_is_compiled_by_filter_jit():
+    loss, key = expected_cost(pendulum(), batch=2), jr.key(0)
+    expected = jax.jit(lambda controller: loss(controller, key))(CONTROLLER)
+    assert_close(eqx.filter_jit(loss)(CONTROLLER, key), expected, rtol=1e-12)
+    with user_error(TypeError, match="unhashable type"):  # as the docstring says
+        jax.jit(loss)(CONTROLLER, key)

@@ -97,7 +97,10 @@ def expected_cost(
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][]. With `ranges`, each
         rollout draws its own plant. None by default.
 
-    **Returns:** a function `loss(controller, key)` to a scalar.
+    **Returns:** a function `loss(controller, key)` to a scalar. Compile it with
+    `eqx.filter_jit(loss)`. `jax.jit(loss)` raises `unhashable type`, because the loss
+    is a module that holds the arrays of the plant; `jax.jit` of a function that calls
+    the loss works.
 
     **Raises:** `ValueError` if `batch`, `horizon` or `truncate` is below 1,
     `environment` is not an environment, `checkpoint` has another value,
@@ -188,7 +191,8 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
     - `horizon`: steps of the episode; the `horizon` of the environment by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar and a dictionary. The
-    controller must be a [`delucax.AbstractStochasticPolicy`][].
+    controller must be a [`delucax.AbstractStochasticPolicy`][]. Compile the function
+    with `eqx.filter_jit`, as in [`delucax.training.expected_cost`][].
 
     **Raises:** `ValueError` if `horizon` is below 1 or `environment` is not an
     environment. A `ValueError` is also raised when the loss is called, if the
