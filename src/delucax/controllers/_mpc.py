@@ -83,6 +83,13 @@ class MPC(AbstractController):
         in `incidents["failed_plan"]`,
     - `last`: the last plan, shifted by one step, a [`delucax.planning.Start`][].
 
+    After a rollout, `run.controller_state` is this state at the end, and
+    `run.incidents["failed_plan"]` is true at the steps whose plan was not successful.
+    Both are there if `keep` of [`delucax.rollout`][] holds `"controller_state"` and
+    `"incidents"`, as by default. The cost and the violation of the plans are not
+    stored: plan again from the times and states of the run, as in the example. These
+    plans do not start from the last plan, so they may end in another local minimum.
+
     If the planner runs out of iterations or finds no descent, the controller still uses
     its plan, because it is the best plan so far. A plan is unusable if every start
     diverges or the constraints cannot hold. `throw` and `fallback` decide what the
@@ -166,7 +173,23 @@ class MPC(AbstractController):
         mpc = dlx.controllers.MPC(env.dynamics, cost, 20, bounds=(-2.0, 2.0))
         x0 = jnp.array([0.3, 0.0])
         run = dlx.rollout(env, mpc, key=jax.random.key(0), x0=x0, horizon=30)
-        run.total_cost
+        state = run.controller_state
+        print(run.total_cost, run.incident_counts["failed_plan"], state.iterations)
+
+        @jax.jit
+        @jax.vmap
+        def planned(t, x):
+            options = dict(bounds=mpc.bounds, throw=False)
+            plan = mpc.planner(mpc.dynamics, mpc.cost, x, 20, t, **options)
+            return plan.cost, plan.violation
+
+        costs, violations = planned(run.times[:-1], run.states[:-1])
+        print(costs[::10], violations.max())
+        ```
+
+        ```text
+        1.973 0 1
+        [6.761 3.078 1.162] 0.0
         ```
     """
 
