@@ -179,8 +179,8 @@ class MPC(AbstractController):
         @jax.jit
         @jax.vmap
         def planned(t, x):
-            options = dict(bounds=mpc.bounds, throw=False)
-            plan = mpc.planner(mpc.dynamics, mpc.cost, x, 20, t, **options)
+            given = dict(bounds=mpc.bounds, constraints=mpc.constraints, throw=False)
+            plan = mpc.planner(mpc.dynamics, mpc.cost, x, 20, t, **given)
             return plan.cost, plan.violation
 
         costs, violations = planned(run.times[:-1], run.states[:-1])
