@@ -207,16 +207,26 @@ def test_a_policy_starts_with_the_costs_of_its_regulator(monkeypatch):
     assert search.tried[-1].cost > search.mean(before)
 
 
-def test_a_long_round_ends_with_its_time():
-    task = dataclasses.replace(env(), horizon=2000)
-    search = PolicySearch(task, None, KEY, 10.0, progress=False)
-    policy = structures(task, None, False, 4, 1, KEY)["network"]
-    line = Line("network", "none", policy, np.full(64, np.inf))
-    search.trained(line, "evolution")
-    compiled = search.seconds
-    # A whole round, of 150 generations, would take much longer.
-    search.trained(line, "evolution")
-    assert search.seconds - compiled < 3
+@pytest.mark.parametrize(("began", "blocks"), [(0.0, 6), (6.8, 2)])
+def test_a_long_round_ends_with_its_time(monkeypatch, began, blocks):
+    """After its first block a round takes 5% of the budget, or ends with the
+    training, at 70% of it."""
+    module = sys.modules[PolicySearch.__module__]
+    heard = []
+
+    def endless(*given, callbacks, **options):
+        while not callbacks[0](len(heard), {}):
+            heard.append(search.seconds)
+        return given[2]
+
+    monkeypatch.setattr(module, "by_gradient", endless)
+    # A block takes 0.1 s.
+    clock = lambda search: began + 0.1 * len(heard)
+    monkeypatch.setattr(PolicySearch, "seconds", property(clock))
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    line = known("network", dlx.controllers.Zero(1), 1.0)
+    assert search.trained(line, "gradient") is line.policy
+    assert len(heard) == blocks
 
 
 def test_a_comparison_ends_with_the_time(monkeypatch):

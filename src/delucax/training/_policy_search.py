@@ -8,30 +8,25 @@ from typing import Any
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-import optax
 from jaxtyping import Array
 
 from .._controller import AbstractController
 from .._module import get_path
 from .._progress import tqdm
 from .._typing import PRNGKey
-from ..controllers import LQG, LQR, Residual, Zero
+from ..controllers import LQG, LQR, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
 from ._attempt import Attempt, Line
-from ._costs import expected_cost
 from ._episode_costs import (
     costs_of,
     costs_of_mpc,
     costs_of_plan,
     on_plants,
     tamed,
-    TamedCost,
 )
-from ._evolve import evolve
-from ._fit import fit
-from ._gradient_estimators import ClippedSamples
 from ._regulator import regulator
+from ._rounds import by_evolution, by_gradient, LONGEST
 from ._structures import structures
 
 
@@ -53,16 +48,11 @@ _TRAINING, _CHOOSING = 0.7, 0.75
 _OVERRUN, _MPC = 1.1, 2
 # Episodes of a comparison with MPC or plans that run together.
 _TOGETHER = 4
-# Steps in a round of gradient training, and generations in a round of evolution. A
-# round ends early if it has taken the share `_ROUND` of the budget since its first
-# block, which compiles.
-_STEPS, _GENERATIONS, _BLOCK, _ROUND = 300, 150, 5, 0.05
+# A round of training ends early if it has taken this share of the budget since its
+# first block, which compiles.
+_ROUND = 0.05
 # Initial learning rates of a round. The second one is used when no method gains.
 _RATE, _FINE_RATE = 2e-2, 2e-3
-# Gradients in a batch, and the longest rollout that is differentiated.
-_BATCH, _LONGEST = 32, 200
-# Episodes in the cost of each model of a generation.
-_EVALUATIONS = 8
 # The usual cost before it is known, so large that no cost is far above it.
 _ANY = 1e30
 # The share of the budget for an attempt, after its first round, and for each policy of
@@ -113,8 +103,7 @@ class PolicySearch:
         name = "LQR" if environment.dynamics.observes_state else "LQG"
         # The structures that need no training.
         self.floor = "zero", name
-        self.steps = min(environment.horizon, _LONGEST)
-        lasting = self.steps * float(environment.dt)
+        lasting = min(environment.horizon, LONGEST) * float(environment.dt)
         unit, times = environment.dynamics.time_unit, [lasting * m for m in _MEMORIES]
         # From the name of a method to the time constant of its damped gradient.
         damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
@@ -260,10 +249,6 @@ class PolicySearch:
 
     def trained(self, line: Line, method: str) -> AbstractController:
         """The policy of a line after one round of training with a method."""
-        env, policy = self.environment, line.policy
-        options: Any = dict(key=self.fresh_key(), progress=False, throw=False)
-        if isinstance(policy, Residual):
-            options["trainable"] = "correction"  # not the LQR
         ends: list[float] = []
 
         def is_over(*_: Any) -> bool:
@@ -272,28 +257,23 @@ class PolicySearch:
             ends.append(ends[0] if ends else self.seconds + _ROUND * self.budget)
             return not self.may_train or self.seconds > ends[0]
 
-        options |= dict(callbacks=(is_over,), block=_BLOCK)
-        if method == _EVOLUTION:
-            width = _WIDE if line.structure == "network" else _NARROW
-            options["sigma"] = width if line.method == "none" else _NEAR
-            episode = expected_cost(env, batch=1, ranges=self.ranges)
-            loss = TamedCost(episode, jnp.asarray(self.usual), _EVALUATIONS)
-            return evolve(loss, policy, _GENERATIONS, **options).model
-        adam = optax.adam(optax.cosine_decay_schedule(self.rate, _STEPS))
-        optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
-        # An array, so that the methods share one compiled program.
-        decay = jnp.exp(-env.dt / self.methods[method])
-        shape: Any = dict(batch=1, horizon=self.steps)
-        loss = expected_cost(env, gradient_decay=decay, ranges=self.ranges, **shape)
-        options["gradient"] = ClippedSamples(_BATCH)
-        return fit(loss, policy, optimiser, _STEPS, **options).model
+        given = self.environment, self.ranges, line.policy
+        options: Any = dict(key=self.fresh_key(), callbacks=(is_over,))
+        if method != _EVOLUTION:
+            return by_gradient(*given, self.methods[method], self.rate, **options)
+        width = _WIDE if line.structure == "network" else _NARROW
+        sigma = width if line.method == "none" else _NEAR
+        return by_evolution(*given, sigma, self.usual, **options)
 
     def improve(self, line: Line, seconds: float = np.inf) -> Line:
-        """The line after some seconds of training, or when no method gains. Each round
-        uses the method with the largest gain in its last round."""
+        """The line after some seconds of training, or when no method gains.
+
+        Each attempt uses the method with the largest gain in its last attempt.
+        """
         ends = self.seconds + seconds
-        gains = dict.fromkeys([line.method, *self.methods], np.inf)
-        gains.pop("none", None)
+        # The method of the last gain comes first.
+        names = sorted(self.methods, key=lambda name: name != line.method)
+        gains = dict.fromkeys(names, np.inf)
         while self.may_train and self.seconds < ends and max(gains.values()) > _GAIN:
             method = max(gains, key=lambda method: gains[method])
             after = self.attempt(line, method)
