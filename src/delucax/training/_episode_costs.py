@@ -112,8 +112,7 @@ def first_steps(environment, keys):
 
     def one(key):
         x0 = environment.reset(environment.split_key(key)[0])
-        step = lambda u: environment.step(jnp.zeros(()), x0, u)
-        after = jax.vmap(lambda u: step(u).state)(controls)
-        return x0, step(jnp.zeros(m)).cost, after
+        steps = jax.vmap(lambda u: environment.step(jnp.zeros(()), x0, u))(controls)
+        return x0, steps.cost[0], steps.state
 
     return jax.vmap(one)(keys)

@@ -44,8 +44,8 @@ _LAST, _ROUNDS = 4, 8
 # rest is for the comparison.
 _TRAINING, _CHOOSING = 0.7, 0.75
 # A comparison starts only if it is likely to end within `_OVERRUN` times the budget. It
-# is expected to take as long as the longest step so far, and MPC `_MPC` times as long.
-_OVERRUN, _MPC = 1.1, 2
+# is expected to take so many times as long as the longest step so far.
+_OVERRUN, _LONGER = 1.1, {"MPC": 2.0, "plan": 1.5}
 # Episodes of a comparison with MPC or plans that run together.
 _TOGETHER = 4
 # A round of training ends early if it has taken this share of the budget since its
@@ -126,8 +126,8 @@ class PolicySearch:
 
     def may_compare(self, name: str) -> bool:
         """Whether there is time for a comparison with this controller."""
-        # MPC makes a plan at each step, and takes longer to compile than a training.
-        likely = self.longest * (_MPC if name == "MPC" else 1)
+        # Plans, and MPC even more, take longer to compile than a training.
+        likely = self.longest * _LONGER[name]
         return self.seconds + likely < _OVERRUN * self.budget
 
     def keys(self, count: int) -> Array:
@@ -220,8 +220,8 @@ class PolicySearch:
         With disturbances MPC replaces the plan, because a plan would know them."""
         if self.chosen()[0] != "LQR":
             return False
-        keys = self.keys(CHOICE)[: len(self.comparison)]
-        own = np.mean(costs_of(self.environment, self.ranges, self.law, keys))
+        keys = self.keys(CHOICE)[: self.count]
+        own = np.mean(self.best["LQR"].costs[: self.count])
         known = isinstance(self.environment.disturbance, NoDisturbance)
         other = self.costs_of_rival("plan" if known else "MPC", self.law, keys)
         if other is None or not np.isfinite(own):
@@ -371,27 +371,34 @@ class PolicySearch:
         return best.structure, best.policy
 
     @property
+    def count(self) -> int:
+        """The number of episodes in the comparison."""
+        return _COMPARISON if self.ranges is None else _PLANTS
+
+    @property
     def comparison(self) -> Array:
-        """The keys of the episodes for the comparison."""
-        return self.keys(_COMPARISON if self.ranges is None else _PLANTS)
+        """The keys of the comparison: as many as for a choice, because policies run
+        them in the same compiled program. Only the first `count` are used."""
+        return jr.split(jr.fold_in(self.key, self.count), CHOICE)
 
     def plants(self) -> dict[str, np.ndarray]:
         """The parameters drawn for the plants of the comparison, by path."""
-        ranges = self.ranges or {}
+        ranges, keys = self.ranges or {}, self.comparison[: self.count]
         of = lambda plant, key: {path: get_path(plant, path) for path in ranges}
-        drawn = on_plants(self.environment, ranges, self.comparison, of)
+        drawn = on_plants(self.environment, ranges, keys, of)
         return {path: np.asarray(values) for path, values in drawn.items()}
 
     def compared(self, policy: AbstractController) -> Iterator[tuple[str, np.ndarray]]:
         """The costs of the policy and of other controllers, one after the other, in
         episodes that were used for nothing else."""
-        env, ranges, keys = self.environment, self.ranges, self.comparison
         floor = {n: self.best[n].policy for n in self.floor if n in self.best}
         laws = {"policy": policy, **floor}
         for name, law in laws.items():
-            yield name, np.asarray(costs_of(env, ranges, law, keys), float)
-        for name in ("MPC", "plan") if env.dynamics.observes_state else ("plan",):
+            yield name, self.costs(law, self.comparison)[: self.count]
+        observed = self.environment.dynamics.observes_state
+        for name in ("MPC", "plan") if observed else ("plan",):
             if self.may_compare(name):
+                keys = self.comparison[: self.count]
                 costs = self.costs_of_rival(name, policy, keys)
                 if costs is not None:
                     yield name, costs

@@ -19,13 +19,13 @@ from ..controllers import (
     MLP,
     Residual,
     Standardise,
-    Zero,
 )
 from ..environments import Environment
 from ..simulation import rollout
 
 
-# Episodes of each driver, for the scales of features and controls.
+# Episodes of each constant control and of the law, for the scales of features and
+# controls.
 _EPISODES = 32
 
 
@@ -51,15 +51,14 @@ def structures(
         low, high = (jnp.broadcast_to(jnp.asarray(e, float), m) for e in bounds)
     bounded = jnp.isfinite(high - low)
 
-    drivers: list[AbstractController] = [Zero(m)]
-    if law is not None:
-        drivers.append(law)
-    for end in (low, high):
-        drivers.append(Constant(jnp.where(jnp.isfinite(end), end, 0)))
-    visits = _visits(environment, drivers, jr.split(visits_key, _EPISODES))
-    features = _standardised(environment, np.concatenate([y for y, _ in visits]))
+    held = [jnp.where(jnp.isfinite(end), end, 0) for end in (low, high)]
+    constants = jnp.stack([jnp.zeros(m), *held])
+    seen, applied = _visits(
+        environment, law, constants, jr.split(visits_key, _EPISODES)
+    )
+    features = _standardised(environment, seen)
     # A control without bounds gets a range from the controls of the law, or [-2, 2].
-    reach = np.ones(m) if law is None else _spread(np.asarray(visits[1][1]), 1e-3)
+    reach = np.ones(m) if law is None else _spread(np.asarray(applied), 1e-3)
     half = jnp.where(bounded, (high - low) / 2, 2 * reach)
     # With a bound on one side only, the range begins at that bound.
     below = jnp.where(jnp.isfinite(high), high - 2 * half, -half)
@@ -96,20 +95,24 @@ def structures(
 
 @eqx.filter_jit
 def _visits(
-    environment: Environment, drivers: list[AbstractController], keys: Array
-) -> list[tuple[Array, Array]]:
-    """For each driver: observations and controls of its episodes, a row per step."""
+    environment: Environment, law: Any, constants: Array, keys: Array
+) -> tuple[Array, Array | None]:
+    """The observations under constant controls and under the law, a row for each step,
+    and the controls of the law."""
     keep = ("observations", "controls")
 
-    def of(driver):
-        run = lambda k: rollout(environment, driver, key=k, keep=keep, throw=False)
-        runs: Any = jax.vmap(run)(keys)
-        return tuple(
-            array.reshape(-1, array.shape[-1])
-            for array in (runs.observations, runs.controls)
-        )
+    def rows(driver, key):
+        run: Any = rollout(environment, driver, key=key, keep=keep, throw=False)
+        return run.observations, run.controls
 
-    return [of(driver) for driver in drivers]
+    flat = lambda rows: rows.reshape(-1, rows.shape[-1])
+    held = jnp.repeat(constants, len(keys), axis=0)
+    again = jnp.tile(keys, len(constants))
+    y, _ = jax.vmap(lambda u, key: rows(Constant(u), key))(held, again)
+    if law is None:
+        return flat(y), None
+    own, u = jax.vmap(lambda key: rows(law, key))(keys)
+    return jnp.concatenate([flat(y), flat(own)]), flat(u)
 
 
 @eqx.filter_jit
@@ -117,9 +120,9 @@ def _encoded(environment: Environment, observations: Array) -> Array:
     return jax.vmap(environment.encode)(observations)
 
 
-def _standardised(environment: Environment, observations: np.ndarray) -> Standardise:
+def _standardised(environment: Environment, observations: Array) -> Standardise:
     """Features that are standardised with the median and spread of `observations`."""
-    z = np.asarray(_encoded(environment, jnp.asarray(observations)))
+    z = np.asarray(_encoded(environment, observations))
     centre = np.median(z[np.all(np.isfinite(z), axis=1)], axis=0)
     std = _spread(z, 1e-3)
     return Standardise(jnp.asarray(centre), jnp.asarray(std), environment.encode)
