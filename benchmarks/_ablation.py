@@ -1,9 +1,8 @@
 """What each part of `training.synthesise` brings: the part `ablation` of
 `benchmarks.policies`.
 
-The same search within the same seconds, without one of its parts, on tasks of each
-kind. `gradient alone` is what one writes without it: a network, trained by the gradient
-of the rollout.
+The same search within 40 s, without one of its parts, on tasks of each kind. `gradient
+alone` is what one writes without it: a network, trained by the gradient of the rollout.
 """
 
 import time
@@ -18,7 +17,7 @@ from benchmarks._synthesis import regret
 
 
 STORE = _cases.RESULTS / "ablation.jsonl"
-SEEDS = 3
+SEEDS, BUDGET = 3, 40.0
 TASKS = (
     "acrobot",
     "cartpole_swing_up",
@@ -52,7 +51,7 @@ def case(task: str, without: str, seed: int) -> dict[str, Any]:
             return None if alone or without == "no LQR inside" else super().regulator()
 
     key = jax.random.key(seed)
-    search = Reduced(task_of(task), None, key, budget=75.0, progress=False)
+    search = Reduced(task_of(task), None, key, budget=BUDGET, progress=False)
     dropped = {
         "no damping": lambda name: name.startswith("gradient,"),
         "no evolution": lambda name: name == "evolution",

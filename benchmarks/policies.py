@@ -21,6 +21,8 @@ where they were cut off:
   `sb3`);
 - `export`: the policies in C.
 
+`--page` puts the tables of these into `docs/policies.md`.
+
 With `--at-once 2` two cases share the cores, each with the same seconds.
 
 How the estimators compare is in the paper's studies: `python -m delucax reproduce
@@ -48,6 +50,7 @@ from benchmarks._exported_policies import exported
 from benchmarks._family import family
 from benchmarks._machine import compile_anew, describe, limit_cores
 from benchmarks._paired import middle, spread
+from benchmarks._policy_page import write
 from benchmarks._results import updated
 from benchmarks._rivals import rivals
 from benchmarks._synthesis import tasks
@@ -328,7 +331,11 @@ def main() -> None:
         action="store_true",
         help="to try swing-up, tuning or learning; not written",
     )
+    parser.add_argument("--page", action="store_true", help="only write the tables")
     options = parser.parse_args()
+    if options.page:
+        write(RESULTS)
+        return
     compile_anew()
     about = {"machine": describe()}
     runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from benchmarks._machine import describe, keep_programs
+from benchmarks._page import DOCS, markdown, write_page
 from benchmarks._score_picture import draw, score, short
 from benchmarks._scores import Board, board_of, COLUMNS, NEAR, PLAN, Spread
 from benchmarks._synthesis import STORE as SYNTHESISED
@@ -26,7 +27,7 @@ from delucax.studies._scoreboard import scoreboard, TRAINED
 
 
 STORE = Path(__file__).parent / "results" / "scoreboard.jsonl"
-PAGE = Path(__file__).parents[1] / "docs" / "scoreboard.md"
+PAGE = DOCS / "scoreboard.md"
 PICTURE = PAGE.parent / "assets" / "scoreboard.svg"
 # Two processes side by side, as the page says of the times.
 WORKERS = 2
@@ -76,7 +77,7 @@ def best_table(board: Board) -> str:
         ranked = [(e, method) for e, method in ranked if e < zero][:BEST]
         named = [f"{short(method)} {percent(excess)}" for excess, method in ranked]
         body.append([f"`{task}`", ", ".join(named) or "none better than zero control"])
-    return _markdown(["task", "best controllers"], body, 2)
+    return markdown(["task", "best controllers"], body, 2)
 
 
 def tables(board: Board) -> str:
@@ -120,7 +121,7 @@ def how_often(board: Board) -> str:
         row = [short(method), len(each), *counts, percent(float(np.median(each)))]
         body.append([*map(str, row)])
     near = [f"within {limit}%" for limit in (1, round(100 * NEAR), 25)]
-    return _markdown(["", "tasks", *near, "median"], body, 1)
+    return markdown(["", "tasks", *near, "median"], body, 1)
 
 
 def _families(board: Board) -> Iterable[tuple[str, list[str]]]:
@@ -147,7 +148,7 @@ def _by_task(
             row += [_plan(board, task), _number(board.best(task))]
         body.append(row)
     ends = ["plan", "best known"] if best else []
-    return _markdown(["task", *map(short, methods), *ends], body, 1)
+    return markdown(["task", *map(short, methods), *ends], body, 1)
 
 
 def _plan(board: Board, task: str) -> str:
@@ -186,23 +187,6 @@ def _number(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if abs(value) < 1e5 else f"{value:.1e}"
 
 
-def _markdown(head: list[str], body: list[list[str]], left: int) -> str:
-    rule = ["---" if k < left else "---:" for k in range(len(head))]
-    lines = [" | ".join(line) for line in (head, rule, *body)]
-    return "".join(f"| {line} |\n" for line in lines)
-
-
-def write_page(made: dict[str, str]) -> None:
-    """Put each part between its marks."""
-    page = PAGE.read_text(encoding="utf-8")
-    for name, text in made.items():
-        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-        before, _, rest = page.partition(begin)
-        _, _, after = rest.partition(end)
-        page = f"{before}{begin}\n{text}\n{end}{after}"
-    PAGE.write_text(page, encoding="utf-8")
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run what is missing and write the page."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scoreboard")
@@ -227,7 +211,7 @@ def main(arguments: list[str] | None = None) -> int:
     board = stored(results)
     made = parts(board)
     print("\n".join(made.values()))
-    write_page(made)
+    write_page(PAGE, made)
     draw(board, PICTURE)
     print(f"{time.perf_counter() - begin:.0f} s on {jax.devices()[0].device_kind}")
     return 0
