@@ -58,6 +58,10 @@ _SPELLINGS = [
 # It takes some relations and brackets for letters.
 _LETTER = re.compile(r"<mi>(&#x[0-9A-F]+;)</mi>")
 
+# An equation in a line of text is not broken. With more symbols than this it may be
+# wider than a phone, and the style sheet lets it scroll there.
+_SYMBOL, _NARROW = re.compile(r"<m[ino][ >]"), 20
+
 
 def _stand_in_for_stable_baselines3() -> None:
     """The reference imports what it documents. One class extends another of
@@ -81,6 +85,8 @@ def to_mathml(latex: str, display: bool) -> str:
     unknown = re.search(r"\\[A-Za-z]+", mathml)
     if unknown is not None:
         raise ValueError(f"unknown command {unknown.group()}")
+    if not display and len(_SYMBOL.findall(mathml)) > _NARROW:
+        mathml = mathml.replace("<math ", '<math class="delucax-wide" ', 1)
     return _LETTER.sub(_symbol, mathml)
 
 
