@@ -1,8 +1,11 @@
-"""Check the built site, after `make docs`.
+"""Check the built site, after `make docs`, and the links of the pages beside it.
 
 Every link inside the site leads to a page, and to an anchor of it; every image is there
 and has a text for those who do not see it; no two pages share a title; and no line of
 code is longer than 88 characters, so that none scrolls (what code prints wraps).
+
+README.md and CONTRIBUTING.md are read in the repository: there a link leads to a file,
+and its anchor to a heading, which GitHub names by a rule of its own.
 """
 
 import posixpath
@@ -13,8 +16,12 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 
-SITE = Path(__file__).parents[1] / "site"
+ROOT = Path(__file__).parents[1]
+SITE = ROOT / "site"
 WIDTH = 88
+BLOCK = re.compile(r"^(`{3,}).*?^\1`*$", re.DOTALL | re.MULTILINE)
+CODE = re.compile(r"(`+).+?\1", re.DOTALL)
+LINK = re.compile(r"\]\(\s*<?([^)\s>]+)|^\[[^\]]+\]:\s*<?([^\s>]+)", re.MULTILINE)
 VOID = {"br", "col", "hr", "img", "input", "link", "meta", "path", "source", "wbr"}
 
 
@@ -86,7 +93,40 @@ def faults(site: Path) -> list[str]:
     return found
 
 
+def slugs(markdown: str) -> set[str]:
+    """The anchors of a file's headings as GitHub makes them.
+
+    A letter is made small, a space becomes a hyphen, and other signs go. A second
+    heading with the same words ends in -1.
+    """
+    found: list[str] = []
+    for heading in re.findall(r"^#{1,6} +(.*)$", BLOCK.sub("", markdown), re.MULTILINE):
+        shown = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", heading.strip())
+        found.append(re.sub(r"[^\w\- ]", "", shown.lower()).replace(" ", "-"))
+    return {
+        f"{slug}-{found[:i].count(slug)}" if slug in found[:i] else slug
+        for i, slug in enumerate(found)
+    }
+
+
+def broken(root: Path, name: str) -> list[str]:
+    """The links of a Markdown file of the repository that lead nowhere, a line each."""
+    markdown = (root / name).read_text(encoding="utf-8")
+    found = []
+    for links in LINK.findall(CODE.sub("", BLOCK.sub("", markdown))):
+        url = urlsplit("".join(links))
+        if url.scheme or url.netloc:
+            continue
+        target = (root / name).parent / unquote(url.path) if url.path else root / name
+        if not target.exists():
+            found.append(f"{name}: no file for {url.geturl()}")
+        elif url.fragment and target.suffix == ".md":
+            if unquote(url.fragment) not in slugs(target.read_text(encoding="utf-8")):
+                found.append(f"{name}: no heading for {url.geturl()}")
+    return found
+
+
 if __name__ == "__main__":
-    wrong = faults(SITE)
+    wrong = faults(SITE) + broken(ROOT, "README.md") + broken(ROOT, "CONTRIBUTING.md")
     print("\n".join(wrong) or "the site is sound")
     sys.exit(bool(wrong))
