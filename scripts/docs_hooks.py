@@ -7,13 +7,14 @@ and `$$...$$`. An equation that cannot be converted is a warning, hence an error
 strict build.
 
 The page of claims is written from the ledger, and the tables of names in the reference
-from the docstrings. The version of the package stands in the header.
+from the docstrings. The version of the package stands in the header. A figure of a notebook is described by the `alt` of its cell's metadata.
 """
 
 import html
 import importlib.metadata
 import importlib.util
 import inspect
+import json
 import logging
 import pkgutil
 import posixpath
@@ -36,11 +37,10 @@ _EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 # A class without an `__init__` of its own shows that of `object`.
 _NO_INIT = re.compile(r"<p>Initialize self\.\s+See help\(type\(self\)\)[^<]*</p>")
 
-# Headings, figures of a notebook that nothing describes, and links to other sources.
+# Cells of a notebook, figures that nothing describes, and links to other sources.
 _FIGURE = re.compile(
-    r"<h\d[^>]*>(.*?)</h\d>|"
-    r'<img(?: alt="No description[^"]*")?(?=[\s>])(?![^>]*\salt=)',
-    re.DOTALL,
+    r'id="cell-id=([^"]*)"|'
+    r'<img(?: alt="No description[^"]*")?(?=[\s>])(?![^>]*\salt=)'
 )
 _LINK = re.compile(r'href="([^":#]+\.(?:md|ipynb))(#[^"]*)?"')
 
@@ -181,7 +181,7 @@ def _each(names: Iterable[str | None]) -> str:
 def on_page_content(html_text: str, /, *, page: Any, files: Any, **_: Any) -> str:
     """Replace every marked equation of a page, and drop what says nothing."""
     if page.file.src_uri.endswith(".ipynb"):
-        html_text = described(linked(html_text, page.file, files))
+        html_text = described(linked(html_text, page.file, files), page.file)
 
     def render(match: re.Match[str]) -> str:
         source = html.unescape(match.group(2)).strip()
@@ -210,17 +210,23 @@ def linked(html_text: str, file: Any, files: Any) -> str:
     return _LINK.sub(lead, html_text)
 
 
-def described(html_text: str) -> str:
-    """A notebook whose figures say which section they belong to."""
-    section = ""
+def described(html_text: str, file: Any) -> str:
+    """A notebook whose figures are described by the `alt` of their cells' metadata."""
+    with open(file.abs_src_path, encoding="utf-8") as notebook:
+        cells = json.load(notebook)["cells"]
+    alts = {cell.get("id"): cell["metadata"].get("alt") for cell in cells}
+    cell = ""
 
     def describe(match: re.Match[str]) -> str:
-        nonlocal section
-        if match.group(1) is None:
-            return f'<img alt="A figure of the section {section}"'
-        heading = re.sub(r"<.*?>|¶|&para;", "", match.group(1))
-        section = html.escape(html.unescape(" ".join(heading.split())))
-        return match.group()
+        nonlocal cell
+        if match.group(1) is not None:
+            cell = match.group(1)
+            return match.group()
+        if not alts.get(cell):
+            where = f"{file.src_uri}: the figure of cell {cell}"
+            _log.warning("%s needs a description, as alt of the cell's metadata", where)
+            return match.group()
+        return f'<img alt="{html.escape(alts[cell])}"'
 
     return _FIGURE.sub(describe, html_text)
 
