@@ -7,7 +7,8 @@ and `$$...$$`. An equation that cannot be converted is a warning, hence an error
 strict build.
 
 The page of claims is written from the ledger, and the tables of names in the reference
-from the docstrings. The version of the package stands in the header. A figure of a notebook is described by the `alt` of its cell's metadata.
+from the docstrings. The version of the package stands in the header. A
+figure of a notebook is described by the `alt` of its cell's metadata.
 """
 
 import html
