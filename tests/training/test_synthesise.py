@@ -40,10 +40,24 @@ def test_a_linear_plant_gets_its_regulator():
 
 
 def test_what_was_tried_is_reported():
-    structures = {attempt.structure for attempt in result().tried}
+    floor, trained = result().tried[:2], result().tried[2:]
+    assert [(a.structure, a.method) for a in floor] == [
+        ("zero", "none"),
+        ("LQR", "none"),
+    ]
+    structures = {attempt.structure for attempt in trained}
     assert structures and structures <= {"network", "LQR + network"}
+    assert all(attempt.method != "none" for attempt in trained)
     assert all(np.isfinite(attempt.cost) for attempt in result().tried)
     assert sum(attempt.seconds for attempt in result().tried) < result().seconds
+
+
+def test_the_report_is_short():
+    said = repr(result())
+    assert said.count("\n") == 1 and "structure='LQR'" in said
+    assert f"{len(result().tried)} tried" in said and "over 16 episodes: policy" in said
+    ended = "the LQR was as good as a plan", "the time was over"
+    assert result().ended in ended
 
 
 def test_costs_are_from_the_same_starts():
@@ -269,7 +283,8 @@ def test_it_stops_where_the_user_does(monkeypatch):
 
     monkeypatch.setattr(PolicySearch, "attempt", interrupted)
     stopped = synthesise(env(), key=KEY, budget=10.0, width=8, progress=False)
-    assert stopped.structure == "LQR" and not stopped.tried
+    assert stopped.structure == "LQR" and stopped.ended == "interrupted"
+    assert {attempt.method for attempt in stopped.tried} == {"none"}
 
 
 def test_an_interrupt_before_anything_is_known(monkeypatch):

@@ -8,13 +8,16 @@ from .._controller import AbstractController
 
 
 class Attempt(NamedTuple):
-    """One training that [`delucax.training.synthesise`][] tried.
+    """One policy that [`delucax.training.synthesise`][] tried.
 
     **Attributes:**
 
     - `structure`: the structure of the policy, as in [`delucax.training.Synthesis`][].
-    - `method`: the training method, such as `"gradient"` or `"evolution"`.
-    - `cost`: the mean cost over the initial states on which policies are chosen.
+    - `method`: the training method. `"gradient"` is the gradient of the rollout, and
+        `"gradient, 0.5 s"` the same with a damping that has the time constant 0.5 s.
+        `"evolution"` is [`delucax.training.evolve`][]. `"none"` is no training.
+    - `cost`: the mean cost over 64 initial states that are only used to choose a
+        policy. It is the lowest one of all rounds of this training.
     - `seconds`: the time that the training took, including compilation [s].
 
     !!! example

@@ -99,6 +99,7 @@ class PolicySearch:
         self.best = {"zero": Line("zero", "none", zero, unknown)}
         self.last: list[Line] = []
         self.tried: list[Attempt] = []
+        self.ended = "interrupted"
         self.law: LQR | LQG | None = None
         name = "LQR" if environment.dynamics.observes_state else "LQG"
         # The structures that need no training.
@@ -145,7 +146,11 @@ class PolicySearch:
         floor = self.best["zero"].policy, self.law
         for name, law in zip(self.floor, floor, strict=True):
             if law is not None:
-                self.enter(Line(name, "none", law, self.costs(law)))
+                began = self.seconds
+                line = Line(name, "none", law, self.costs(law))
+                self.enter(line)
+                took = self.seconds - began
+                self.tried.append(Attempt(name, "none", self.mean(line), took))
         self.warn_of_lost_starts()
         family, key = self.ranges is not None, self.fresh_key()
         made = structures(self.environment, self.law, family, width, depth, key)
@@ -156,16 +161,22 @@ class PolicySearch:
         first, last = list(made)[0], list(made)[-1]
         trials = [(first, gradients), (last, evolution)]
         trials += [(first, evolution), (last, gradients)] if first != last else []
-        lines = []
+        lines, untrained = [], len(self.tried)
         for name, methods in trials:
             line = Line(name, "none", made[name], self.costs(made[name]))
             for method in methods:
-                if self.may_train or not self.tried:
+                # However short the budget is, one policy is trained.
+                if self.may_train or len(self.tried) == untrained:
                     line = self.attempt(line, method)
             lines.append(line)
             if len(lines) == _FIRST and self.is_settled():
+                rival = "a plan" if self.is_known else "MPC"
+                self.ended = f"the LQR was as good as {rival}"
                 return
         self.refine(lines)
+        self.ended = "no training lowered the cost any more"
+        if not self.may_train:
+            self.ended = "the time was over"
 
     def refine(self, lines: list[Line]) -> None:
         """Train the best of the lines, and the others if time is left."""
@@ -215,6 +226,11 @@ class PolicySearch:
             )
             return None
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the disturbances are known, because there are none."""
+        return isinstance(self.environment.disturbance, NoDisturbance)
+
     def is_settled(self) -> bool:
         """Whether the LQR is enough: neither the first two trials nor a plan is better.
         With disturbances MPC replaces the plan, because a plan would know them."""
@@ -222,8 +238,8 @@ class PolicySearch:
             return False
         keys = self.keys(CHOICE)[: self.count]
         own = np.mean(self.best["LQR"].costs[: self.count])
-        known = isinstance(self.environment.disturbance, NoDisturbance)
-        other = self.costs_of_rival("plan" if known else "MPC", self.law, keys)
+        rival = "plan" if self.is_known else "MPC"
+        other = self.costs_of_rival(rival, self.law, keys)
         if other is None or not np.isfinite(own):
             return False
         return not _is_better(np.mean(other), own)

@@ -49,11 +49,18 @@ class Synthesis(NamedTuple):
         `"LQG"`, `"MPC"` and `"plan"`, with an entry for each episode. All controllers
         run the same episodes, which were not used for training or for the choice of the
         policy. A controller is missing if it does not exist for the environment or if
-        the budget left no time for it.
-    - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings.
+        the budget left no time for it. MPC and the plan know the plant, and the plan
+        also knows the whole state and all disturbances in advance. So no policy may
+        reach the cost of the plan.
+    - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings;
+        the first ones are zero control and the LQR or LQG. `pandas.DataFrame(tried)`
+        makes a table of it.
     - `seconds`: the time it took.
     - `plants`: for a family of plants, a dictionary from each path of `ranges` to the
         value of this parameter in each episode of the comparison; otherwise empty.
+    - `ended`: why the training ended: `"the time was over"`, `"no training lowered the
+        cost any more"`, `"the LQR was as good as a plan"` (MPC, with disturbances), or
+        `"interrupted"`.
 
     !!! example
 
@@ -63,10 +70,14 @@ class Synthesis(NamedTuple):
 
         costs = {"policy": np.array([1.0, 2.0]), "zero": np.array([5.0, 9.0])}
         zero = dlx.controllers.Zero(1)
-        dlx.training.Synthesis(zero, "zero", costs, [], 5.0).to_pandas()
+        made = dlx.training.Synthesis(zero, "zero", costs, [], 5.0)
+        print(made)
+        made.to_pandas()
         ```
 
         ```text
+        Synthesis(structure='zero', seconds=5.0, ended='interrupted', 0 tried)
+        mean cost over 2 episodes: policy 1.5, zero 7
                 mean  median  worst
         policy   1.5     1.5    2.0
         zero     7.0     7.0    9.0
@@ -79,6 +90,15 @@ class Synthesis(NamedTuple):
     tried: list[Attempt]
     seconds: float
     plants: dict[str, np.ndarray] = {}
+    ended: str = "interrupted"
+
+    def __repr__(self) -> str:
+        about = f"structure={self.structure!r}, seconds={self.seconds:.1f}"
+        about += f", ended={self.ended!r}, {len(self.tried)} tried"
+        means = {name: np.mean(costs) for name, costs in self.costs.items()}
+        said = ", ".join(f"{name} {mean:.4g}" for name, mean in means.items())
+        count = max(map(len, self.costs.values()), default=0)
+        return f"Synthesis({about})\nmean cost over {count} episodes: {said}"
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A table with a row for each controller in the comparison.
@@ -156,9 +176,10 @@ def synthesise(
         control has one bound, the range has the same width and begins at the bound.
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
-        default, at least 10. A program that compiles when the time is over finishes
-        first. The number of trials depends on the speed of the machine, so the result
-        depends on the machine too.
+        default, at least 10. Training may take 70% of it, and the rest is for the
+        choice and the comparison. A program that compiles when the time is over
+        finishes first. The number of trials depends on the speed of the machine, so the
+        result depends on the machine too.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
         works on a family of plants: each episode draws a plant. The LQR is designed for
         the nominal plant; MPC and the plan know each plant. None by default: one plant.
@@ -227,8 +248,8 @@ def synthesise(
             f"from {lost} of {len(own)} initial states.",
             stacklevel=2,
         )
-    tried, plants = search.tried, search.plants()
-    return Synthesis(policy, structure, costs, tried, search.seconds, plants)
+    about = search.seconds, search.plants(), search.ended
+    return Synthesis(policy, structure, costs, search.tried, *about)
 
 
 def _check_environment(
