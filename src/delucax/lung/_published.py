@@ -44,9 +44,14 @@ class PublishedLung(AbstractDynamics):
     \mathrm{network}(z) & k \ge 5
     \end{cases}$$
 
-    with $z_\mathrm{all} = (u_k, \dots, u_{k - 4}, p_k, \dots, p_{k - 4})$ and $z =
-    (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})$, where $u$ are the scaled
-    controls. The published network has three layers of SELUs without biases. Before an
+    from the inputs
+
+    $$\begin{aligned}
+    z_\mathrm{all} &= (u_k, \dots, u_{k - 4}, p_k, \dots, p_{k - 4}) \\
+    z &= (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})
+    \end{aligned}$$
+
+    Here $u$ are the scaled controls. The published network has three layers of SELUs without biases. Before an
     inspiration the history is zero, except for the start pressure. While `u_out` is
     above 1/2, the state is reset to the state before an inspiration. The task
     `lung/learned_lung` clips the controls; the model does not.

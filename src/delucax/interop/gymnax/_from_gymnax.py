@@ -80,9 +80,12 @@ class GymnaxDynamics(AbstractDynamics):
     """The step of an environment in gymnax's protocol, as dynamics.
     [`delucax.interop.gymnax.from_gymnax`][] makes it.
 
-    The state is a vector. This vector consists of three parts: the entries of all
-    leaves of the state of the environment; if steps draw random numbers, four numbers
-    for a random key; and a last entry that is 1 if the episode is over, otherwise 0.
+    The state is a vector with these parts, in this order:
+
+    - the entries of all leaves of the state of the environment;
+    - four numbers for a random key, if steps draw random numbers;
+    - one entry that is 1 if the episode is over, otherwise 0.
+
     Integers and booleans are stored as floats, which are exact up to 2^24 in float32.
     The disturbance `w` is added to the next state.
 
