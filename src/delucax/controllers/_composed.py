@@ -31,8 +31,8 @@ class Scheduled(AbstractController):
         one entry for each time step. `eqx.filter_vmap` makes such a module.
     - `dt`: the time between one controller and the next.
 
-    **Raises:** `ValueError` if `controllers` is not a controller, if the leading axes of
-    its arrays differ in length or are missing, or if `dt` is not positive.
+    **Raises:** `ValueError` if `controllers` is not a controller, if the leading axes
+    of its arrays are missing or differ in length, or if `dt` is not positive.
 
     !!! example
 

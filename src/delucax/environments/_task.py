@@ -165,8 +165,8 @@ def task(
             substeps: int = substeps,
             **others: Any,
         ) -> Environment:
-            """- `system`: a [`delucax.systems.{kind}`][]; by default it is built from the
-                other keyword arguments.
+            """- `system`: a [`delucax.systems.{kind}`][]; by default it is built from
+                the other keyword arguments.
             - `dt`: the control interval{unit}, {dt} by default.
             - `horizon`: the number of steps per episode, {horizon} by default.
             - `solver`: a Diffrax solver, {solver}.

@@ -51,10 +51,10 @@ class PublishedLung(AbstractDynamics):
     z &= (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})
     \end{aligned}$$
 
-    Here $u$ are the scaled controls. The published network has three layers of SELUs without biases. Before an
-    inspiration the history is zero, except for the start pressure. While `u_out` is
-    above 1/2, the state is reset to the state before an inspiration. The task
-    `lung/learned_lung` clips the controls; the model does not.
+    Here $u$ are the scaled controls. The published network has three layers of SELUs
+    without biases. Before an inspiration the history is zero, except for the start
+    pressure. While `u_out` is above 1/2, the state is reset to the state before an
+    inspiration. The task `lung/learned_lung` clips the controls; the model does not.
 
     The model is rebuilt from the published weights, without the program of the authors.
     Under the conditions of the authors' notebook, the model has the same errors as in
