@@ -1,6 +1,8 @@
 """Sequential quadratic programming: optima of others, the optimality conditions, hard
 and soft limits, derivatives, and what must not go wrong."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -181,7 +183,7 @@ def test_what_cannot_hold_is_named():
     given = dict(bounds=(-0.1, 0.1), constraints=never)
     plan = SQP()(dynamics, cost, x0, U, throw=False, **given)
     assert plan.result == dlx.RESULTS.no_feasible_point and plan.violation > 1e-2
-    with pytest.raises(RuntimeError, match=r"`goal` \(entry 0\).* by .* at the end"):
+    with pytest.raises(RuntimeError, match=r"`goal` \(entry 0\) is violated by"):
         SQP()(dynamics, cost, x0, U, **given)
     # No derivative of what is no solution.
     f = lambda x0: SQP()(dynamics, cost, x0, U, throw=False, **given).cost
@@ -194,6 +196,35 @@ def test_what_cannot_hold_is_named():
         with pytest.raises(RuntimeError, match=f"The {words}"):
             limits = Constraints(states=states)
             SQP()(dynamics, cost, x0, U, bounds=(-1.0, 1.0), constraints=limits)
+
+
+@needs_x64
+def test_all_that_cannot_hold_together_is_named():
+    dynamics, cost, x0, U = steered()
+
+    def message(inequality=None, **given):
+        limits = Constraints(inequality, **given)
+        with pytest.raises(RuntimeError, match="constraints cannot all hold") as error:
+            SQP()(dynamics, cost, x0, U, constraints=limits)
+        return str(error.value)
+
+    # No control changes the first position, and the bound of it takes others along.
+    slow = {"up": lambda t, x, u: u[0] - 0.1, "down": lambda t, x, u: -u[0] - 0.1}
+    given = dict(final_equality={"goal": arrived}, states=([-0.5, -9, -9, -9], 9.0))
+    words = message(slow, **given)
+    sizes = [float(size) for size in re.findall(r" by ([\d.]+) at ", words)]
+    assert len(sizes) == 4 and sizes == sorted(sizes, reverse=True) and sizes[0] > 0.5
+    assert "4 constraints are violated: the " in words
+    assert "the lower bound of state 0 (east) by 0.5 at stage 1, the " in words
+    # A soft constraint that is violated is not among them, and a single one is alone.
+    slow = {name: SoftConstraint(limit, linear=1e-3) for name, limit in slow.items()}
+    alone = "The lower bound of state 0 (east) is violated by 0.5 at stage 1. Pass"
+    assert alone in message(slow, **given)
+    # A long list is cut.
+    equal = {f"c{i}": lambda t, x, u, i=i: u[0] - i for i in range(1, 8)}
+    words = message(equality=equal)
+    assert words.count("the constraint `c") == 4
+    assert re.search(r", and \d more\. Any of them", words)
 
 
 @needs_x64

@@ -38,7 +38,7 @@ _REMEDY = (
     "So there is no usable plan. With MPC(..., throw=False), or with a fallback, the "
     "run goes on, and `run.incident_times['failed_plan']` is the first time without a "
     "plan. Call the planner from the state at that time: its error says what is wrong, "
-    "and which constraint is violated most."
+    "and which constraints are violated."
 )
 
 

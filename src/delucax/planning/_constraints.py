@@ -275,9 +275,23 @@ def _each(constraints: Constraints, final: bool):
             yield name, function, kind == "equality"
 
 
-def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any) -> str:
-    """A sentence for messages: the most violated constraint, by how much, and where."""
-    T, violations = len(controls), []
+_LISTED = 4
+"""How many violated constraints a message lists."""
+
+
+class Violation(NamedTuple):
+    """The largest violation of one constraint, and where it is."""
+
+    size: float
+    name: str
+    place: str
+
+
+def violations_of(
+    constraints: Constraints, problem: Any, states: Any, controls: Any
+) -> str:
+    """A sentence for messages: the violated constraints, by how much, and where."""
+    T, found = len(controls), []
     times = problem.times(T)
     stage = jax.vmap(lambda t, x, u: problem.stage_constraints(t, x, u)[0])
     each = stage(times[:-1], states[:-1], controls)
@@ -290,11 +304,10 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
             start += row.size
             if row.weights is None and row.size:
                 over = np.abs(c) if row.is_equality else np.maximum(c, 0)
-                names = [f"constraint `{row.name}`"]
-                if row.size > 1:
-                    names = [f"{names[0]} (entry {i})" for i in range(row.size)]
-                first = None if final else 0
-                violations.append((np.nan_to_num(over, nan=np.inf), names, first))
+                name = f"constraint `{row.name}`"
+                names = [f"{name} (entry {i})" for i in range(row.size)]
+                names = names if row.size > 1 else [name]
+                found.append(_largest(over, names, None if final else 0))
     for kind, value, planned, first in (
         ("state", constraints.states, states, 1),  # the first state is given
         ("control", constraints.controls, controls, 0),
@@ -304,14 +317,31 @@ def worst_of(constraints: Constraints, problem: Any, states: Any, controls: Any)
         low, high = (e[first:] if e.ndim == 2 else e for e in map(np.asarray, value))
         planned, known = planned[first:], getattr(problem.dynamics, f"{kind}_names")
         for side, over in (("lower", low - planned), ("upper", planned - high)):
-            names = [f"{side} bound of {kind} {i} ({n})" for i, n in enumerate(known)]
-            violations.append((np.maximum(over, 0), names, first))
-    if not violations:
+            over = np.maximum(over, 0)
+            for i, n in enumerate(known):
+                name = f"{side} bound of {kind} {i} ({n})"
+                found.append(_largest(over[:, i : i + 1], [name], first))
+    # A constraint that is violated only by rounding is not to blame.
+    least = np.finfo(states.dtype).eps ** 0.5
+    found = sorted((v for v in found if v.size > least), key=lambda v: -v.size)
+    if not found:
         return ""
-    over, names, first = max(violations, key=lambda entry: entry[0].max())
-    # Do not blame a constraint that is violated only by rounding.
-    if not over.max() > np.finfo(states.dtype).eps ** 0.5:
-        return ""
+    if len(found) == 1:
+        size, name, place = found[0]
+        return f"The {name} is violated by {size:.2g} {place}."
+    listed = [f"the {v.name} by {v.size:.2g} {v.place}" for v in found[:_LISTED]]
+    if more := len(found) - len(listed):
+        listed.append(f"and {more} more")
+    return (
+        f"{len(found)} constraints are violated: {', '.join(listed)}. Any of them can "
+        "be the one that cannot hold."
+    )
+
+
+def _largest(over: Any, names: list[str], first: int | None) -> Violation:
+    """The largest entry of the violations of a constraint, one row for each stage from
+    `first` on, or of a constraint at the end if that is None."""
+    over = np.nan_to_num(np.asarray(over), nan=np.inf)
     k, i = (int(j) for j in np.unravel_index(over.argmax(), over.shape))
-    at = "at the end" if first is None else f"at stage {k + first}"
-    return f"The {names[i]} is violated most, by {over.max():.2g} {at}."
+    place = "at the end" if first is None else f"at stage {k + first}"
+    return Violation(float(over[k, i]), names[i], place)

@@ -29,7 +29,7 @@ from .._results import choose, raise_on_failure, RESULTS
 from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._constraints import Constraints, worst_of
+from ._constraints import Constraints, violations_of
 from ._multipliers import Multipliers
 from ._plan import Plan
 from ._problem import Problem
@@ -64,8 +64,9 @@ def checked_plan(
         if problem is None or problem.constraints is None:
             return words
         solved = solved_problem(problem, plan)
-        worst = worst_of(problem.constraints, solved, plan.states, plan.controls)
-        return f"{words} {worst}".rstrip()
+        trajectory = plan.states, plan.controls
+        violations = violations_of(problem.constraints, solved, *trajectory)
+        return f"{words} {violations}".rstrip()
 
     return raise_on_failure(plan, where, throw, "the plan", facts)
 
