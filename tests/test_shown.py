@@ -97,7 +97,14 @@ def test_results_show_name_and_message():
     stopped = results.promote(diffrax.RESULTS.max_steps_reached)
     assert repr(stopped).startswith("<RESULTS.max_steps_reached: The maximum")
     pick = lambda k: results.where(k > 0, results.successful, results.diverged)
-    assert repr(jax.vmap(pick)(jnp.arange(3))) == "<RESULTS: 2 successful, 1 diverged>"
+    batch = jax.vmap(pick)(jnp.arange(3))
+    assert repr(batch) == "<RESULTS: 2 successful, 1 diverged>"
+    each = [dlx.RESULTS[batch[i]] for i in range(3)]
+    assert each == [dlx.RESULTS[result] for result in batch]
+    assert sorted(map(bool, each)) == [False, False, True]
+    assert repr(batch[:0]) == "<RESULTS: >"
+    with pytest.raises((IndexError, TypeError)):
+        dlx.RESULTS.successful[0]
     texts = []
     jax.jit(lambda k: texts.append(repr(pick(k))))(1)
     assert texts == ["<RESULTS: traced>"]

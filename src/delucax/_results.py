@@ -140,7 +140,17 @@ else:
 
 
 class _Item(Result):
-    """An item of `RESULTS` that prints its name and its message."""
+    """An item of `RESULTS` that prints its name and its message.
+
+    The items of a batch are items again: `results[i]`, and `for result in results`.
+    """
+
+    def __getitem__(self, index):
+        return jax.tree.map(lambda r: r[index], self)
+
+    def __iter__(self):
+        # Without it, Python would index until an `IndexError`, which JAX never raises.
+        return (self[i] for i in range(len(self._value)))
 
     def __repr__(self):
         if isinstance(self._value, Tracer):
