@@ -141,7 +141,8 @@ class MPC(AbstractController):
         the gains of the plan, and then discards the plan. If there is no usable plan in
         the next step either, it applies the first trajectory of `start`, which is by
         default the trajectory under the LQR. With `real_time`, the controller keeps
-        following the last plan.
+        following the last plan. All these controls keep `bounds`, but they need not
+        keep `constraints`.
     - `fallback`: a controller that acts in the steps without a usable plan, instead of
         raising. The fallback is called at every step, so that its state is up to date.
         None by default.
