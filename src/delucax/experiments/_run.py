@@ -379,11 +379,13 @@ def _progress(
         whole.update()
         if workers == 1:
             return
-        if worker not in bars:
+        is_new = worker not in bars
+        if is_new:
             bar = make(position=len(bars) + 1, leave=False)
             bars[worker] = stack.enter_context(bar)
         name = f"worker {worker}: {case[:40]}"
-        bars[worker].set_description_str(name, refresh=False)
+        # Later ones are shown with the next tick that tqdm draws.
+        bars[worker].set_description_str(name, refresh=is_new)
         bars[worker].update()
 
     with contextlib.ExitStack() as stack:
