@@ -1,5 +1,7 @@
 """PPO, SHAC, surrogates and batches of seeds."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -305,6 +307,36 @@ def test_surrogate_goes_on_from_a_checkpoint(tmp_path):
         fit(drawn, model, optimiser, 9, **options, **kept, callbacks=[stop])
     again = fit(drawn, model, optimiser, 9, **options, **kept)
     assert np.array_equal(whole.history.loss, again.history.loss)
+
+
+class Infinite(dlx.training.AbstractSurrogate):
+    """Starts with a number of Python in its memory."""
+
+    first: object = eqx.field(static=True)
+
+    def init(self, model, key):
+        return {"gain": model.K, "best": (jnp.zeros(()), self.first)}
+
+    def update(self, model, memory, step, key):
+        return memory
+
+    def __call__(self, model, memory, key):
+        return jnp.sum(model.K**2)
+
+
+@once
+@pytest.mark.parametrize("first, shown", [(jnp.inf, "inf"), ("none", "'none'")])
+def test_memory_that_is_no_array_is_named_by_its_path(first, shown):
+    where = re.escape(f"got {shown} at memory['best'][1]. Use")
+    with user_error(match=f"^fit: the memory that Infinite.init returns .*{where}"):
+        fit(
+            Infinite(first),
+            c.Linear(jnp.ones((1, 2))),
+            optax.sgd(0.1),
+            1,
+            key=jr.key(0),
+            progress=False,
+        )
 
 
 class Dithered(dlx.AbstractStochasticPolicy):

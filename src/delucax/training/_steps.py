@@ -285,11 +285,13 @@ def _first_state(optimiser: Optimiser, seeds: int | None, values: Values) -> PyT
 def _first_memory(loss: AbstractSurrogate, model: PyTree, key: PRNGKey) -> PyTree:
     """The memory of a surrogate before the first step."""
     memory = loss.init(model, jr.fold_in(key, _MEMORY))
-    if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
-        raise ValueError(
-            f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
-            f"arrays, got {memory!r}."
-        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(memory):
+        if not eqx.is_array(leaf):
+            raise ValueError(
+                f"{_WHERE}: the memory that {type(loss).__name__}.init returns must be "
+                f"a pytree of arrays, got {leaf!r} at memory"
+                f"{jax.tree_util.keystr(path)}. Use jnp.asarray for a number."
+            )
     return jax.tree.map(strip_weak_type, memory)
 
 
