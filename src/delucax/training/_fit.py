@@ -146,7 +146,10 @@ def fit(
         to log to TensorBoard, for example. If a callback returns `True`, training stops
         after this block, for example because the loss is low enough or the time is up.
     - `checkpoint`: the path of a file for checkpoints; none by default. If this file
-        exists, the run resumes from the checkpoint in it.
+        exists, the run resumes from the checkpoint in it. `steps` belongs to the run:
+        a call with another number of steps raises an error. A run that a callback
+        stopped resumes if you repeat the same call. So if you may want to train longer,
+        choose a large number of steps, and stop with a callback.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. A checkpoint is always written at the end of the run.
     - `throw`: whether to raise an error if the loss, its gradient or an update is NaN

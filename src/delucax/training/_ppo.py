@@ -62,9 +62,14 @@ class PPO(AbstractActorCriticLoss):
     scales stay fixed during a batch, so that $\rho$ starts at 1. An additional batch
     before the first step sets the first scales.
 
-    In total, `fit` takes `batch * horizon * (1 + steps / (epochs * minibatches))` steps
-    of the environment. Metrics: `total_cost` of the last batch, `entropy`, `kl`,
-    `clipped` (the fraction of ratios outside the clip range) and `value_loss`.
+    In total, `fit` takes `batch * horizon * (1 + ceil(steps / (epochs * minibatches)))`
+    steps of the environment. For example, 63 steps of `fit` with 4 epochs of 8
+    minibatches run 3 batches. If an episode terminates before the horizon, this number
+    also counts its remaining steps, in which the state is held. They are computed, but
+    have no effect on the loss.
+
+    Metrics: `total_cost` of the last batch, `entropy`, `kl`, `clipped` (the fraction of
+    ratios outside the clip range) and `value_loss`.
 
     **Arguments:**
 
