@@ -275,6 +275,9 @@ def test_divergence_is_an_error_or_a_status(key):
     arguments = dict(key=key, x0=jnp.ones(1), horizon=horizon)
     with pytest.raises(RuntimeError, match=r"NaN or infinite.*step \d+ \(t = "):
         dlx.rollout(env, zero, **arguments)
+    cost = lambda env: dlx.rollout(env, zero, **arguments).total_cost
+    with pytest.raises(RuntimeError, match=r"NaN or infinite.*step \d+ \(t = "):
+        eqx.filter_grad(cost)(env)
     run = dlx.rollout(env, zero, throw=False, **arguments)
     assert run.result == dlx.RESULTS.diverged
     assert "NaN" in run.summary()["result"][0]

@@ -3,6 +3,8 @@
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.lax as lax
 import numpy as np
 
 from .._check import is_concrete
@@ -35,6 +37,9 @@ def checked(
         numbers, rest = eqx.partition(trajectory, eqx.is_inexact_array)
         return eqx.combine(trajectory.result.error_if(numbers, failed), rest)
     if failed:
+        # Under `jax.grad` without a jit the arrays have values, but NumPy cannot read
+        # them.
+        trajectory, dynamics = _without_tangents((trajectory, dynamics))
         message = f"{where}: {RESULTS[trajectory.result]}"
         if trajectory.states is not None:
             bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
@@ -58,3 +63,9 @@ def checked(
                 message = f"{message} {dynamics.describe_fault(*steps)}".rstrip()
         raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
     return trajectory
+
+
+def _without_tangents(tree: Any) -> Any:
+    """The tree without the derivatives that its arrays carry."""
+    floats, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lax.stop_gradient, floats), rest)
