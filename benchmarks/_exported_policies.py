@@ -160,8 +160,11 @@ def exported(only: list[str], at_once: int = 1) -> dict[str, Any]:
             f"{worst['difference']:.1e} ({worst['structure']} of {worst['task']}): "
             f"{'met' if within == len(group) else 'NOT met'}"
         )
-        most = float(worst["difference"])
-        counts = {"policies": len(group), "within": within, "most": most}
+        returned = group[group["structure"].str.startswith("synthesise")]
+        counts = {"policies": len(group), "within": within, "returned": len(returned)}
+        counts["most"] = float(worst["difference"])
+        counts["rounding of that"] = float(worst["rounding"])
+        counts["most of the returned"] = float(returned["difference"].max())
         summary.append({"precision": precision} | counts)
     return {"rows": table.to_dict("records"), "summary": summary}
 

@@ -173,18 +173,11 @@ def test_each_kind_of_plant_gets_its_structures():
     assert names(hidden(), lqg, False) == {"memory", "LQG + memory"}
 
 
-def test_where_the_state_is_hidden_the_regulator_is_an_lqg():
-    task, key = hidden(), jax.random.key(1)
-    lqg = regulator(task, key)
-    assert isinstance(lqg, dlx.controllers.LQG)
-    run = dlx.rollout(task, lqg, key=key)
-    zero = dlx.rollout(task, dlx.controllers.Zero(1), key=key)
-    assert run.total_cost < 0.2 * zero.total_cost
-    assert jnp.all(jnp.abs(run.states[-1]) < 0.2)
-    # Its gain is that of the covariances that the noise has, to the sampling error.
-    assert lqg.estimator.V[0, 0] == pytest.approx(1e-4, rel=0.2)
+def test_an_lqg_may_be_enough():
+    task = hidden()
+    lqg = regulator(task, KEY)
     floor = {"zero": np.full(2, 9.0), "LQG": np.full(2, 1.0)}
-    search = PolicySearch(task, None, key, 10.0, progress=False)
+    search = PolicySearch(task, None, KEY, 10.0, progress=False)
     for name, costs in floor.items():
         search.enter(known(name, lqg, *costs))
     assert search.chosen() == ("LQG", lqg)

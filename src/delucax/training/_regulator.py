@@ -32,7 +32,8 @@ def regulator(environment: Environment, key: PRNGKey) -> LQR | LQG:
         return local_lqr(environment)
     plant, Q, R, S = local_model(environment)
     start, W, V = (np.asarray(e, float) for e in _covariances(environment, key))
-    start += _LEAST * max(np.max(np.diag(start)), _LEAST) * np.eye(len(start))
+    least = _LEAST * max(np.max(np.diag(start)), _LEAST)
+    start = start + least * np.eye(len(start))
     E, C, x_ref = plant.E, np.asarray(plant.C, float), plant.x_ref
     driven = np.zeros_like(start) if E is None else np.asarray(E @ W @ E.T, float)
     # Without `E`, the covariance of a step is that of the state itself.
