@@ -291,7 +291,7 @@ def violations_of(
     constraints: Constraints, problem: Any, states: Any, controls: Any
 ) -> str:
     """A sentence for messages: the violated constraints, by how much, and where."""
-    T, found = len(controls), []
+    T, violated = len(controls), []
     times = problem.times(T)
     stage = jax.vmap(lambda t, x, u: problem.stage_constraints(t, x, u)[0])
     each = stage(times[:-1], states[:-1], controls)
@@ -307,7 +307,7 @@ def violations_of(
                 name = f"constraint `{row.name}`"
                 names = [f"{name} (entry {i})" for i in range(row.size)]
                 names = names if row.size > 1 else [name]
-                found.append(_largest(over, names, None if final else 0))
+                violated.append(_largest(over, names, None if final else 0))
     for kind, value, planned, first in (
         ("state", constraints.states, states, 1),  # the first state is given
         ("control", constraints.controls, controls, 0),
@@ -320,21 +320,21 @@ def violations_of(
             over = np.maximum(over, 0)
             for i, n in enumerate(known):
                 name = f"{side} bound of {kind} {i} ({n})"
-                found.append(_largest(over[:, i : i + 1], [name], first))
+                violated.append(_largest(over[:, i : i + 1], [name], first))
     # A constraint that is violated only by rounding is not to blame.
     least = np.finfo(states.dtype).eps ** 0.5
-    found = sorted((v for v in found if v.size > least), key=lambda v: -v.size)
-    if not found:
+    violated = sorted((v for v in violated if v.size > least), key=lambda v: -v.size)
+    if not violated:
         return ""
-    if len(found) == 1:
-        size, name, place = found[0]
+    if len(violated) == 1:
+        size, name, place = violated[0]
         return f"The {name} is violated by {size:.2g} {place}."
-    listed = [f"the {v.name} by {v.size:.2g} {v.place}" for v in found[:_LISTED]]
-    if more := len(found) - len(listed):
+    listed = [f"the {v.name} by {v.size:.2g} {v.place}" for v in violated[:_LISTED]]
+    if more := len(violated) - len(listed):
         listed.append(f"and {more} more")
     return (
-        f"{len(found)} constraints are violated: {', '.join(listed)}. Any of them can "
-        "be the one that cannot hold."
+        f"{len(violated)} constraints are violated: {', '.join(listed)}. Any of them "
+        "can be the one that cannot hold."
     )
 
 
