@@ -152,6 +152,16 @@ def test_the_last_choice_is_made_on_more_starts(monkeypatch):
     assert len(search.best[name].costs) == 8 * module.CHOICE
 
 
+def test_the_last_choice_is_among_different_policies():
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    good, other = (dlx.controllers.Constant([float(i)]) for i in range(2))
+    # Attempts without a gain enter the policy that they began with.
+    for _ in range(5):
+        search.enter(known("network", good, 1.0))
+    search.enter(known("network", other, 2.0))
+    assert [line.policy for line in search.last] == [good, other]
+
+
 def test_a_reward_is_a_large_usual_cost():
     """Of a mountain car: zero control costs nothing, and a little effort little."""
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)

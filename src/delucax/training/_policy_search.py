@@ -76,6 +76,11 @@ def _is_better(other: Any, own: Any) -> bool:
     return bool(own - other > _WORTH * abs(own))
 
 
+def _distinct(lines: list[Line]) -> list[Line]:
+    """Each policy once: an attempt without a gain returns the policy it began with."""
+    return list({id(line.policy): line for line in lines}.values())
+
+
 class PolicySearch:
     """A search for a policy within a time budget."""
 
@@ -336,7 +341,7 @@ class PolicySearch:
         """Keep the line if it is the best of its structure, and update the usual
         cost."""
         name = line.structure
-        self.last = sorted([*self.last, line], key=self.score)[:_LAST]
+        self.last = sorted(_distinct([*self.last, line]), key=self.score)[:_LAST]
         self.best[name] = min(self.best.get(name, line), line, key=self.score)
         costs = self.best[name].costs
         middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
@@ -361,7 +366,7 @@ class PolicySearch:
         and the first 64 initial states may have none.
         """
         floor = [self.best[name] for name in self.floor if name in self.best]
-        lines = [*self.last, *floor]
+        lines = _distinct([*self.last, *floor])
         for k in range(1, _ROUNDS):
             if self.seconds > _CHOOSING * self.budget:
                 break
