@@ -140,6 +140,25 @@ def test_optimisers_are_equal_if_made_in_the_same_way():
     assert Optimiser(makers[5]()) != made[5][0]
 
 
+RATE = 0.1
+
+
+def test_an_optimiser_that_reads_a_global(monkeypatch):
+    def make():
+        halved = lambda step: RATE / 2  # in a schedule within another function
+        return Optimiser(optax.sgd(lambda step: halved(step)))
+
+    first = make()
+    assert first == make()
+    monkeypatch.setitem(globals(), "RATE", 0.2)
+    assert first != make()
+    # A new array may get the identity of one that is gone.
+    monkeypatch.setitem(globals(), "RATE", np.ones(3))
+    second = make()
+    monkeypatch.setitem(globals(), "RATE", np.zeros(3))
+    assert second != make()
+
+
 def test_an_optimiser_may_close_over_what_has_no_value_yet():
     adam = optax.adam(0.1)
 
@@ -285,6 +304,22 @@ def test_callbacks_are_told_of_each_block():
     assert metrics["step"] == 9
     assert_close(metrics["twice"], 2 * 0.8**9, rtol=1e-5)
     assert_close(metrics["loss"], 1 + 0.8**18, rtol=1e-5)
+
+
+@once
+def test_callbacks_are_told_the_mean_of_the_seeds_that_go_on():
+    heard = []
+    models = eqx.filter_vmap(lambda s: Line(slope=s))(jnp.array([1.0, -1.0]))
+    fitted = train(
+        lambda m, key: jnp.sqrt(m.slope),
+        models,
+        steps=4,
+        key=jr.split(jr.key(0), 2),
+        throw=False,
+        callbacks=[lambda step, metrics: heard.append(metrics["loss"])],
+    )
+    assert np.isnan(fitted.history.loss[-1, 1])
+    assert_close(heard[-1], fitted.history.loss[-1, 0])
 
 
 @once

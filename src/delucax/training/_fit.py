@@ -151,7 +151,8 @@ def fit(
         stopped resumes if you repeat the same call. So if you may want to train longer,
         choose a large number of steps, and stop with a callback.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
-        blocks by default. A checkpoint is always written at the end of the run.
+        blocks by default. A checkpoint is also written at the end of the run, unless
+        the run or one of its seeds diverged.
     - `throw`: whether to raise an error if the loss, its gradient or an update is NaN
         or infinite; true by default. If false, training stops before that step, and
         `fitted.result` is `RESULTS.diverged`. In a batch of seeds, only the seed that
@@ -268,7 +269,7 @@ def fit(
             times = dict(step=np.arange(count) + done, seconds=np.full(count, seconds))
             blocks.append(rows | times)
             done += count
-            last = {name: float(np.mean(c[-1])) for name, c in blocks[-1].items()}
+            last = {name: _mean(c[-1], faults) for name, c in blocks[-1].items()}
             bar.update(count)
             bar.set_postfix(loss=f"{last['loss']:.4g}", refresh=False)
             is_due = done == steps or done - written >= every
@@ -292,6 +293,13 @@ def fit(
     else:
         outcome = _outcomes(state.fault)
     return Fitted(run.finished(state), history, outcome)
+
+
+def _mean(values: Any, faults: Any) -> float:
+    """The mean over the seeds, without those that diverged if others go on."""
+    goes_on = faults == 0
+    of_seeds = np.shape(values) == np.shape(goes_on) and goes_on.any()
+    return float(np.mean(values[goes_on] if of_seeds else values))
 
 
 @eqx.filter_jit

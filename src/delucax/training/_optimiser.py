@@ -1,7 +1,8 @@
 """Optax optimisers that can be compared, so that `fit` does not compile again."""
 
 import functools
-from types import CellType, FunctionType
+from collections.abc import Iterator
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import optax
@@ -11,14 +12,14 @@ class Optimiser:
     """An Optax optimiser. Two of them are equal if they were made in the same way.
 
     Each call of `optax.adam(1e-3)` makes new functions, for which JAX would compile
-    again. This class compares the code of the functions and the values in their
-    closures, so an equal optimiser uses the compiled programs of the first.
+    again. This class compares the code of the functions and the values that they read,
+    so an equal optimiser uses the compiled programs of the first.
     """
 
     def __init__(self, transformation: optax.GradientTransformation):
         self.init = transformation.init
         self.update = optax.with_extra_args_support(transformation).update
-        self._content = _content(transformation)
+        self._content = _content(transformation, {})
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Optimiser) and self._content == other._content
@@ -27,18 +28,36 @@ class Optimiser:
         return hash(self._content)
 
 
-def _content(value: Any, *inside: Any) -> Any:
+class _Itself:
+    """An object without a hash, which equals only itself."""
+
+    # It holds the object, so that no other one gets the same identity.
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Itself) and self.value is other.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+def _content(value: Any, seen: dict[int, int]) -> Any:
     """What to compare of `value`: the contents of a function or container, else the
-    object itself, or its identity if it has no hash."""
+    object itself. `seen` numbers the functions and containers by their identity."""
     # The type is part of it, because 1 equals True and 1.0.
     kind = type(value)
-    if any(value is other for other in inside):
-        return kind
-    parts = functools.partial(_contents, inside=(*inside, value))
+    if kind is FunctionType or isinstance(value, tuple | list | dict):
+        # Functions may call themselves and each other.
+        if id(value) in seen:
+            return kind, seen[id(value)]
+        seen[id(value)] = len(seen)
+    parts = lambda values: tuple(_content(one, seen) for one in values)
     if kind is FunctionType:
         cells = parts(map(_held, value.__closure__ or ()))
+        read = parts(_globals(value.__code__, value.__globals__))
         defaults = parts((value.__defaults__, value.__kwdefaults__))
-        return value.__code__, id(value.__globals__), cells, defaults
+        return value.__code__, id(value.__globals__), read, cells, defaults
     if kind is functools.partial:
         return kind, parts((value.func, value.args, value.keywords))
     if isinstance(value, tuple | list):
@@ -48,12 +67,19 @@ def _content(value: Any, *inside: Any) -> Any:
     try:
         hash(value)
     except TypeError:
-        return kind, id(value)
+        return kind, _Itself(value)
     return kind, value
 
 
-def _contents(values: Any, inside: tuple[Any, ...]) -> tuple[Any, ...]:
-    return tuple(_content(value, *inside) for value in values)
+def _globals(code: CodeType, given: dict[str, Any]) -> Iterator[Any]:
+    """The global values that a function may read, without modules."""
+    for name in code.co_names:
+        # Some of these names are of attributes. To compare too much does no harm.
+        if name in given and not isinstance(given[name], ModuleType):
+            yield given[name]
+    for part in code.co_consts:
+        if isinstance(part, CodeType):
+            yield from _globals(part, given)
 
 
 def _held(cell: CellType) -> Any:
