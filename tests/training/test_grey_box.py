@@ -52,6 +52,8 @@ def test_a_network_finds_the_friction_that_physics_leaves_out():
     assert fitted.model.system.vector_field(0.0, x, u, None)[0] == x[1]
     with user_error(match="corrected must be 'angle' or 'velocity', got 'v'"):
         sysid.grey_box(guess, test, "system.length", corrected=["v"], key=jr.key(0))
+    with user_error(match=r"share must be between 0 and 1, got 1\.0"):
+        sysid.grey_box(guess, test, "system.length", share=1.0, key=jr.key(0))
 
 
 def test_scales_and_offsets():

@@ -215,6 +215,10 @@ def test_bootstrap():
     assert_close(again.std, std, rtol=0.2)
     assert_close(again.low, fitted.low, atol=float(std))
     assert_close(again.high, fitted.high, atol=float(std))
+    # Windows whose states are all estimated leave half of the degrees of freedom.
+    short = sysid.physical(plant, record, "system.gain", window=2)
+    again = sysid.bootstrap(short, record, draws=200, key=jax.random.key(1))
+    assert_close(again.std, short.std, rtol=0.2)
     with user_error(match="block must be at most the 120 samples of the shortest"):
         drawn(block=121, key=jax.random.key(0))
     linear = sysid.linear(record)

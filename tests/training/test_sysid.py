@@ -139,6 +139,8 @@ def test_too_little_data_say_so():
     assert found.x0 is None
     with user_error(RuntimeError, match="(?s)^sysid.linear: .*not identifiable: "):
         sysid.linear(few)
+    with user_error(RuntimeError, match="(?s)^sysid.arx: .*not identifiable: "):
+        sysid.arx(few, outputs_back=1, controls_back=1)
     with user_error(match="more measurements than unknowns, got 6 for 2 parameters"):
         sysid.physical(GUESS, record(states[:3], controls[:2]), BOTH, window=1)
 

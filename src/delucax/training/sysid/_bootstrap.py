@@ -27,7 +27,7 @@ from ._physical import physical
 from ._record import Record, Records, records_of
 from ._sampled import Sampling, sampling_of
 from ._starts import estimated_starts, guessed_starts, simulated_records, stitched
-from ._windows import cut_into_windows
+from ._windows import begins_of, cut_into_windows
 
 
 _WHERE = "sysid.bootstrap"
@@ -178,8 +178,9 @@ def bootstrap(
     given = model, sampling, firsts, groups, rows, window
     outputs, residuals = _residuals(*given)
     # The fit made the residuals smaller than the noise; scale them up by the degrees
-    # of freedom that it used.
-    unknown = len(fitted.names) + x0.size
+    # of freedom that it used: the parameters, and a state at the start of each window.
+    begins = sum(len(begins_of(g, window)) * len(g.outputs) for g in groups)
+    unknown = len(fitted.names) + begins * x0.shape[-1]
     total = sum(map(len, records)) * outputs[0].shape[1]
     residuals = residuals * np.sqrt(total / max(total - unknown, 1))
     options: Any = dict(x0=x0, window=window, burn_in=fitted.burn_in)

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import (
+    as_number,
     check_choice,
     check_count,
     check_instance,
     check_key,
     check_positive,
-    check_range,
 )
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey
@@ -166,7 +166,8 @@ def grey_box(
     """
     check_instance(dynamics, Discretized, "dynamics", _WHERE)
     records = records_of(record, _WHERE)
-    check_range(share, "share", _WHERE, 0, 1)
+    if not 0 < as_number(share, "share", _WHERE) < 1:
+        raise ValueError(f"{_WHERE}: share must be between 0 and 1, got {share!r}.")
     for spread in spreads:
         check_positive(spread, "spreads", _WHERE)
     key = check_key(key, _WHERE)

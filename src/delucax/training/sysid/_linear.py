@@ -84,7 +84,7 @@ def linear(
         matrices = dict(A=estimate[:, :n], B=estimate[:, n : n + m])
         return matrices | (dict(x_next=estimate[:, -1]) if affine else {})
 
-    return _fitted(matrices_of, names, records, lags, affine, reach, throw)
+    return _fitted(matrices_of, names, records, lags, affine, reach, throw, where)
 
 
 def arx(
@@ -162,7 +162,7 @@ def arx(
     names = [f"y{i}(k-{lag})" for lag in lags[0] for i in range(p)]
     names += [f"u{i}(k-{lag})" for lag in lags[1] for i in range(m)]
     matrices_of = lambda estimate: _realised(estimate, p, m, a, b, delay)
-    return _fitted(matrices_of, names, records, lags, False, reach, throw)
+    return _fitted(matrices_of, names, records, lags, False, reach, throw, where)
 
 
 @eqx.filter_jit
@@ -236,6 +236,7 @@ def _fitted(
     affine: bool,
     reach: Array,
     throw: bool,
+    where: str,
 ) -> Identified:
     """Fit a linear model that predicts the outputs from the past at these lags."""
     lags = tuple(lags[0]), tuple(lags[1])
@@ -251,7 +252,7 @@ def _fitted(
         x0=None,
         result=RESULTS.successful,
     )
-    return checked(fit, throw, "sysid.linear")
+    return checked(fit, throw, where)
 
 
 def _realised(estimate, p, m, a, b, delay) -> dict[str, Any]:
