@@ -210,6 +210,13 @@ def test_moments_are_those_of_all_rows():
     assert_close(std, np.std(rows[valid], axis=0), rtol=1e-12)
 
 
+@once
+def test_the_deviation_of_a_small_quantity_is_known():
+    rows = jnp.stack([1e-6 * jnp.arange(4.0), jnp.full(4, 350.0)], axis=1)
+    moments = Moments.empty(jnp.zeros(2)).joined(rows, jnp.ones(4, bool))
+    assert_close(moments.std, [1e-6 * np.std(np.arange(4)), 1.0], rtol=1e-5)
+
+
 @needs_x64
 def test_ppo_learns():
     """From doing nothing nearly to the best."""
@@ -361,9 +368,21 @@ def test_log_probability_stands_for_an_entropy_that_is_not_known():
     assert model.policy.has_memory  # as no policy is asked what it remembers
     env = environment()
     ppo = PPO(env, 2, 3, epochs=1, minibatches=1)
-    memory, metrics, _ = started(ppo, model)
+    memory, metrics, slope = started(ppo, model)
     assert memory.rows.times.shape == (2, 3)
     assert_close(metrics["entropy"], -np.mean(memory.rows.log_prob), rtol=1e-5)
+    # The gradient of E[-log p] is that of -log p times -log p, as of any mean.
+    more = eqx.tree_at(lambda ppo: ppo.entropy_weight, ppo, jnp.asarray(1.0))
+    _, _, other = started(more, model)
+
+    def by_hand(policy):
+        given = memory.rows.observations, memory.rows.controls
+        score = lambda y, u: policy.log_prob(0.0, y, None, u)
+        log_prob = jax.vmap(jax.vmap(score))(*given)
+        return jnp.mean((jax.lax.stop_gradient(log_prob) + 1) * log_prob)
+
+    bonus = eqx.filter_grad(by_hand)(model.policy).gain
+    assert_close(other.policy.gain - slope.policy.gain, bonus, rtol=1e-3, atol=1e-5)
     assert not model_of().policy.has_memory
 
 

@@ -331,8 +331,9 @@ class Moments(NamedTuple):
     def std(self) -> Array:
         """The standard deviations, 1 for an entry that is nearly constant."""
         variance = self.squares / jnp.maximum(self.count, 1)
-        # A division by a tiny deviation would only amplify rounding.
-        some = variance > 1e-8
+        # A deviation of the size of rounding would only amplify rounding.
+        rounding = 16 * jnp.finfo(variance.dtype).eps * jnp.abs(self.mean)
+        some = variance > rounding**2
         return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 1)
 
 

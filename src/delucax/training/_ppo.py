@@ -186,6 +186,10 @@ class PPO(AbstractActorCriticLoss):
         # overflow: then a weight of zero still gives NaN in the gradient.
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
         ratio, advantages = jnp.exp(change), rows.advantages
+        if entropy is None:
+            # One sample estimates E[-log p(u)]. The weight makes its gradient right,
+            # although the controls were drawn from the old policy.
+            entropy = -ratio * log_prob
         clipped = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
         # The larger of the two, because these are costs. This is a pessimistic bound:
         # its gradient is zero once the ratio left the clip range towards a lower cost.
@@ -228,14 +232,12 @@ class PPO(AbstractActorCriticLoss):
         return jax.tree.map(lax.stop_gradient, rows), jnp.mean(runs.total_cost)
 
 
-def _scores(policy: Any, rows: Episodes) -> tuple[Array, Array]:
-    """The log-probability and the entropy at each step of each row."""
+def _scores(policy: Any, rows: Episodes) -> tuple[Array, Array | None]:
+    """The log-probability and the entropy at each step of each row; `None` for the
+    entropy if the policy has no formula for it."""
 
     def score(t, y, state, u):
-        log_prob, entropy = policy.log_prob(t, y, state, u), policy.entropy(t, y, state)
-        # If the policy has no formula for its entropy E[-log p(u)], one sample
-        # estimates it.
-        return log_prob, -log_prob if entropy is None else entropy
+        return policy.log_prob(t, y, state, u), policy.entropy(t, y, state)
 
     def act(t, y, state, u):
         return score(t, y, state, u), policy(t, y, state)[1]
