@@ -71,6 +71,24 @@ def test_a_learner_under_attack():
     assert found.total_cost > found.costs[0]
 
 
+def test_a_plant_that_runs_away_is_the_worst_case():
+    class Cubic(dlx.AbstractSystem):
+        state_names, control_names, disturbance_names = ("x", "y"), (), ("w",)
+
+        def vector_field(self, t, x, u, w):
+            return jnp.stack([x[1] - x[0], x[1] ** 3 + w[0]])
+
+    # The cost of an infinite state that has no weight is NaN.
+    cost = dlx.costs.Quadratic([1.0, 0.0], [])
+    env = dlx.Environment(dlx.Discretized(Cubic(), 0.1), cost, horizon=60)
+    zero = dlx.controllers.Zero(0)
+    options = dict(key=KEY, bound=0.3, x0=[0.0, 0.5], iterations=3, starts=4)
+    found = dlx.training.worst_case(env, zero, **options)
+    assert found.total_cost == np.inf
+    again = dlx.rollout(env, zero, key=KEY, x0=[0.0, 0.5], w=found.w, throw=False)
+    assert again.failed
+
+
 def test_the_value_of_the_game():
     """With both sides of the H-infinity game at their best, what the control pays less
     what the adversary spends is x0' X x0."""

@@ -288,7 +288,8 @@ def worst_case(
     - `starts`: the number of starts, 8 by default.
 
     **Returns:** a named tuple. `w`, shape `(horizon, k)`, are the disturbances, to use
-    in `rollout(..., w=w)`. `total_cost` is the total cost under these disturbances.
+    in `rollout(..., w=w)`. `total_cost` is the total cost under these disturbances,
+    infinite if they make the plant run away.
     `costs`, shape `(iterations + 1,)`, is the total cost at each iteration of the best
     start.
 
@@ -334,7 +335,9 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
 
     def total(w):
         options: Any = dict(key=run_key, horizon=horizon, x0=x0, keep=(), throw=False)
-        return rollout(environment, controller, w=w, **options).total_cost
+        cost = rollout(environment, controller, w=w, **options).total_cost
+        # A plant that runs away is the worst case, and NaN would lose all comparisons.
+        return jnp.where(jnp.isnan(cost), jnp.inf, cost)
 
     def on_sphere(g, old):
         norm = safe_norm(g, keepdims=True)
