@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 from typing import Any
 
 import jax
@@ -67,6 +68,34 @@ def test_steps_without_a_finite_control_do_not_count():
     options = dict(rounds=2, episodes=4, steps=100, progress=False)
     fitted = imitate(env(), Lost(), policy, key=KEY, **options)
     assert fitted.model.K[0, 0] > 0.1
+
+
+def test_a_constant_control_does_not_outweigh_the_others():
+    plant = dlx.LinearDynamics(0.9 * jnp.eye(2), jnp.eye(2))
+    cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(2))
+    start = dlx.environments.UniformState([-1.0, -1.0], [1.0, 1.0])
+    both = dlx.Environment(plant, cost, initial_state=start, horizon=10)
+    one = dlx.controllers.Linear(jnp.array([[1.0, 1.0], [0.0, 0.0]]))
+    policy = dlx.controllers.Linear(jnp.array([[0.0, 0.0], [0.01, 0.01]]))
+    options = dict(rounds=1, episodes=4, steps=5, progress=False)
+    fitted = imitate(both, one, policy, key=KEY, **options)
+    # The policy is nearly right about the second control from the beginning.
+    assert fitted.history.loss[0] < 10
+
+
+def test_a_round_that_diverged_is_not_forgotten(monkeypatch):
+    module = sys.modules[imitate.__module__]
+    results = iter([dlx.RESULTS.diverged, dlx.RESULTS.successful])
+
+    def fit(*args, **kwargs):
+        fitted = dlx.training.fit(*args, **kwargs)
+        return dataclasses.replace(fitted, result=next(results))
+
+    monkeypatch.setattr(module, "fit", fit)
+    policy = dlx.controllers.Linear(jnp.zeros((1, 2)))
+    options = dict(rounds=2, episodes=2, steps=2, progress=False)
+    fitted = imitate(env(), expert(), policy, key=KEY, **options)
+    assert fitted.result == dlx.RESULTS.diverged
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_instance, check_key
 from .._controller import AbstractController, check_controller, initial_state, replay
+from .._results import RESULTS
 from .._typing import PRNGKey
 from ..environments import Environment
 from ..simulation import rollout
@@ -65,7 +66,8 @@ def imitate(
     \lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \rVert^2$$
 
     Here $\pi_\theta$ is the policy, $u^*$ the expert, and $S$ the diagonal matrix of
-    the standard deviations of the expert's controls in the first round.
+    the standard deviations of the expert's controls in the first round. A control that
+    is nearly constant has the largest of these deviations.
 
     **Arguments:**
 
@@ -129,7 +131,7 @@ def imitate(
     capacity = rounds * episodes * horizon
     options["batch_size"] = min(batch_size, capacity)
     for k in range(rounds):
-        run_key, fit_key = jr.split(jr.fold_in(key, k))
+        run_key, order_key, fit_key = jr.split(jr.fold_in(key, k), 3)
         keys = jr.split(run_key, episodes)
         driver = policy if k else expert
         *new, counts = jax.device_get(
@@ -147,12 +149,17 @@ def imitate(
                     f"{_WHERE}: expert must have finite controls, got none in the "
                     "first round."
                 )
-            loss = _Likeness(jnp.asarray(np.maximum(controls.std(axis=0), 1e-6)))
+            loss = _Likeness(jnp.asarray(_spread(controls)))
         # The rows are repeated up to a fixed size, so that later rounds do not compile
-        # again.
-        whole = tuple(np.resize(r, (capacity, *r.shape[1:])) for r in rows)
+        # again. Which rows are repeated once more than the others is random.
+        order = jr.permutation(order_key, len(rows[0]))
+        at = np.resize(np.asarray(order), capacity)
+        whole = tuple(r[at] for r in rows)
         fitted = fit(loss, policy, optimiser, steps, key=fit_key, data=whole, **options)
-        policy, result = fitted.model, fitted.result
+        policy = fitted.model
+        # A failure in one round is not forgotten in the next.
+        if result is None or bool(result == RESULTS.successful):
+            result = fitted.result
         histories.append(fitted.history)
     return Fitted(policy, _one_after_another(histories), result)
 
@@ -176,6 +183,14 @@ def _watched(environment, driver, expert, keys, horizon):
         return times, y, controls, counts.astype(y.dtype)
 
     return [r.reshape(-1, *r.shape[2:]) for r in jax.vmap(episode)(keys)]
+
+
+def _spread(controls: np.ndarray) -> np.ndarray:
+    """The standard deviations of the controls. An entry that is nearly constant has the
+    largest of them: its own would outweigh the other entries."""
+    std = controls.std(axis=0)
+    most = std.max() or 1
+    return np.where(std > 1e-3 * most, std, most)
 
 
 def _one_after_another(histories: list[History]) -> History:
