@@ -158,6 +158,8 @@ def test_integers_and_numbers_are_actions():
             by_force = env.step(0.0, x, jnp.array([float(force)]))
             assert np.all(by_number.state == by_force.state)
             assert by_number.control == force
+    with user_error(match=r"floating-point numbers of shape \(1,\), got integers of"):
+        dlx.make("cartpole").step(0.0, jnp.zeros(4), jnp.array([1]))
     between = dlx.make("cartpole").step(0.0, jnp.zeros(4), jnp.array([3.0]))
     assert between.control == 3
 

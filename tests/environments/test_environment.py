@@ -173,6 +173,19 @@ def test_a_cost_that_is_no_scalar():
 
 
 @once
+def test_whole_numbers_are_clipped_as_numbers():
+    env = dlx.Environment(DYNAMICS, COST, control_bounds=(-0.5, 0.5), horizon=2)
+    assert env.saturate(jnp.array([1])) == 0.5
+
+    class Whole(dlx.AbstractController):
+        def __call__(self, t, y, state):
+            return jnp.array([1]), state
+
+    run = dlx.rollout(env, Whole(), key=jax.random.key(0))
+    assert run.incident_counts["clipped_control"] == 2
+
+
+@once
 def test_uniform_state():
     with user_error(match="low <= high"):
         dlx.environments.UniformState(jnp.ones(2), jnp.zeros(2))

@@ -231,6 +231,10 @@ def test_termination_holds_the_state_and_charges_the_end_once(key):
     assert_close(run.costs, [1, 1, 1, 0, 0, 0, 0, 0])
     assert run.length == 3 and run.final_cost == 300 and run.total_cost == 303
     assert list(np.asarray(run.terminated)) == [False] * 2 + [True] * 6
+    # A part has the final cost if the run ends in it.
+    parts = [run[0:2], run[2:3], run[3:8], run[0:3], run[1:8]]
+    assert [float(part.final_cost) for part in parts] == [0, 300, 0, 300, 300]
+    assert run[0:3].total_cost == 303 and run[3:8].total_cost == 0
     gradient = jax.grad(
         lambda u: dlx.rollout(env, dlx.controllers.Constant(u), key=key).total_cost
     )(jnp.ones(1))

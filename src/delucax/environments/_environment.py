@@ -328,7 +328,8 @@ class Environment(eqx.Module):
             if control.ndim != 0:
                 raise ValueError(
                     "Environment: u must be one integer action (a scalar) or a control "
-                    f"of shape ({self.control_size},), got shape {control.shape}."
+                    f"of floating-point numbers of shape ({self.control_size},), got "
+                    f"integers of shape {control.shape}."
                 )
             count = len(self.actions)
             if is_concrete(control) and not 0 <= int(control) < count:
@@ -339,6 +340,8 @@ class Environment(eqx.Module):
         if self.control_bounds is None:
             return control
         low, high = self.control_bounds
+        # Whole numbers become floats, because bounds need not be whole.
+        control = as_float_array(control)
         return clip(control, low, high).astype(control.dtype)
 
     def step(

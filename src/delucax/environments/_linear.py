@@ -189,6 +189,10 @@ def lds(
             )
         if A is None and C is not None:
             raise ValueError("lds: C needs A and B. For a random C, pass observations.")
+        if A is not None and observations is not None:
+            raise ValueError(
+                "lds: observations is only for random matrices. Pass C with A and B."
+            )
         if A is None:
             A, B, C = _random(key, states, controls, observations, spectral_radius)
         elif key is not None:

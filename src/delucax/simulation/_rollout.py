@@ -241,8 +241,11 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             x = jnp.where(done, lax.stop_gradient(x0), x)
         state = eqx.combine(memory, static)
         u, after = call_controller(controller, t, observed, state)
-        is_action = jnp.issubdtype(jnp.result_type(u), jnp.integer)
-        if env.actions is None or not is_action:
+        # The number of an action is not a control, and is never clipped.
+        is_action = env.actions is not None and jnp.issubdtype(
+            jnp.result_type(u), jnp.integer
+        )
+        if not is_action:
             check_control(u, controller, env.control_size, "environment")
         records = "events" in keep
         advance = dynamics.advance_with_events if records else dynamics.advance
@@ -263,7 +266,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         if "incidents" in keep:
             before, now = tallies(memory), tallies(after)
             incidents = {name: now[name] > before[name] for name in now}
-            if env.control_bounds is not None and eqx.is_inexact_array(u):
+            if env.control_bounds is not None and not is_action:
                 low, high = env.control_bounds
                 incidents["clipped_control"] = jnp.any((u < low) | (u > high))
         if done is not None:

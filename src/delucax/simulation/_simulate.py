@@ -19,7 +19,7 @@ from .._check import (
     finite_vector,
     is_concrete,
 )
-from .._controller import AbstractController, tallies
+from .._controller import AbstractController, initial_state, tallies
 from .._integration import (
     as_fixed_step_solver,
     check_method,
@@ -347,7 +347,7 @@ def _inputs(system, source, w, x0, t0, length, intervals, key, hold) -> Inputs:
     controls: Any = None
     memory: Any = None
     if isinstance(source, AbstractController):
-        memory = source.init(key=key)
+        memory = initial_state(source, key)
         if hold is None and jax.tree.leaves(memory):
             raise ValueError(
                 f"simulate: hold=None needs a controller without a state, got "

@@ -264,7 +264,9 @@ class Trajectory(eqx.Module):
             if incidents is not None and name in incidents:
                 elsewhere = (result == kind) & ~jnp.any(incidents[name])
                 result = choose(elsewhere, RESULTS.successful, result)
-        final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
+        # The run has its final cost at its own end, which may be before the last row.
+        has_end = (start < self.length) & (self.length <= stop)
+        final_cost = jnp.where(has_end, self.final_cost, 0)
         return dataclasses.replace(
             self,
             states=ends(self.states),
