@@ -41,10 +41,11 @@ class Attempt(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A policy in training: the method of its last gain (`"none"` before training), and
-    its costs."""
+    """A policy in training: the method of its last gain (`"none"` before training), its
+    costs, and the learning rates of the methods that did not gain at the first rate."""
 
     structure: str
     method: str
     policy: AbstractController
     costs: np.ndarray
+    rates: dict[str, float] = {}

@@ -51,8 +51,9 @@ _TOGETHER = 4
 # A round of training ends early if it has taken this share of the budget since its
 # first block, which compiles.
 _ROUND = 0.05
-# Initial learning rates of a round. The second one is used when no method gains.
-_RATE, _FINE_RATE = 2e-2, 2e-3
+# The initial learning rate of a method. It falls by the second number when the method
+# does not gain, and below the third the method is not used for this policy any more.
+_RATE, _SLOWER, _LEAST_RATE = 2e-2, 0.1, 1e-3
 # The usual cost before it is known, so large that no cost is far above it.
 _ANY = 1e30
 # The share of the budget for an attempt, after its first round, and for each policy of
@@ -114,7 +115,6 @@ class PolicySearch:
         # From the name of a method to the time constant of its damped gradient.
         damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
         self.methods = damped | {"gradient": jnp.inf, _EVOLUTION: None}
-        self.rate = _RATE
         # The least median cost so far, and its absolute value.
         self.least, self.usual = np.inf, _ANY
         # The longest step so far: a first round, which compiles, or a comparison.
@@ -198,10 +198,7 @@ class PolicySearch:
                 lines = [self.improve(line, share) for line in lines]
             share *= _FEWER
         for line in [*lines, *sorted(dropped, key=self.score)]:
-            self.rate = _RATE
-            after = self.improve(line)
-            self.rate = _FINE_RATE
-            self.improve(after)
+            self.improve(line)
 
     def warn_of_lost_starts(self) -> None:
         """Warn before the training if plants run away under all laws so far."""
@@ -281,7 +278,8 @@ class PolicySearch:
         given = self.environment, self.ranges, line.policy
         options: Any = dict(key=self.fresh_key(), callbacks=(is_over,))
         if method != _EVOLUTION:
-            return by_gradient(*given, self.methods[method], self.rate, **options)
+            rate = line.rates.get(method, _RATE)
+            return by_gradient(*given, self.methods[method], rate, **options)
         width = _WIDE if line.structure == "network" else _NARROW
         sigma = width if line.method == "none" else _NEAR
         return by_evolution(*given, sigma, self.usual, **options)
@@ -289,26 +287,35 @@ class PolicySearch:
     def improve(self, line: Line, seconds: float = np.inf) -> Line:
         """The line after some seconds of training, or when no method gains.
 
-        Each attempt uses the method with the largest gain in its last attempt.
+        Each attempt uses the method with the largest gain in its last attempt at this
+        rate. A method that was not tried at its rate comes before.
         """
         ends = self.seconds + seconds
-        # The method of the last gain comes first.
-        names = sorted(self.methods, key=lambda name: name != line.method)
+        # The method of the last gain comes first, then those with less damping.
+        names = sorted(reversed(self.methods), key=lambda name: name != line.method)
         gains = dict.fromkeys(names, np.inf)
-        while self.may_train and self.seconds < ends and max(gains.values()) > _GAIN:
-            method = max(gains, key=lambda method: gains[method])
-            after = self.attempt(line, method)
-            own = self.score(after)
-            gains[method] = (self.score(line) - own) / max(abs(own), 1e-12)
-            line = after
+        while self.may_train and self.seconds < ends:
+            left = [n for n in names if line.rates.get(n, _RATE) > _LEAST_RATE]
+            if not left:
+                break
+            method = max(left, key=lambda name: gains[name])
+            before, line = line, self.attempt(line, method)
+            gain = self.gain(before, line)
+            gains[method] = gain if gain > _GAIN else np.inf
         return line
+
+    def gain(self, before: Line, after: Line) -> float:
+        """How much the score fell, relative to its size."""
+        own = self.score(after)
+        return (self.score(before) - own) / max(abs(own), 1e-12)
 
     def attempt(self, line: Line, method: str) -> Line:
         """The line after some rounds of a method, or as it was if none is better."""
         began, best, ends, least = self.seconds, line, 0.0, np.inf
         while not ends or self.seconds < ends:
             policy = self.trained(best, method)
-            after = Line(line.structure, method, policy, self.costs(policy))
+            costs = self.costs(policy)
+            after = best._replace(method=method, policy=policy, costs=costs)
             if not ends:
                 # The first round compiles.
                 self.longest = max(self.longest, self.seconds - began)
@@ -322,6 +329,9 @@ class PolicySearch:
         self.tried.append(Attempt(line.structure, method, least, self.seconds - began))
         self.enter(best)
         self.show()
+        if self.gain(line, best) <= _GAIN:
+            slower = line.rates.get(method, _RATE) * _SLOWER
+            best = best._replace(rates=line.rates | {method: slower})
         return best
 
     def show(self) -> None:
@@ -376,9 +386,11 @@ class PolicySearch:
                 line._replace(costs=np.concatenate([line.costs, costs]))
                 for line, costs in zip(lines, more, strict=True)
             ]
-        for line in lines:
-            own = [other for other in lines if other.structure == line.structure]
-            self.best[line.structure] = min(own, key=self.score)
+        # Only these were compared on all initial states.
+        best: dict[str, Line] = {}
+        for line in sorted(lines, key=self.score):
+            best.setdefault(line.structure, line)
+        self.best = best
 
     def chosen(self) -> tuple[str, AbstractController]:
         """The best policy, or zero control or the LQR if they are about as good."""
