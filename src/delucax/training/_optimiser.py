@@ -47,7 +47,7 @@ def _content(value: Any, seen: dict[int, int]) -> Any:
     object itself. `seen` numbers the functions and containers by their identity."""
     # The type is part of it, because 1 equals True and 1.0.
     kind = type(value)
-    if kind is FunctionType or isinstance(value, tuple | list | dict):
+    if issubclass(kind, FunctionType | tuple | list | dict):
         # Functions may call themselves and each other.
         if id(value) in seen:
             return kind, seen[id(value)]

@@ -153,10 +153,11 @@ def synthesise(
         and of a quarter, and then it is not damped. The second way is
         [`delucax.training.evolve`][], which needs no gradient. If neither the first two
         trials nor a plan is better than the LQR, the search returns the LQR.
-    3. Refinement. The better half of the trained policies is trained further, with the
-        methods that still lower their cost, until one of them is left. When no method
-        lowers its cost any more, the learning rate is reduced to a tenth, and after
-        that the search continues with the next best policy.
+    3. Refinement. The better half of the trained policies is trained further, until one
+        of them is left, and then the others if time is left. The method that lowered
+        the cost most comes first. If a method does not lower the cost any more, its
+        learning rate is reduced to a tenth once, and then it is not used any more for
+        this policy.
     4. Choice. The candidates are the four best policies and the baselines. The
         criterion is the mean cost over up to 512 initial states that were not used for
         training. In this mean, a cost above 20 times the usual cost grows only
