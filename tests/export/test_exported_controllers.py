@@ -88,6 +88,28 @@ def test_answer_to_bad_numbers(tmp_path, fallback):
         assert program.flag == (1 if np.isinf(bad[0]) else 2)
 
 
+class Late(dlx.AbstractController):
+    """The control is the observation of the step before."""
+
+    size: int
+
+    def init(self, *, key=None):
+        return jnp.zeros(self.size)
+
+    def __call__(self, t, y, state):
+        return state, y
+
+
+@pytest.mark.parametrize("size", [2, 10])
+def test_a_control_that_is_the_old_state(tmp_path, size):
+    export.c(Late(size), tmp_path, name="late", example=np.zeros(size))
+    program = load(tmp_path, "late").running()
+    for k in range(3):
+        np.testing.assert_array_equal(program.step(0.0, np.full(size, k + 1.0)), k)
+    np.testing.assert_array_equal(program.step(0.0, np.full(size, np.nan)), 2)
+    assert program.flag == 1
+
+
 def counted(x):
     """Errors on whole numbers and booleans, one in a loop, of which no NaN is left."""
     k = eqx.error_if(jnp.array(3), x[0] > 1, "It is too large.")

@@ -177,10 +177,10 @@ def _step(traced, name, state, last, fallback, shared, most):
     u = ready(program, u)
     changed, values, tested = _changed(program, traced, places, after)
     leave_unless(finite_test(program, [u, *tested]), "BAD_RESULT")
-    program.put_all(changed, values)
-    program.fill(answer, u)
     if last is not None:
         program.fill(kept, u)
+    # The control may be a part of the old state, so both are set at once.
+    program.put_all([*changed, answer], [*values, u])
     real = f"{name}_real"
     signature = (
         f"int {name}_step({name}_state *state, {real} t, const {real} *y, {real} *u)"
