@@ -205,6 +205,8 @@ ARRAYS = {
         np.arange(9.0 * x.shape[1]).reshape(9, -1) @ jnp.sin(x[0]),
     ),
     "order": lambda x: (
+        jnp.argsort(x > 0),
+        jnp.sort(jnp.round(x).astype(jnp.int32), axis=0),
         jnp.sort(x),
         jnp.argsort(x, axis=0),
         lax.sort((jnp.round(x), x), num_keys=2),

@@ -18,7 +18,24 @@ def suffix(dtype: Any) -> str:
     return "b" if dtype.kind == "b" else f"{dtype.kind}{8 * dtype.itemsize}"
 
 
+_ORDER = """
+/* The ascending order of n keys. NaN comes last. Equal keys keep their order. */
+static void order_S(int n, const T *key, int step, int32_t *order) {
+  for (int i = 1; i < n; ++i) {
+    const int32_t moved = order[i];
+    const T x = key[moved * step];
+    int k = i;
+    for (; k > 0; --k) {
+      const T y = key[order[k - 1] * step];
+      if (x >= y || x != x) break;
+      order[k] = order[k - 1];
+    }
+    order[k] = moved;
+  }
+}"""
+
 _SCALAR = {
+    "order": _ORDER,
     "square": "static T square_S(T x) { return x * x; }",
     "one_minus_square": """
 static T one_minus_square_S(T x) { return (1 - x) * (1 + x); }""",
@@ -73,6 +90,8 @@ static T rounded_S(T x, int bits) {
 }
 
 _INTEGER = {
+    # Without the test for NaN: Clang warns of an integer compared with itself.
+    "order": _ORDER.replace(" || x != x", ""),
     "square": "static T square_S(T x) { return (T)(1u * (U)x * (U)x); }",
     "maximum": "static T maximum_S(T a, T b) { return a > b ? a : b; }",
     "minimum": "static T minimum_S(T a, T b) { return a < b ? a : b; }",
@@ -113,22 +132,6 @@ _UNSIGNED = _INTEGER | {
 static T shift_signed_S(T a, T n) { return n < 8 * sizeof(T) ? (T)(a >> n) : 0; }""",
 }
 
-_ORDER = """
-/* The ascending order of n keys. NaN comes last. Equal keys keep their order. */
-static void order_S(int n, const T *key, int step, int32_t *order) {
-  for (int i = 1; i < n; ++i) {
-    const int32_t moved = order[i];
-    const T x = key[moved * step];
-    int k = i;
-    for (; k > 0; --k) {
-      const T y = key[order[k - 1] * step];
-      if (!(x < y || (y != y && x == x))) break;
-      order[k] = order[k - 1];
-    }
-    order[k] = moved;
-  }
-}"""
-
 _THREEFRY = """
 /* Threefry-2x32, JAX's random generator: two words from a key and a counter. */
 static uint64_t threefry_S(T key0, T key1, T x, T y) {
@@ -149,7 +152,6 @@ static uint64_t threefry_S(T key0, T key1, T x, T y) {
 }"""
 
 _OTHERS = {
-    "order": _ORDER,
     "threefry": _THREEFRY,
     "cholesky": """
 /* The lower Cholesky factor. All NaN if the matrix is not positive definite. */
@@ -304,7 +306,7 @@ def routine(name: str, dtype: Any, out: Any = None) -> tuple[str, str]:
 
 def _typed(text: str, dtype: np.dtype, label: str | None = None) -> str:
     words = {"_S(": f"_{label or suffix(dtype)}("}
-    kind, function = c_type(dtype), "f" if dtype == np.float32 else ""
+    kind, function = c_type(dtype, stored=True), "f" if dtype == np.float32 else ""
     for name in "fabs log sqrt exp erf erfc floor tan ldexp frexp rint".split():
         words[f"{name}F("] = f"{name}{function}("
     for old, new in words.items():
