@@ -238,7 +238,7 @@ static void reflections_S(int m, int n, T *a, T *tau) {
     tau[k] = 0;
     if (rest == 0) continue;
     const T alpha = a[k * n + k], norm = sqrtF(alpha * alpha + rest);
-    const T beta = alpha > 0 ? -norm : norm;
+    const T beta = -copysignF(norm, alpha);
     tau[k] = (beta - alpha) / beta;
     a[k * n + k] = beta;
     for (int i = k + 1; i < m; ++i) a[i * n + k] /= alpha - beta;
@@ -307,7 +307,8 @@ def routine(name: str, dtype: Any, out: Any = None) -> tuple[str, str]:
 def _typed(text: str, dtype: np.dtype, label: str | None = None) -> str:
     words = {"_S(": f"_{label or suffix(dtype)}("}
     kind, function = c_type(dtype, stored=True), "f" if dtype == np.float32 else ""
-    for name in "fabs log sqrt exp erf erfc floor tan ldexp frexp rint".split():
+    names = "fabs log sqrt exp erf erfc floor tan ldexp frexp rint copysign"
+    for name in names.split():
         words[f"{name}F("] = f"{name}{function}("
     for old, new in words.items():
         text = text.replace(old, new)
