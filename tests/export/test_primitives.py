@@ -241,6 +241,10 @@ ARRAYS = {
         jax.grad(lambda x: halved(x) ** 2)(x[0, 0]),
     ),
     "wrapped": lambda x: (jax.jit(jnp.sin)(x), jax.checkpoint(jnp.cos)(x)),
+    "beyond": lambda x: (
+        jnp.full(x.shape, jnp.nan).astype(jnp.int32) + (x > 0),
+        jnp.concatenate([x[0], jnp.array([jnp.inf, -jnp.inf, 1e9])]).astype(jnp.int16),
+    ),
     "ramps": lambda x: (
         jnp.arange(9) * x[0, 0],
         jnp.eye(*x.shape) + x,

@@ -229,6 +229,10 @@ def _selected(given: list[Expr]) -> Expr:
 def _converted(given: Expr, out: np.dtype, shared: Any) -> Expr:
     if given.dtype == out:
         return given
+    if given.dtype.kind == "f" and out.kind in "iu":
+        # Known numbers too, because NumPy converts NaN and infinity differently.
+        name = shared.routine("to_integer", given.dtype, out)
+        return Expr(f"{name}({given.text})", out, given.reads, given.cost + 1)
     if given.value is not None:
         with np.errstate(all="ignore"):
             return literal(np.asarray(given.value).astype(out), out)
@@ -239,9 +243,6 @@ def _converted(given: Expr, out: np.dtype, shared: Any) -> Expr:
         return given._replace(
             text=f"({given.text} != 0)", dtype=out, low=0, high=1, cost=given.cost + 1
         )
-    if given.dtype.kind == "f" and out.kind in "iu":
-        name = shared.routine("to_integer", given.dtype, out)
-        return Expr(f"{name}({given.text})", out, given.reads, given.cost + 1)
     if out.kind in "iu":
         limits = np.iinfo(out)
         if low < limits.min or high > limits.max:
