@@ -33,6 +33,10 @@ def printed(x):
     return x
 
 
+def total(a, b):
+    return a + b + a * b
+
+
 def filtered(x):
     return eqx.filter_pure_callback(lambda x: x, x, result_shape_dtypes=x)
 
@@ -56,6 +60,16 @@ REFUSED = [
     ),
     ("convert_element_type", lambda x: jnp.fft.fft(x).real, "no type for complex"),
     ("igamma", lambda x: jax.scipy.special.gammainc(x, x), "not implemented in C"),
+    (
+        "reduce",
+        lambda x: lax.reduce(x, x.dtype.type(0), total, (0,)),
+        "not implemented in C",
+    ),
+    (
+        "reduce_window",
+        lambda x: lax.reduce_window(x, x.dtype.type(0), total, (2,)),
+        "not implemented in C",
+    ),
 ]
 
 

@@ -88,7 +88,9 @@ def _added(eqn: Any, ins: list[Atom], block: Block, where: str) -> Sequence[Atom
     inner = next((params[name] for name in _CALLS if name in params), None)
     if inner is not None:
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-        return _inlined(closed, ins, block, where)
+        # The function of a reduction takes scalars, so a reduction is no call.
+        if [form(v.aval)[0] for v in closed.jaxpr.invars] == [a.shape for a in ins]:
+            return _inlined(closed, ins, block, where)
     if op == "platform_index":
         platforms = params["platforms"]
         # The branch for all platforms uses no operation that only XLA has.
