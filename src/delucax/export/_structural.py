@@ -195,17 +195,10 @@ def pad(e, node, x, fill):
     return place
 
 
-def iota(e, node):
-    out, axis = node.outs[0], node.params["dimension"]
-    at = lambda i: i[axis].expr(out.dtype)
-    return e.formula(out.shape, out.dtype, at, (), 0)
-
-
 RULES: dict[str, Any] = {
     "broadcast_in_dim": broadcast,
     "reshape": reshape,
     "squeeze": reshape,
-    "expand_dims": reshape,
     "tile": tile,
     "transpose": transpose,
     "slice": slice_,
@@ -215,5 +208,4 @@ RULES: dict[str, Any] = {
     "stack": stack,
     "concatenate": concatenate,
     "pad": pad,
-    "iota": iota,
 }
