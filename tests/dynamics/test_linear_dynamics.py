@@ -37,8 +37,9 @@ def test_affine_map_and_sensor():
     expected = jnp.array([2.0, 3.0]) + A @ (x - 1) + B @ (u - 1) + E @ w
     assert_close(dynamics(0.0, x, u, w), expected, rtol=1e-6)
     assert_close(dynamics.observe(0.0, x), [2.0])
-    assert dynamics.disturbance_size == 1
+    assert dynamics.disturbance_size == 1 and dynamics.noise is None
     rest = dlx.LinearDynamics(A, B, x_ref=jnp.ones(2))
+    assert rest.noise == "additive"
     assert_close(rest(0.0, jnp.ones(2), jnp.zeros(1)), [1, 1], rtol=1e-6)
 
 

@@ -275,6 +275,14 @@ def test_a_plant_with_events(tmp_path):
     np.testing.assert_allclose(states, expected, atol=tolerance(1e-5, 1e-12))
 
 
+def test_a_linear_plant_with_a_matrix_of_its_disturbance(tmp_path):
+    plant = dlx.LinearDynamics(A, B, E=[[1.0], [0.5]])
+    export.c(plant, tmp_path, name="plant")
+    x, u, w = np.ones(2), np.full(1, 2.0), np.full(1, 3.0)
+    expected = A @ x + B @ u + [3.0, 1.5]
+    np.testing.assert_allclose(export.load(tmp_path)(0.0, x, u, w), expected, rtol=1e-6)
+
+
 def test_a_corrected_regulator_keeps_its_cost(tmp_path):
     env = dlx.make("pendulum", horizon=50)
     scaled = dlx.controllers.Standardise(jnp.full(3, 0.1), jnp.full(3, 2.0), env.encode)

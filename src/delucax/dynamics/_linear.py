@@ -1,7 +1,7 @@
 """Linear dynamics in discrete time."""
 
 from dataclasses import KW_ONLY
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -117,6 +117,12 @@ class LinearDynamics(AbstractDynamics):
     def disturbance_size(self) -> int:
         """The number of columns of `E`; the size of the state by default."""
         return self.state_size if self.E is None else self.E.shape[-1]
+
+    @property
+    def noise(self) -> Literal["additive"] | None:
+        """`None` if `E` is given, by which `w` enters the equations; otherwise
+        `"additive"`."""
+        return "additive" if self.E is None else None
 
     @property
     def observes_state(self) -> bool:
