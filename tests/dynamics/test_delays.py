@@ -239,6 +239,15 @@ def test_derivatives_with_respect_to_a_delay_of_the_state():
     assert_gradient(cost, np.array(0.73), rtol=1e-7)
 
 
+def test_a_delay_of_many_steps():
+    """The rounding of single precision grows with their number."""
+    for tau in (0.6, 1.1, 1.2):
+        steps = dlx.dynamics.MethodOfSteps(Lag(delays=[tau]), dt=0.01)
+        assert steps.memory == round(100 * tau)
+        _, result = steps.advance(0.0, steps.filled([1.0]), jnp.zeros(1), None)
+        assert bool(result == dlx.RESULTS.successful)
+
+
 def test_a_given_past():
     steps = dlx.dynamics.MethodOfSteps(Lag(delays=[np.pi / 2]), dt=np.pi / 40)
     # `x' = -x(t - pi / 2)` has the solution `sin(t)`.

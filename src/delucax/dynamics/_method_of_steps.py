@@ -21,6 +21,7 @@ from ._base import Forwarding
 
 
 _PARTS = "start", "slope_at_start", "end", "slope_at_end"
+_SLACK = 1e-6  # relative: the rounding of a quotient that should be whole
 
 
 class MethodOfSteps(Forwarding):
@@ -104,8 +105,7 @@ class MethodOfSteps(Forwarding):
             )
         if known and not (np.size(delays) and np.all(np.asarray(delays) > 0)):
             raise ValueError(f"{where}: delays must be positive, got {delays}.")
-        # The slack absorbs the rounding of a quotient that should be whole.
-        up = lambda ratio: max(1, int(np.ceil(float(ratio) * (1 - 1e-6))))
+        up = lambda ratio: max(1, int(np.ceil(float(ratio) * (1 - _SLACK))))
         if self.substeps is None:
             self.substeps = up(self.dt / np.min(delays))
         self.substeps = check_count(self.substeps, "substeps", where)
@@ -201,9 +201,9 @@ class MethodOfSteps(Forwarding):
 
     def _is_beyond(self, delays: Array) -> Array:
         ratio = delays / self._step
-        slack = 1e-6  # for the rounding of a ratio that should be whole
-        most = (self.memory or 0) + slack
-        return jnp.any((ratio < 1 - slack) | (ratio > most))
+        slack = 2 * _SLACK  # so that what the constructor chooses is within it
+        beyond = ratio > (self.memory or 0) * (1 + slack)
+        return jnp.any((ratio < 1 - slack) | beyond)
 
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
