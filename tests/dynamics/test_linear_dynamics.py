@@ -158,6 +158,16 @@ def test_bad_arguments(make, match):
         make()
 
 
+class Inverse(dlx.AbstractDynamics):
+    """Its state is finite again after it was infinite."""
+
+    state_names, control_names = ("x",), ("u",)
+    dt: jax.Array = dlx.parameter(1.0)
+
+    def advance(self, t, x, u, w):
+        return 1 / x, dlx.RESULTS.successful
+
+
 def test_open_loop():
     dynamics = dlx.LinearDynamics(A, B)
     controls = jnp.ones((3, 1))
@@ -181,3 +191,5 @@ def test_open_loop():
     unstable = dlx.LinearDynamics(1e30 * jnp.eye(2), B)
     with pytest.raises(Exception, match="NaN or infinite"):
         dlx.open_loop(unstable, jnp.ones(2), jnp.ones((20, 1)))
+    with pytest.raises(Exception, match="NaN or infinite"):
+        dlx.open_loop(Inverse(), jnp.zeros(1), jnp.ones((2, 1)))

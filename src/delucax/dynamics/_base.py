@@ -237,8 +237,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
     steps = jnp.arange(controls.shape[0])
     last, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
     states = stack_steps(parts, size, last)
-    # NaN propagates, so it is enough to check the last state.
-    finite = jnp.all(jnp.isfinite(states[-1]))
+    finite = jnp.all(jnp.isfinite(states))
     end = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)
     return result.error_if(states, result != RESULTS.successful)
