@@ -163,6 +163,15 @@ def test_wrong_choices_are_named():
             moved(trainable)
 
 
+def test_wrong_ends_are_named():
+    for low, high, match in (
+        (1, 1, "low must be below high, got 1.0 and 1.0"),
+        (0, np.inf, "low and high must be finite, got 0.0 and inf.*delucax.positive"),
+    ):
+        with user_error(match=match):
+            dlx.bounded(low, high)
+
+
 def test_nothing_marked_says_what_could_be():
     with user_error(
         match="nothing in Plant is trainable: no field is marked .*'mass', 'friction'"

@@ -93,10 +93,10 @@ class bounded(AbstractConstraint):
 
     **Arguments:**
 
-    - `low`: the lower end, a number.
-    - `high`: the upper end, a number above `low`.
+    - `low`: the lower end, a finite number.
+    - `high`: the upper end, a finite number above `low`.
 
-    **Raises:** `ValueError` if `low` is not below `high`.
+    **Raises:** `ValueError` if `low` is not below `high`, or an end is not finite.
 
     !!! example
 
@@ -127,6 +127,11 @@ class bounded(AbstractConstraint):
         low, high = self.low, self.high
         if not low < high:
             raise ValueError(f"bounded: low must be below high, got {low} and {high}.")
+        if not np.all(np.isfinite([low, high])):
+            raise ValueError(
+                f"bounded: low and high must be finite, got {low} and {high}. For "
+                "values above zero without an upper end, use delucax.positive."
+            )
 
     def constrain(self, z: Array) -> Array:
         value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
