@@ -130,6 +130,10 @@ def test_wrong_arguments():
         lung.run_breaths(lung.SimulatedRunner(ENV, key=KEY), print)
     with user_error(match="must be a task of a lung"):
         lung.SimulatedRunner(dlx.make("pendulum"), key=KEY)
+    runner = lung.SimulatedRunner(ENV, key=KEY)
+    with user_error(match=r"both valves, shape \(2,\), got shape \(1,\)\. lung.Breath"):
+        lung.run_breaths(runner, dlx.controllers.Zero(1))
+    assert runner.is_clean and runner.steps == 100  # of the clean-up alone
 
 
 def test_every_breath_begins_alike():

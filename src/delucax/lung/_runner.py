@@ -236,7 +236,7 @@ def run_breaths(
         the controls of the clean-up.
 
     **Raises:** `ValueError` if `runner` is not a runner, `controller` is not a
-        controller, or a control is not finite.
+        controller of both valves, or a control is not finite.
 
     !!! example
 
@@ -269,6 +269,12 @@ def run_breaths(
         state = controller.init(key=key)
         # Compile now, not while a valve stands open.
         u, _ = _act(controller, jnp.asarray(0.0), jnp.array([0.0]), state)
+        if u.shape != (2,):
+            raise ValueError(
+                f"{where}: controller must return the controls of both valves, shape "
+                f"(2,), got shape {u.shape}. lung.Breathing makes such a controller "
+                "from a controller of the inspiratory valve."
+            )
         _applied(controller, jnp.array([0.0, 0.0]), state)
         for k in range(steps):
             pressure = float(runner.observe())
