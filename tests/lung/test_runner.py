@@ -10,6 +10,7 @@ from helpers import assert_close, CountCalls, once, user_error
 
 import delucax as dlx
 from delucax import lung
+from delucax._check import check_key
 
 
 pytestmark = once
@@ -148,6 +149,24 @@ def test_every_breath_begins_alike():
     assert_close(
         run.controls[50:100, 0], 5 * (1 - np.exp(5 * (1.5 - times))), atol=1e-3
     )
+
+
+class Drawn(dlx.AbstractController):
+    """A control that is drawn, and then halves."""
+
+    def init(self, *, key=None):
+        return jax.random.uniform(check_key(key, "Drawn"))
+
+    def __call__(self, t, y, state):
+        return jnp.reshape(state, (1,)), state / 2
+
+
+def test_every_breath_begins_with_the_state_that_was_drawn():
+    u_in = closed_loop(lung.Breathing(Drawn(), WAVEFORM)).controls[:, 0]
+    drawn = u_in[0]
+    assert drawn > 0
+    assert_close(u_in[:5], drawn * 0.5 ** np.arange(5))
+    assert_close(u_in[100:105], u_in[:5])
 
 
 class Counting(dlx.AbstractController):

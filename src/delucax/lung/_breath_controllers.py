@@ -18,6 +18,7 @@ from ._waveform import BreathWaveform, check_waveform
 
 class _Phases(NamedTuple):
     inner: PyTree
+    first: PyTree
     valve: PyTree
     inhaling: Array
 
@@ -80,12 +81,13 @@ class Breathing(AbstractController):
         if self.valve is not None:
             key, valve_key = (None, None) if key is None else jr.split(key)
             valve = self.valve.init(key=valve_key)
-        return _Phases(self.inspiratory.init(key=key), valve, jnp.zeros((), bool))
+        first = self.inspiratory.init(key=key)
+        return _Phases(first, first, valve, jnp.zeros((), bool))
 
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         inhale = self.waveform.is_inspiration(t)
         begins = inhale & ~state.inhaling
-        inner = _where(begins, self.inspiratory.init(key=None), state.inner)
+        inner = _where(begins, state.first, state.inner)
         u_in, after = self.inspiratory(t, y, inner)
         # The valve opens with a time constant of 0.2 s.
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
@@ -95,7 +97,8 @@ class Breathing(AbstractController):
         if self.valve is not None:
             (u_out,), valve = self.valve(t, y, state.valve)
         u = jnp.stack([u_in, u_out]).astype(y.dtype)
-        return u, _Phases(_where(inhale, after, inner), valve, inhale)
+        inner = _where(inhale, after, inner)
+        return u, _Phases(inner, state.first, valve, inhale)
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         inner = self.inspiratory.applied(u[:1], cost, state.inner)
