@@ -136,6 +136,8 @@ def test_wrong_numbers_are_named():
         lung.learned_lung(MODEL, limit=-1.0)
     with user_error(match="sensor_delay must be a whole number of at least 0, got -1"):
         lung.single_compartment(sensor_delay=-1)
+    with user_error(match="learned_lung: sensor_delay cannot be given .* model, 2 st"):
+        lung.learned_lung(MODEL, sensor_delay=5)
     with user_error(match="'sensor_dely'; did you mean 'sensor_delay'"):
         lung.single_compartment(sensor_dely=1)
     for env in (MODEL, ENV):

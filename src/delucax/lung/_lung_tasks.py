@@ -247,7 +247,8 @@ def learned_lung(
 
     **Returns:** a [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if `model` has another type, or if a number is invalid.
+    **Raises:** `ValueError` if `model` has another type, if a number is invalid, or if
+    `sensor_delay` is given for a [`delucax.lung.LungModel`][].
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -268,6 +269,11 @@ def learned_lung(
     if model is None:
         model = load(Path(__file__).with_name("learned_lung.dlx"))
     if isinstance(model, LungModel):
+        if "sensor_delay" in options:
+            raise ValueError(
+                f"{where}: sensor_delay cannot be given for a LungModel, because the "
+                f"sensor has the delay of the model, {model.dynamics.sensor} steps."
+            )
         # The task adds the sensor, and then the delay: take the dynamics without it.
         options |= dict(sensor_delay=model.dynamics.sensor)
         dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
