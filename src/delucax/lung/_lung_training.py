@@ -172,7 +172,11 @@ def breath_error(
     pips: Any = PIPS,
     horizon: int = LENGTH,
 ) -> Array:
-    """The mean absolute error of the pressure under a controller.
+    """The mean absolute error of the pressure under a controller, weighed by the task.
+
+    Each step counts by the cost of the task, a [`delucax.lung.BreathCost`][]. So a
+    step of the expiratory phase counts with `expiration_weight`, 0 by default. With
+    a `limit`, a pressure above it counts more.
 
     **Arguments:**
 
@@ -185,8 +189,9 @@ def breath_error(
     - `horizon`: the number of steps per episode, 29 by default, which is 0.87 s of an
         inspiration.
 
-    **Returns:** the mean of $|p - r|$ over the steps of each episode [cmH2O], shape
-        `(pips,)`. The error is NaN if a simulation failed.
+    **Returns:** the mean cost of the steps of each episode [cmH2O], shape `(pips,)`.
+        For the default `horizon` and a task without `limit` it is the mean of
+        $|p - r|$. The error is NaN if a simulation failed.
 
     **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
     below PEEP).
