@@ -167,6 +167,16 @@ def test_tuned_pids_are_the_best_that_were_tried(tmp_path, monkeypatch):
     assert jnp.all(own <= alike + 1e-3) and jnp.all(own < 10)
 
 
+def test_a_pid_that_diverges_is_not_the_best(monkeypatch):
+    gains, errors = np.arange(9.0).reshape(3, 3), [[np.nan, 2, 1], [np.nan, 1, 2.5]]
+    found = jnp.asarray(gains), jnp.asarray(errors)
+    monkeypatch.setattr(lung, "pid_grid", lambda envs, **options: found)
+    envs = stack([lung.single_compartment()] * 2)
+    trainer = Trainer(envs, lung.BreathWaveform(), FULL, KEY, print)
+    best = _contenders.searched_pids(envs, trainer)
+    assert best["PID"].kp.tolist() == [6.0, 3.0] and best["PID for all"].kp == 3.0
+
+
 @pytest.mark.parametrize("name, most", [("PID", 0.2), ("LeakyPID", 4.0)])
 def test_pids_are_drawn_over_orders_of_magnitude(name, most):
     kind, waveform = getattr(dlx.controllers, name), lung.BreathWaveform()

@@ -443,7 +443,7 @@ def pid_grid(
         envs = eqx.filter_vmap(task)(jnp.array([5.0, 20.0]))
         few = dict(kp=[0.5, 1.0], ki=[1.0], pips=[20.0])
         gains, errors = lung.pid_grid(envs, key=jax.random.key(0), **few)
-        best_in_each_lung = gains[jnp.argmin(errors, axis=1)]
+        best_in_each_lung = gains[jnp.nanargmin(errors, axis=1)]
         ```
     """
     where = "pid_grid"

@@ -140,7 +140,9 @@ def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | P
     key, true = jr.fold_in(trainer.key, 6), dict[str, Any](TRUE_PID, kind="true")
     for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
         grid, errors = lung.pid_grid(envs, key=key, **options)
-        own, of_all = jnp.argmin(errors, axis=1), jnp.argmin(jnp.mean(errors, axis=0))
+        # The error is NaN where a simulation failed.
+        of_all = jnp.nanargmin(jnp.mean(errors, axis=0))
+        own = jnp.nanargmin(errors, axis=1)
         best[name] = stack([trainer.pid(kind, gains) for gains in grid[own]])
         best[f"{name} for all"] = trainer.pid(kind, grid[of_all])
     return best
