@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, once, user_error
 
@@ -49,6 +50,34 @@ def test_violation_of_every_kind():
         constraints = dlx.planning.Constraints(**given)
         narrow = dataclasses.replace(problem, constraints=constraints)
         assert narrow.simulate(plan).violation >= least - 1e-6
+
+
+class Driven(dlx.systems.Pendulum):
+    """A pendulum whose torque grows with time."""
+
+    def vector_field(self, t, x, u, w):
+        return super().vector_field(t, x, u + t, w)
+
+
+@once
+def test_steps_of_several_lengths():
+    """They are those of the inner dynamics, with its time and its disturbance."""
+    widths = np.array([0.1, 0.3, 0.2])
+    inner = dlx.Discretized(Driven(), dt=1.0, substeps=4)
+    sampled = dlx.problems.Sampled(inner, jnp.asarray(widths), dt=2.0)
+    x, w = jnp.array([0.1, 0.0]), jnp.full((3, inner.disturbance_size), 0.5)
+    states = dlx.open_loop(sampled, x, jnp.zeros((3, 1)), w=w)
+    for k, t in enumerate((0.0, 0.1, 0.4)):
+        step = dlx.Discretized(Driven(), dt=widths[k], substeps=4)
+        x = step(t, x, jnp.zeros(1), w[k])
+        assert_close(states[k + 1], x, rtol=1e-5)
+    turned = sampled.difference(jnp.array([2 * np.pi, 0.0]), jnp.zeros(2))
+    assert sampled.angle_names == inner.angle_names and abs(turned[0]) < 1e-5
+    fine = sampled.refined(2, lambda inner: inner)
+    halves = dlx.open_loop(fine, states[0], jnp.zeros((6, 1)))
+    assert_close(fine.dt, 1.0)
+    alone = dlx.open_loop(sampled, states[0], jnp.zeros((3, 1)))
+    assert_close(halves[::2], alone, rtol=1e-4)
 
 
 @once

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from .._module import indexed_names, parameter
 from .._results import Result
-from .._typing import Control, Disturbance, RealScalar, State, Time
+from .._typing import Control, Disturbance, Observation, RealScalar, State, Time
 from ..costs import AbstractCost
-from ..dynamics import AbstractDynamics, Discretized
+from ..dynamics import AbstractWrapper, Discretized
 from ..planning import Unknowns
 from ..systems import AbstractSystem
 from ._base import OptimalControl
@@ -62,16 +62,20 @@ class Reactions(AbstractSystem):
         return self.function(self.rates, x)
 
 
-class Sampled(AbstractDynamics):
+class Sampled(AbstractWrapper):
     """A discretised system whose step `k` has the length `widths[k]`.
 
-    The time of these dynamics is the number of steps, so `dt` is 1 by default.
+    The time of these dynamics is the number of steps, so `dt` is 1 by default. The time
+    of the system is the sum of the lengths of the steps before.
 
     **Arguments:**
 
     - `inner`: a [`delucax.Discretized`][] system. Its `dt` is not used.
     - `widths`: the lengths of the steps, shape `(T,)`.
     - `dt`: the increase of the time of these dynamics in one step, 1 by default.
+
+    **Raises:** `ValueError` if the system has a diffusion, because its Brownian
+    increments are drawn for steps of one length.
 
     !!! example
 
@@ -95,21 +99,40 @@ class Sampled(AbstractDynamics):
     widths: Float[Array, " T"] = parameter()
     dt: Array = parameter(1.0)
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        return self.inner.state_names
+    def __check_init__(self):
+        if self.noise == "brownian":
+            raise ValueError(
+                "Sampled: the system of inner must have no diffusion, because its "
+                "Brownian increments are drawn for steps of one length."
+            )
 
     @property
-    def control_names(self) -> tuple[str, ...]:
-        return self.inner.control_names
+    def dynamics(self) -> Discretized:
+        """The wrapped dynamics, `inner`."""
+        return self.inner
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """None, because the times of events would not be those of the steps."""
+        return ()
+
+    def observe(self, t: Time, x: State) -> Observation:
+        return self.inner.observe(self._start(self._step_at(t)), x)
 
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        k = jnp.round(jnp.asarray(t / self.dt)).astype(int)
+        k = self._step_at(t)
         at = lambda inner: inner.dt
         inner = eqx.tree_at(at, self.inner, self.widths[k].astype(x.dtype))
-        return inner.advance(jnp.zeros_like(x[0]), x, u, None)
+        return inner.advance(self._start(k), x, u, w)
+
+    def _step_at(self, t: Time) -> Array:
+        return jnp.round(jnp.asarray(t / self.dt)).astype(int)
+
+    def _start(self, k: Array) -> Array:
+        """The time of the system at the start of step `k`."""
+        return jnp.pad(jnp.cumsum(self.widths), (1, 0))[k]
 
     def refined(self, points: int, inner: Callable[[Any], Any]) -> "Sampled":
         """The same dynamics with each step cut into parts, and with new inner dynamics.
@@ -120,7 +143,7 @@ class Sampled(AbstractDynamics):
         **Returns:** a [`delucax.problems.Sampled`][].
         """
         widths = jnp.repeat(self.widths / points, points)
-        return Sampled(inner(self.inner), widths)
+        return Sampled(inner(self.inner), widths, self.dt / points)
 
 
 class Residuals(AbstractCost):
