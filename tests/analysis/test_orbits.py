@@ -75,6 +75,11 @@ def test_an_event_that_does_not_come():
     options = dict(max_steps=20, throw=False)
     missed = dlx.analysis.poincare_map(wheel(dt=0.01), "step back", GUESS, **options)
     assert missed.result == dlx.RESULTS.not_converged
+    # It comes in the 12th interval; a loop in blocks could take that many.
+    for most, result in ((11, "not_converged"), (12, "successful")):
+        options |= dict(max_steps=most)
+        late = dlx.analysis.poincare_map(wheel(dt=0.067), "step", GUESS, **options)
+        assert late.result == getattr(dlx.RESULTS, result)
     with pytest.raises(ValueError, match="event must be"):
         dlx.analysis.poincare_map(wheel(), "bounce", GUESS)
 

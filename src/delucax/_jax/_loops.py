@@ -44,7 +44,10 @@ def _zero_by_call(count: Array) -> Array:
 def bounded_while(
     needed: Callable[[Any], Array], turn: Callable[[Any], Any], state: Any, most: int
 ) -> Any:
-    """Apply `turn` to `state` while `needed(state)` holds, at most `most` times.
+    """Apply `turn` to `state` while `needed(state)` holds, `most` times if need be.
+
+    The turns are taken in blocks, so there may be a few more. If these would be wrong,
+    `needed` must count the turns.
 
     It has derivatives in both modes, which store the state at each turn and compute the
     rest again. Turns that are not needed are skipped: all by one test, or in blocks. In

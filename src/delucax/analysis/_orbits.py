@@ -176,7 +176,9 @@ def _return(dynamics, event, x, u, t0, max_steps) -> Return:
 
     zero = jnp.zeros((), x.dtype)
     carry = x, zero, jnp.asarray(0), jnp.asarray(False), RESULTS.successful
-    carry = bounded_while(lambda carry: ~carry[3], turn, carry, max_steps)
+    # Counted, because the loop may take a few turns more.
+    needed = lambda carry: ~carry[3] & (carry[2] < max_steps)
+    carry = bounded_while(needed, turn, carry, max_steps)
     x, time, _, done, result = carry
     missed = ~done & (result == RESULTS.successful)
     return Return(x, time, choose(missed, RESULTS.not_converged, result))
