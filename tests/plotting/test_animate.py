@@ -1,6 +1,7 @@
 """Moving pictures: their frames, their files, and how plants are drawn."""
 
 import base64
+import dataclasses
 import io
 import re
 import sys
@@ -408,3 +409,14 @@ def test_setup_must_return_keywords(env, trajectory):
             Scene(run, env, [0], 40)
     finally:
         _BY_TYPE.update(kept)
+
+
+def test_a_series_that_is_not_finite_at_first():
+    environment = environment_of(Cart())
+    run = run_of(environment)
+    costs = run.costs.at[0].set(jnp.nan)
+    run = dataclasses.replace(run, costs=costs)
+    scene = Scene(as_runs(run, None, "run", "test")[0], environment, [0, 10], dpi=20)
+    scene.frame(0)
+    shown = [len(line.get_xdata()) for line, _ in scene.lines[-2:]]
+    assert shown == [0, 0]

@@ -141,7 +141,8 @@ class Scene:
         for line, (times, values) in self.lines:
             # The last time has no cost: the dot stays at the last cost.
             shown = np.flatnonzero((times <= time) & np.isfinite(values))
-            start = shown[-1:] if line.get_marker() == "o" else slice(max(shown) + 1)
+            end = max(shown, default=-1) + 1  # 0 before the first finite value
+            start = shown[-1:] if line.get_marker() == "o" else slice(end)
             line.set_data(times[start], values[start])
         past = self.path.times[: row + 1], self.path.states[: row + 1]
         self.plant.draw(*self._moment(row), past)
