@@ -12,6 +12,8 @@ import jax
 
 
 _PACKAGES = ("delucax", "jax", "jaxlib", "equinox", "diffrax", "numpy")
+VERSIONS = (*_PACKAGES, "python")
+"""The names of the versions in a provenance."""
 
 version = functools.cache(importlib.metadata.version)
 """The version of an installed package."""

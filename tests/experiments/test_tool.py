@@ -576,7 +576,7 @@ def test_wrong_arguments_are_named(call, message):
         call()
 
 
-@pytest.mark.parametrize("name", ["x", "status", "error"])
+@pytest.mark.parametrize("name", ["x", "status", "error", "jax"])
 def test_a_result_that_would_hide_a_column_fails(name):
     @experiment.parametrize("x", [1])
     def clash(x):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .._check import as_path
+from .._provenance import VERSIONS
 
 
 try:
@@ -30,7 +31,7 @@ _KEYS = ("experiment", "case", "seed", "status", "versions")
 _NEEDED = {"run", "parameters", "status", "error", "device"}
 PASSED = ("passed", "passed unexpectedly")
 FAILED = ("failed", "passed unexpectedly")
-RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
+RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS, *VERSIONS)
 """The names that neither a parameter nor a result can have."""
 
 
