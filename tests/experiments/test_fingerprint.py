@@ -2,6 +2,7 @@
 
 import collections
 import enum
+import importlib
 import os
 import subprocess
 import sys
@@ -202,6 +203,51 @@ def test_objects_in_a_ring_and_in_common_are_read_once():
     ring.others, other.others = (ring, 1), (other, 2)
     assert fingerprint(ladder(60)) == fingerprint(ladder(60)) != fingerprint(ladder(61))
     assert fingerprint(ring) != fingerprint(other)
+
+
+def test_a_function_that_was_read_before_still_counts(module):
+    text = """
+def adam():
+    return 1
+def sgd():
+    return 2
+use = adam
+def value():
+    return adam(), sgd(), use()
+"""
+    one = fingerprint(module(text))
+    assert fingerprint(module(text.replace("use = adam", "use = sgd"))) != one
+
+
+@pytest.mark.parametrize(
+    "line, call",
+    {
+        "from near.far import f": "f()",
+        "from near import far": "far.f()",
+        "import near.far": "near.far.f()",
+    }.items(),
+)
+@pytest.mark.parametrize("inside", [False, True])
+def test_what_the_code_imports_counts(tmp_path, monkeypatch, line, call, inside):
+    """At the top or within a function, also from a package without a file."""
+    text = f"{line}\ndef value():\n    return {call}\n"
+    if inside:
+        text = (
+            f"def value():\n    {line}\n    import no_such_module\n    return {call}\n"
+        )
+    found = []
+    for k, number in enumerate((1, 1, 2)):
+        folder = tmp_path / str(k)
+        (folder / "near").mkdir(parents=True)
+        (folder / "near" / "far.py").write_text(f"def f():\n    return {number}\n")
+        (folder / "importer.py").write_text(text)
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(folder)
+            value = importlib.import_module("importer").value
+            found += [fingerprint(value), fingerprint(value)]
+        for name in ("importer", "near", "near.far"):
+            del sys.modules[name]
+    assert len({*found[:4]}) == 1 and found[4] == found[5] != found[0]
 
 
 class Pair(typing.NamedTuple):

@@ -4,15 +4,17 @@ import ast
 import contextlib
 import copyreg
 import dataclasses
+import dis
 import functools
 import hashlib
+import importlib.util
 import inspect
 import os
 import sys
 import sysconfig
 import textwrap
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -28,9 +30,9 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
 
     A function is hashed by its source without comments, docstring and decorators, by
     the values that it closes over, and by the functions, classes and values that it
-    names. Only the user's code counts: functions and classes of libraries are hashed by
-    name. An object is hashed by its content and the code of its class. `root` is a
-    module whose code counts even if it belongs to a library.
+    names or imports. Only the user's code counts: functions and classes of libraries
+    are hashed by name. An object is hashed by its content and the code of its class.
+    `root` is a module whose code counts even if it belongs to a library.
 
     **Raises:** `TypeError` if a value in it cannot be hashed by its content.
     """
@@ -44,9 +46,16 @@ def is_library(module: str | None) -> bool:
     # A module that is not loaded was made by `exec`, as in the tests of the pages.
     if module == "__main__" or module not in sys.modules:
         return False
-    file = getattr(sys.modules[module], "__file__", None)
+    loaded = sys.modules[module]
+    file, folders = getattr(loaded, "__file__", None), getattr(loaded, "__path__", ())
+    return _is_of_library(module, file, folders)
+
+
+def _is_of_library(module: str, file: str | None, folders: Iterable[str]) -> bool:
+    # A namespace package has folders, but no file.
+    place = file or next(iter(folders), None)
     is_ours = module.partition(".")[0] == "delucax"
-    return is_ours or file is None or _is_installed(file)
+    return is_ours or place is None or _is_installed(place)
 
 
 @functools.cache
@@ -63,8 +72,10 @@ class _Hasher:
         self.visited: dict[int, tuple[int, Any]] = {}
 
     def mark_visited(self, thing: Any) -> bool:
-        """Give an object a number. Returns whether it is new."""
+        """Give an object a number, or add the number that it has. Returns whether the
+        object is new."""
         if id(thing) in self.visited:
+            self.update("again", self.visited[id(thing)][0])
             return False
         self.visited[id(thing)] = len(self.visited), thing
         return True
@@ -135,6 +146,9 @@ class _Hasher:
         if self.is_own(f.__module__):
             self.update(source_of(f))
             names = _names(f.__code__)
+            for name, thing in _imported(f.__code__, f.__globals__):
+                self.update(name)
+                self.add_named(thing)
         else:
             self.update(f.__module__)
         self.add([f.__defaults__, f.__kwdefaults__])
@@ -150,8 +164,6 @@ class _Hasher:
     def add_named(self, value: Any) -> None:
         """Add a value that the code names. A value that cannot be hashed counts by its
         type."""
-        if id(value) in self.visited:
-            return
         before, count = self.sha.copy(), len(self.visited)
         try:
             self.add(value)
@@ -194,7 +206,6 @@ class _Hasher:
             raise TypeError(f"a {type(value).__name__}, which is used up when read")
         kind = type(value)
         if not self.mark_visited(value):
-            self.update("again", self.visited[id(value)][0])
             return
         # The parts that pickle would write, and their code.
         reduce = copyreg.dispatch_table.get(kind, lambda value: value.__reduce_ex__(4))
@@ -256,3 +267,37 @@ def _names(code: types.CodeType) -> set[str]:
     """The names that the code uses, also in the functions within it."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return {*code.co_names}.union(*map(_names, inner))
+
+
+def _imported(code: types.CodeType, scope: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What the code imports from the user's modules when it runs, by name. The modules
+    are imported here, because the hash must not depend on whether they were."""
+    steps = [s for s in dis.get_instructions(code) if s.opname != "EXTENDED_ARG"]
+    for level, members, step in zip(steps, steps[1:], steps[2:], strict=False):
+        if step.opname != "IMPORT_NAME":
+            continue
+        name, level, members = step.argval, level.argval, members.argval
+        try:
+            if _is_library_on_disk(scope["__package__"] if level else name):
+                continue
+            module = __import__(name, scope, None, members, level)
+            yield from ((m, getattr(module, m)) for m in members or ())
+            if not members:
+                yield name, module
+        except Exception:
+            yield name, "not imported"
+    for inner in code.co_consts:
+        if isinstance(inner, types.CodeType):
+            yield from _imported(inner, scope)
+
+
+def _is_library_on_disk(module: str) -> bool:
+    """Whether a module that need not be loaded belongs to a library."""
+    top = module.partition(".")[0]
+    if top in sys.modules:
+        return is_library(top)
+    spec = importlib.util.find_spec(top)
+    if spec is None:
+        return False
+    file = spec.origin if spec.has_location else None
+    return _is_of_library(top, file, spec.submodule_search_locations or ())
