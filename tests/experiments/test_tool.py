@@ -615,6 +615,10 @@ def test_interquartile_mean():
     # Of five, the second and fourth count by three quarters.
     expected = (0.75 * 2 + 3 + 0.75 * 4) / 2.5
     assert experiments.interquartile_mean([1, 2, 3, 4, np.inf]) == expected
+    with_nan = [[1, 2, 3, np.nan], [1, 2, 3, 9]]
+    found = experiments.interquartile_mean(with_nan, axis=1)
+    np.testing.assert_array_equal(found, [np.nan, 2.5])
+    assert np.isnan(experiments.interquartile_mean(with_nan))
     with user_error(match="at least one entry"):
         experiments.interquartile_mean([])
 

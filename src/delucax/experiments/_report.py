@@ -215,7 +215,7 @@ def _add_figures(page: Page, results: Results) -> None:
         panels: dict[str, dict[str, list[float]]] = {}
         for row in results.rows:
             value = row.get(metric)
-            if not is_number(value) or not math.isfinite(value):
+            if not is_number(value):
                 continue
             label = row["case"].partition("[")[2][:-1] or row["case"]
             title = str(row[used[0]]) if len(used) > 1 else ""
@@ -241,21 +241,27 @@ def _add_figures(page: Page, results: Results) -> None:
 
 
 def _panel(axes: Any, title: str, cases: dict[str, list[float]]) -> None:
-    labels = list(cases)[:_CASES]
-    for k, label in enumerate(labels):
-        values, place = cases[label], len(labels) - 1 - k
-        axes.plot(values, [place] * len(values), "|", color="0.6")
-        low, high = np.quantile(values, [0.25, 0.75])
+    """Draw the values of each case. A case with values that are not finite says how
+    many, because they have no place in the panel."""
+    labels, flat = [], []
+    for label, values in [*cases.items()][:_CASES]:
+        place, finite = -len(labels), [v for v in values if math.isfinite(v)]
+        axes.plot(finite, [place] * len(finite), "|", color="0.6")
+        with np.errstate(invalid="ignore"):
+            low, high = np.quantile(values, [0.25, 0.75])
+            middle = interquartile_mean(values)
         axes.plot([low, high], [place, place], color="C0", lw=3, alpha=0.5)
-        axes.plot(interquartile_mean(values), place, "o", color="C0", ms=4)
-    flat = [value for label in labels for value in cases[label]]
-    if min(flat) > 0 and max(flat) > 100 * min(flat):
+        axes.plot(middle, place, "o", color="C0", ms=4)
+        missing = len(values) - len(finite)
+        labels.append(f"{label} ({missing} not finite)" if missing else label)
+        flat += finite
+    if flat and min(flat) > 0 and max(flat) > 100 * min(flat):
         axes.set_xscale("log")
     else:
         axes.ticklabel_format(axis="x", scilimits=(-3, 4))
-    axes.set_yticks(range(len(labels)), labels[::-1], fontsize=8)
+    axes.set_yticks(range(0, -len(labels), -1), labels, fontsize=8)
     axes.tick_params(axis="x", labelsize=8)
-    axes.set_ylim(-0.7, len(labels) - 0.3)
+    axes.set_ylim(0.3 - len(labels), 0.7)
     axes.set_title(title, fontsize=10)
     axes.grid(axis="x", alpha=0.3)
 

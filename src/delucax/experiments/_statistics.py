@@ -23,7 +23,8 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
 
     **Arguments:**
 
-    - `values`: numbers. Infinite values in the outer quarters have no effect.
+    - `values`: numbers. Infinite values in the outer quarters have no effect. If a
+        value is NaN, the mean is NaN.
     - `axis`: the axis to average over; all axes by default.
 
     **Returns:** a number, or an array without that axis.
@@ -58,6 +59,8 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     inside = weight > 0
     ordered = np.sort(array, axis=-1)[..., inside]
     mean = ordered @ weight[inside] / weight.sum()
+    # The sort puts NaN last, where its weight would be zero.
+    mean = np.where(np.isnan(array).any(axis=-1), np.nan, mean)
     return float(mean) if mean.ndim == 0 else mean
 
 
