@@ -14,7 +14,8 @@ from helpers import once, user_error
 
 from delucax import experiments
 from delucax.__main__ import main
-from delucax.experiments import experiment, Results
+from delucax.experiments import commands, experiment, Results
+from delucax.experiments._report import diff
 
 
 pytestmark = once
@@ -151,6 +152,21 @@ def test_reports(file, capsys):
     assert "count[4]: only in results/sweep.jsonl" in out
     assert "3 cases are the same, 3 differ" in out
     assert "results differ" in Path("diff.html").read_text()
+
+
+def test_reports_tell_of_seeds_that_are_not_finite_or_not_in_common(tmp_path):
+    @experiment.parametrize("x", [1, 2])
+    @experiment.seeds(4)
+    def cost(x, seed):
+        return {"value": float("nan") if seed == 3 == x + 1 else x + seed}
+
+    found = experiments.run(cost, progress=False)
+    experiments.report(found, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "2 (1 not finite)" in page and "1 (1 not finite)" not in page
+    first, second = (experiments.run(cost, seeds=s, progress=False) for s in ([0], [1]))
+    keys = [("cost", "cost[1]"), ("cost", "cost[2]")]
+    assert diff(first, second) == ([], [], 0, (keys, keys))
 
 
 def test_the_command_line(file, capsys):

@@ -131,7 +131,7 @@ class Difference(NamedTuple):
     - `status`: rows of experiment, case, and the status in both.
     - `same`: the number of cases that agree to the last bit.
     - `only`: the cases, as (experiment, case), that only the first holds, and those
-        that only the second holds.
+        that only the second holds. A case without a common seed is in both lists.
     """
 
     changed: list[list]
@@ -169,7 +169,8 @@ def diff(first: Results, second: Results) -> Difference:
     """
     a, b = _by_case(first), _by_case(second)
     changed, status, same = [], [], 0
-    for key in [key for key in a if key in b]:
+    common = dict.fromkeys(k for k in a if a[k].keys() & b.get(k, {}).keys())
+    for key in common:
         seeds = [seed for seed in a[key] if seed in b[key]]
         states = [{rows[key][s]["status"] for s in seeds} for rows in (a, b)]
         if states[0] != states[1]:
@@ -190,8 +191,8 @@ def diff(first: Results, second: Results) -> Difference:
                 line[3:8] = *interquartile_mean(array, axis=0).tolist(), *difference
             changed.append(line)
         same += is_same
-    only = [key for key in a if key not in b], [key for key in b if key not in a]
-    return Difference(changed, status, same, only)
+    first_only, second_only = ([k for k in rows if k not in common] for rows in (a, b))
+    return Difference(changed, status, same, (first_only, second_only))
 
 
 def _by_case(results: Results) -> dict[tuple[str, str], dict[int, dict[str, Any]]]:
