@@ -642,5 +642,8 @@ def test_paired_comparison():
     assert b["low"] < b["iqm"] < b["high"] and b["high"] - b["low"] > 1.5
     assert b["pairs"] == 120 and b["below"] < 0.1
     assert table.loc["a", "difference"] == 0
+    other = experiments.experiment(lambda: {"seconds": 1.0})
+    both = experiments.run(cost, other, progress=False)
+    assert experiments.compare(both, by="method", baseline="a").equals(table)
     ratio = experiments.compare(quiet(cost), by="method", baseline="a", ratio=True)
     assert abs(ratio.loc["b", "ratio"] - 1.01) < 0.005

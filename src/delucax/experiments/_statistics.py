@@ -146,7 +146,8 @@ def compare(
             )
     check_range(confidence, "confidence", where, 0, 1)
     samples: dict[Any, dict[tuple, dict[int, float]]] = {}
-    for row in [row for row in results.rows if row["status"] in PASSED]:
+    # Other experiments of the results may lack the parameter.
+    for row in [r for r in results.rows if r["status"] in PASSED and by in r]:
         value = row.get(metric)
         if not is_number(value):
             raise ValueError(
