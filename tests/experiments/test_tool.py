@@ -207,7 +207,24 @@ def test_with_a_seed_it_is_called_as_it_is():
     assert {row["kind"] for row in rows} == {"int"}
 
 
-def test_seeds_are_spread_over_a_mesh():
+def test_results_of_seeds_have_the_types_of_a_single_call():
+    @experiment.seeds(2)
+    def draw(key):
+        x = jax.random.normal(key)
+        return {"none": None, "pair": [x, 2 * x]}
+
+    for row in quiet(draw).rows:
+        x = row["pair"][0]
+        assert row["pair"] == [x, 2 * x] and row["none"] is None and not row["error"]
+
+    def nested(key):
+        return {"inner": {"x": jax.random.normal(key)}}
+
+    (row,) = quiet(experiment(nested)).rows
+    assert "the result 'inner' must be a number, a string or an array" in row["error"]
+
+
+def test_seeds_are_spread_over_a_mesh(tmp_path):
     mesh = jax.make_mesh((jax.device_count(),), ("seeds",))
 
     @experiment.seeds(2 * jax.device_count())

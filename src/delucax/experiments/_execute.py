@@ -63,7 +63,8 @@ class Runner:
         try:
             with clock, contextlib.ExitStack() as stack:
                 arguments = self._arguments(index, stack)
-                values = self._columns(self._call(arguments, seeds, mesh))
+                returned = self._call(arguments, seeds, mesh)
+                values = self._columns(returned, len(seeds))
             where = device()
         except KeyboardInterrupt:
             raise
@@ -164,7 +165,7 @@ class Runner:
         call = lambda n: self.experiment.function(**arguments, key=jax.random.key(n))
         return jax.vmap(call)(numbers)
 
-    def _columns(self, returned: Any) -> dict[str, list]:
+    def _columns(self, returned: Any, count: int) -> dict[str, list]:
         """The results by name, as lists with an entry for each seed that JSON can
         store."""
         where = self.experiment.name
@@ -178,8 +179,12 @@ class Runner:
                 )
             columns = {name: [row[name] for row in rows] for name in rows[0]}
         else:
-            named = _as_mapping(returned)
-            columns = {name: list(np.asarray(value)) for name, value in named.items()}
+            named = _as_mapping(jax.tree.map(np.asarray, returned))
+            # A result may also hold several arrays, or none.
+            columns = {
+                name: [jax.tree.map(lambda a, k=k: a[k], value) for k in range(count)]
+                for name, value in named.items()
+            }
         taken = {*RESERVED}.union(*(axis.names for axis in self.axes))
         for name in columns:
             if not isinstance(name, str) or name in taken:
