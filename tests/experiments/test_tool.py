@@ -231,7 +231,15 @@ def test_seeds_are_spread_over_a_mesh(tmp_path):
     def draw(key):
         return jax.random.normal(key)
 
-    assert values(quiet(draw, mesh=mesh)) == values(quiet(draw))
+    whole = values(quiet(draw, mesh=mesh))
+    assert whole == values(quiet(draw))
+    # The devices need not divide the seeds that are missing: all run again.
+    path = tmp_path / "results.jsonl"
+    quiet(draw, store=path, seeds=1)
+    assert values(quiet(draw, store=path, mesh=mesh)) == whole
+    assert json.loads(path.read_text().splitlines()[-1])["seeds"] == [
+        *range(len(whole))
+    ]
 
 
 # Failures

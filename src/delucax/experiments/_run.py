@@ -81,7 +81,8 @@ def run(
     - `seeds`: a number of seeds, or a sequence of seeds, which replaces the seeds of
         the experiments.
     - `mesh`: a `jax.sharding.Mesh`. The seeds of each case are spread over its first
-        axis. None by default. A mesh needs `workers=1`.
+        axis. If one of them is missing in the store, all are run. None by default. A
+        mesh needs `workers=1`.
     - `fresh`: whether to run cases that are already stored; `False` by default.
     - `retry`: whether to run again the cases that raised an error, expected or not;
         `False` by default.
@@ -157,6 +158,8 @@ def run(
                 stored = {s: r for s, r in stored.items() if r["error"] is None}
             missing = tuple(seed for seed in wanted if seed not in stored)
             if missing:
+                # The devices of a mesh divide all seeds, but not any part of them.
+                missing = missing if mesh is None else wanted
                 jobs.append(Job(len(jobs), one, case, missing))
             kept = [stored[seed] for seed in wanted if seed in stored]
             changed += _with_new_status(case, kept)
