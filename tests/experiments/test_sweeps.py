@@ -87,6 +87,25 @@ def test_workers_give_the_same_and_their_death_harms_no_other(file, capfd):
     assert "The results of 8 cases are in both.jsonl" in out.out
 
 
+class Deadly:
+    """Kills the process that reads it."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+def test_a_worker_that_dies_while_it_reads_the_experiment():
+    deadly = Deadly()
+
+    @experiment.parametrize("x", [1, 2])
+    def read(x):
+        return deadly and x
+
+    found = experiments.run(read, workers=2, progress=False)
+    assert len(found.failed) == 2
+    assert "was killed, or crashed" in found.failed[0]["error"]
+
+
 def test_fixtures_of_workers_are_let_go_with_the_run(tmp_path):
     folder = str(tmp_path)
 

@@ -161,7 +161,7 @@ def run(
                 # The devices of a mesh divide all seeds, but not any part of them.
                 missing = missing if mesh is None else wanted
                 jobs.append(Job(len(jobs), one, case, missing))
-            kept = [stored[seed] for seed in wanted if seed in stored]
+            kept = [stored[seed] for seed in wanted if seed not in missing]
             changed += _with_new_status(case, kept)
     with contextlib.closing(opened):
         if jobs or changed:
@@ -245,7 +245,8 @@ def _run_in_workers(jobs: list[Job], workers: int, backend: str) -> Outcomes:
                 if type(error).__name__ not in _DEATHS:
                     raise
                 started = [n for n in pending if Path(folder, str(n)).exists()]
-                for job in [pending.pop(n) for n in (started if marks else [*pending])]:
+                # Without marks any of them may have been running.
+                for job in [pending.pop(n) for n in started or [*pending]]:
                     yield job, _alone(job, packed, backend)
         if any(
             fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
@@ -332,6 +333,9 @@ def _work(
     import cloudpickle
 
     name, content = packed
+    # First, because the process may die while it reads the experiment.
+    if marks is not None:
+        Path(marks, str(number)).touch()
     with jax.enable_x64(precise):
         runners = _local.__dict__.setdefault("runners", {})
         if (name, precise) not in runners:
@@ -342,8 +346,6 @@ def _work(
             runners[name, precise] = Runner(cloudpickle.loads(content))
         runner = runners[name, precise]
         _held.add(runner)
-        if marks is not None:
-            Path(marks, str(number)).touch()
         return number, runner.run(index, seeds, None)
 
 
