@@ -547,6 +547,15 @@ WRONG = {
         lambda: quiet(experiment.use(x=experiment.fixture(lambda key: key))(use_x)),
         "fixture x cannot take 'key': it is made once for all seeds",
     ),
+    "a fixture of the process by one of a case": (
+        lambda: quiet(
+            experiment.use(
+                x=experiment.fixture(lambda tool: tool, scope="process"),
+                tool=experiment.fixture(lambda: 1),
+            )(use_x)
+        ),
+        "fixture x has the scope 'process', so it cannot use fixture tool",
+    ),
     "no expression": (lambda: quiet(stored, select=3), "select must be a string"),
     "confidence": (
         lambda: experiments.compare(

@@ -205,6 +205,13 @@ class Experiment:
                     f"{where}: fixture {name} cannot take {random!r}: it is made once "
                     "for all seeds."
                 )
+            for other in sorted(needs[name] & fixtures.keys()):
+                if fixture.scope == "process" and fixtures[other].scope == "case":
+                    raise ValueError(
+                        f"{where}: fixture {name} has the scope 'process', so it "
+                        f"cannot use fixture {other}, which ends with each case. Give "
+                        f"{other} the scope 'process' too."
+                    )
             self._check_given(fixture.function, f"fixture {name}", {*given, "param"})
         if {"key", "seed"} <= {*arguments}:
             raise ValueError(f"{where}: the function takes both 'key' and 'seed'.")
@@ -342,7 +349,8 @@ class experiment:  # noqa: N801
         An experiment of the same module, or another fixture, gets this value for its
         argument with the name of the fixture. The code after the `yield` runs when the
         scope ends. The arguments of a fixture are parameters of the experiment or other
-        fixtures.
+        fixtures. A fixture of the scope `"process"` can use only other fixtures of
+        that scope.
 
         **Arguments:**
 
