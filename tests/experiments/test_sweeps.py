@@ -188,6 +188,16 @@ def test_reports_tell_of_seeds_that_are_not_finite_or_not_in_common(tmp_path):
     assert diff(first, second) == ([], [], 0, (keys, keys))
 
 
+def test_modules_of_a_package_have_stores_of_their_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "swept").mkdir()
+    for name in ("one", "two"):
+        (tmp_path / "swept" / f"{name}.py").write_text(FILE)
+        assert main(["run", f"swept.{name}", "-k", "count and 0", "--quiet"]) == 0
+        assert Path(f"results/swept.{name}.jsonl").exists()
+    sys.path.remove(str(tmp_path))
+
+
 def test_the_command_line(file, capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out

@@ -36,7 +36,9 @@ def run_file(
 ) -> int:
     """Run the experiments of a file and print their results."""
     experiments = load(file, suites, "run")
-    place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
+    # Not the stem, because a module may have dots in its name.
+    name = Path(file).name.removesuffix(".py")
+    place = Path("results") / f"{name}.jsonl" if store is None else store
     results = run(*experiments, store=place, **options)
     done = {row["case"] for row in results.rows if row["status"] != "skipped"}
     if not done:
@@ -50,7 +52,7 @@ def run_file(
         first = str(row["error"] or "it passed, but was expected to fail")
         print(f"FAILED {case}: {first.splitlines()[0]}", file=sys.stderr)
     print(f"The results of {len(done)} cases are in {place}")
-    _write_page(html, lambda: page_of(results, Path(file).stem))
+    _write_page(html, lambda: page_of(results, name))
     return bool(failed)
 
 
