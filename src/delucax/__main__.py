@@ -112,7 +112,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        kept = " The same command continues where it stopped."
+        command = "same command" + " without --fresh" * options.get("fresh", False)
+        kept = f" The {command} continues where it stopped."
         words = kept if call in (_run, _lung) else ""
         print(f"\nInterrupted.{words}", file=sys.stderr)
         return 130

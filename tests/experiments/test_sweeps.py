@@ -198,6 +198,17 @@ def test_modules_of_a_package_have_stores_of_their_own(tmp_path, monkeypatch, ca
     sys.path.remove(str(tmp_path))
 
 
+def test_an_interruption_says_what_continues(file, capsys, monkeypatch):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "run", interrupted)
+    assert main(["run", file]) == main(["run", file, "--fresh"]) == 130
+    err = capsys.readouterr().err
+    assert "The same command continues" in err
+    assert "The same command without --fresh continues" in err
+
+
 def test_the_command_line(file, capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
