@@ -19,6 +19,7 @@ from delucax import experiments
 from delucax.experiments import experiment, Results
 from delucax.experiments._fingerprint import fingerprint
 from delucax.experiments._results import TIMES
+from delucax.experiments._store import Store
 
 
 pytestmark = once
@@ -462,6 +463,15 @@ def test_two_runs_do_not_write_one_file(tmp_path):
         return 1
 
     assert values(quiet(experiment(nested), store=path)) == [1]
+
+
+def test_lines_that_another_run_wrote_meanwhile_are_kept(tmp_path):
+    path = tmp_path / "results.jsonl"
+    early = Store(path, "run")
+    whole, _ = ran(stored, path)
+    with user_error(match="was written by another run meanwhile"):
+        early.open()
+    assert timeless(Results.read(path)) == timeless(whole)
 
 
 # Bad input

@@ -48,7 +48,8 @@ class Store:
         self.cases: dict[tuple[str, str], dict[str, Any]] = {}
         self.runs: dict[int, dict[str, Any]] = {}
         self._file: int | None = None
-        self._whole = 0
+        # The length of the file when it was read, and of its whole lines.
+        self._size = self._whole = 0
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
@@ -65,6 +66,7 @@ class Store:
         except OSError as error:
             where = f"{self.where}: '{path}'"
             raise type(error)(f"{where} cannot be read: {error}") from error
+        self._size = len(content)
         lines = content.split(b"\n")
         # The last line has no newline if its process was killed.
         self._whole = len(content) - len(lines.pop())
@@ -131,7 +133,10 @@ class Store:
             except OSError as error:
                 self.close()
                 raise self._error("is being written by another run.") from error
-        if os.fstat(self._file).st_size > self._whole:
+        if os.fstat(self._file).st_size != self._size:
+            self.close()
+            raise self._error("was written by another run meanwhile; call again.")
+        if self._size > self._whole:
             os.ftruncate(self._file, self._whole)
         if self._whole == 0:
             self._write(_HEADER)
