@@ -139,6 +139,41 @@ def test_soft_bounds_of_states():
 
 
 @needs_x64
+def test_hard_bounds_stay_hard_next_to_soft_limits():
+    dynamics = dlx.LinearDynamics([[1.0, 1.0], [0.0, 1.0]], [[0.0], [1.0]])
+    cost, x0 = dlx.costs.Quadratic([1.0, 1.0], [0.01]), jnp.array([10.0, 0.0])
+    weights = jnp.linspace(0.01, 0.02, 20)[:, None]
+    soft = Constraints(controls=dlx.qp.Soft(-0.5, 0.5, quadratic=weights))
+
+    @jax.jit
+    @jax.value_and_grad(has_aux=True)
+    def solved(high):
+        plan = SQP()(dynamics, cost, x0, 20, bounds=(-1.0, high), constraints=soft)
+        return plan.cost, plan
+
+    (_, plan), slope = solved(1.0)
+    u = plan.controls
+    assert_close((jnp.min(u), jnp.max(u)), (-1.0, 1.0), atol=1e-8)
+
+    def total(u):
+        x, over = dlx.open_loop(dynamics, x0, u), jnp.maximum(jnp.abs(u) - 0.5, 0)
+        each = jax.vmap(cost)(jnp.zeros(20), x[:-1], u)
+        return jnp.sum(each) + cost.final(0, x[-1]) + jnp.sum(weights / 2 * over**2)
+
+    # A step against the gradient leads nowhere within the bounds: the plan is optimal.
+    step = jnp.clip(u - 0.1 * jax.grad(total)(u), -1.0, 1.0)
+    assert_close(step, u, atol=1e-6)
+    lower, upper = plan.multipliers.controls
+    assert jnp.max(lower) > 1e-3 and jnp.max(upper) > 1e-3
+    difference = (solved(1.0 + 1e-5)[0][0] - solved(1.0 - 1e-5)[0][0]) / 2e-5
+    assert_close(slope, difference, rtol=1e-5)
+    # The program of a real-time iteration is the whole problem, because it is linear.
+    options = dict(bounds=(-1.0, 1.0), constraints=soft, real_time=True)
+    mpc = dlx.controllers.MPC(dynamics, cost, 20, **options)
+    assert_close(mpc(0.0, x0, mpc.init())[0], u[0], atol=1e-6)
+
+
+@needs_x64
 def test_derivatives_against_central_differences():
     def total(theta):
         scale, radius, bound, start = theta

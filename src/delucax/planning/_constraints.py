@@ -115,8 +115,8 @@ class Constraints(eqx.Module):
         `(T+1, n)`; or a [`delucax.qp.Soft`][] with such bounds. The first row of the
         bounds is ignored, because the first state is given. None by default.
     - `controls`: bounds like `states`, of shape `(m,)` or `(T, m)`. For bounds that do
-        not vary in time, use `bounds` of the planner, which is cheaper. None by
-        default.
+        not vary in time, use `bounds` of the planner, which is cheaper. If the planner
+        has `bounds` too, both apply. None by default.
 
     Only [`delucax.planning.SQP`][] takes soft constraints and the bounds `states` and
     `controls`.

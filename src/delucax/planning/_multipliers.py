@@ -34,7 +34,8 @@ class Multipliers(eqx.Module):
         arrays of shape `(T+1, n)`; `None` without such bounds.
     - `controls`: the multipliers of the bounds of controls, a pair `(lower, upper)` of
         arrays of shape `(T, m)`; `None` without bounds, and always for
-        [`delucax.planning.ILQR`][].
+        [`delucax.planning.ILQR`][]. If the planner has hard bounds and soft limits of
+        controls, these are the multipliers of the hard bounds.
     - `costates`: the multipliers of the dynamics, shape `(T+1, n)`. Row `k` is minus
         the derivative of the cost from stage `k` on with respect to $x_k$, as in
         [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`.

@@ -48,6 +48,8 @@ class Limits(NamedTuple):
     """The number of rows that are bounds of states."""
     free: tuple[int, ...] = ()
     """The unknown entries of the first state."""
+    again: int = 0
+    """The number of last rows, which bound the controls a second time."""
 
     @property
     def own(self) -> int:
@@ -110,13 +112,16 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
     own = given and given.states, given and given.controls
     has_states, has_controls = own[0] is not None, own[1] is not None
     has_controls = has_controls or problem.bounds is not None
+    # A row is either hard or soft, so soft limits next to hard bounds have own rows.
+    again = m if problem.bounds is not None and isinstance(own[1], Soft) else 0
     free = () if problem.free is None else problem.free.entries
     begin = 0 if has_states else min(free, default=n)
     if begin < n:
         ends = _bounds(own[0], "states", T, n, dtype)
         parts.append(tuple(a[:, begin:] for a in _from_start(problem, ends)))
     if has_controls:
-        low, high, *weights = _bounds(own[1], "controls", T, m, dtype)
+        value = None if again else own[1]
+        low, high, *weights = _bounds(value, "controls", T, m, dtype)
         if problem.bounds is not None:
             always = tuple(jnp.broadcast_to(b, (T, m)) for b in problem.bounds)
             always = (
@@ -138,10 +143,18 @@ def limits_of(problem: Problem, horizon: int) -> Limits:
         )
         each = jnp.tile(pad(stage)[:, None], (1, T, 1))
         parts.append(tuple(jnp.concatenate([each, pad(final)[:, None]], axis=1)))
+    if again:
+        parts.append(_bounds(own[1], "controls", T, m, dtype))
     blank = jnp.zeros((4, T + 1, 0), dtype)
     joined = [jnp.concatenate(a, axis=1) for a in zip(blank, *parts, strict=True)]
-    bounded = begin, (n + m if has_controls else n)
-    return Limits(*joined, bounded=bounded, is_soft=soft, states=n - begin, free=free)
+    return Limits(
+        *joined,
+        bounded=(begin, n + m if has_controls else n),
+        is_soft=soft,
+        states=n - begin,
+        free=free,
+        again=again,
+    )
 
 
 def _from_start(problem: Problem, ends: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -201,10 +214,11 @@ def _bounds(value: Any, name: str, T: int, size: int, dtype: Any) -> tuple[Array
 def _joined(problem: Problem, limits: Limits, z: Array, stage: Array, final: Array):
     """The rows along a trajectory `z`, shape `(T+1, N)`, with values of constraints."""
     first, last = limits.bounded
-    size = limits.low.shape[1] - limits.own
+    size = limits.low.shape[1] - limits.own - limits.again
     pad = lambda c: jnp.pad(c, ((0, 0), (0, size - c.shape[1])))
     c = jnp.concatenate([pad(stage), pad(final[None])])
-    return jnp.concatenate([z[:, first:last], c], axis=1)
+    again = [z[:, -limits.again :]] if limits.again else []
+    return jnp.concatenate([z[:, first:last], c, *again], axis=1)
 
 
 def _stacked(states: Array, controls: Array) -> Array:
@@ -301,16 +315,20 @@ def expanded(
     defects = jnp.concatenate([problem.missed_start(states[0])[None], defects])
     rows = _joined(problem, limits, _stacked(states, controls), c, c_end)
     values = Values(jnp.sum(cost) + last, defects, rows)
-    N, size = z.shape[1], rows.shape[1] - limits.own
+    N, size = z.shape[1], rows.shape[1] - limits.own - limits.again
     pad = lambda a, *sizes: jnp.pad(
         a, [(0, s - k) for s, k in zip(sizes, a.shape, strict=True)]
     )
     stack = lambda a, b: jnp.concatenate([a, b[None]])
+    G = stack(pad(G, T, size, N), pad(G_end, size, N))
+    if limits.again:
+        picks = jnp.tile(jnp.eye(N, dtype=z.dtype)[-limits.again :], (T + 1, 1, 1))
+        G = jnp.concatenate([G, picks], axis=1)
     model = Model(
         values,
         stack(h, pad(v, N)),
         F,
-        stack(pad(G, T, size, N), pad(G_end, size, N)),
+        G,
         symmetric(stack(H, pad(V, N, N))),
     )
     return jax.tree.map(lambda a: a.astype(states.dtype), model)
