@@ -319,6 +319,22 @@ def test_derivatives_in_closed_form():
 
 
 @needs_x64
+def test_derivatives_between_bounds_that_may_be_infinite():
+    """If the condition is active, and if it is not."""
+    free = -np.inf, np.inf
+    for bounds in (free, (-np.inf, 1.5), ((-1.0, -np.inf), (np.inf, 2.0))):
+        safe = made(0, bounds=bounds)
+
+        def control(z, safe=safe):
+            u, _ = act(safe, z[:2], z[2], z[3:])
+            return u @ jnp.array([1.0, -2.0])
+
+        for level in (-2.0, 2.0):
+            z = np.array([1.0, 0.5, level, 0.3, -0.4])
+            assert np.any(assert_gradient(control, z, atol=1e-7))
+
+
+@needs_x64
 def test_derivatives_of_a_program():
     """At a corner of two conditions, where there is no closed form."""
     safe = made(2, 3)

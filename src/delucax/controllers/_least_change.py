@@ -87,6 +87,10 @@ def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
     behind = jnp.where(way > 0, low, high)
     pace = jnp.where(moves, way, 1)
     enters, leaves = (jnp.maximum((end - n) / pace, 0) for end in (behind, ahead))
+    rest = jnp.clip(n, low, high)
+    # An infinite end is never held. In the branch that is not taken it would make the
+    # derivative NaN.
+    behind = jnp.where(moves & jnp.isfinite(behind), behind, rest)
 
     def is_short(push):
         """Whether the condition is not met yet at this multiplier."""
@@ -99,8 +103,7 @@ def _for_one(task: Task, s: Array, a: Array, price: Array | None) -> Array:
     has_entered = moves & jax.vmap(is_short)(enters)
     has_left = moves & finite & jax.vmap(is_short)(jnp.where(finite, leaves, 0))
     free = has_entered & ~has_left
-    rest = jnp.clip(n, low, high)
-    held = jnp.where(has_left, ahead, jnp.where(moves, behind, rest))
+    held = jnp.where(has_left, ahead, behind)
     level = s + dot(a, jnp.where(free, 0, held - n))
     slope = dot(a, jnp.where(free, way, 0)) + give
     push = jnp.maximum(-level / _unless_zero(slope), 0)
