@@ -144,6 +144,17 @@ def test_a_plan_that_fails_is_an_error():
     assert state.failures.count == 1 and state.result == dlx.RESULTS.not_converged
 
 
+@once
+def test_a_fallback_hears_what_was_applied():
+    env, _ = regulated()
+    pid = dlx.controllers.PID(1.0, 2.0, dt=0.1, output=0)
+    mpc = MPC(env.dynamics, env.cost, 4, fallback=pid)
+    y, u, cost = env.initial_state, jnp.array([0.2]), jnp.zeros(())
+    (_, state), (_, alone) = (c(0.0, y, c.init()) for c in (mpc, pid))
+    state, alone = mpc.applied(u, cost, state), pid.applied(u, cost, alone)
+    assert_close(state.fallback.integral, alone.integral, rtol=1e-6)
+
+
 def reactor():
     """A task, its LQR, and its cost with the LQR's cost to go."""
     env = dlx.make("cstr")

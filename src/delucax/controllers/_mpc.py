@@ -144,8 +144,8 @@ class MPC(AbstractController):
         following the last plan. All these controls keep `bounds`, but they need not
         keep `constraints`.
     - `fallback`: a controller that acts in the steps without a usable plan, instead of
-        raising. The fallback is called at every step, so that its state is up to date.
-        None by default.
+        raising. The fallback is called at every step, and gets the control that was
+        applied, so that its state is up to date. None by default.
     - `real_time`: whether to solve one quadratic program per step; false by default.
         With `real_time`, the planner must be a [`delucax.planning.SQP`][], which is
         also the default.
@@ -383,6 +383,11 @@ class MPC(AbstractController):
             as_float_array(t), y, plan, state._replace(key=key)
         )
         return _checked(self, u, lost, plan.result), after
+
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
+        if self.fallback is None:
+            return state
+        return state._replace(fallback=self.fallback.applied(u, cost, state.fallback))
 
     @eqx.filter_jit
     def _moved_on(
