@@ -100,6 +100,18 @@ def test_back_calculation_arithmetic():
     assert_close(again, controls, rtol=1e-6)
 
 
+@once
+def test_scheduled_gains_hear_what_was_applied(key):
+    make = lambda kp: PID(kp, 2.0, dt=DT, anti_windup_time=0.5)
+    pids = dlx.controllers.Scheduled(eqx.filter_vmap(make)(jnp.array([1.0, 3.0])), DT)
+    controls = run_by_hand(pids, 3 * [-1.0], applied=lambda u: u - 3.0)
+    rise = DT * (2.0 - 3.0 / 0.5)
+    assert_close(controls[:, 0], [1.0, 3.0 + rise, 3.0 + 2 * rise], rtol=1e-5)
+    equal = dlx.controllers.Scheduled(eqx.filter_vmap(make)(jnp.ones(2)), DT)
+    run = lambda pid: dlx.rollout(tank((0.9, 2.0), 20), pid, key=key, x0=jnp.zeros(1))
+    assert_close(run(equal).states, run(make(1.0)).states, rtol=1e-5)
+
+
 def test_no_integral_is_wound_by_saturation():
     for windup in (None, 0.5):
         pid = PID(4.0, dt=DT, bounds=(-1.0, 1.0), anti_windup_time=windup)

@@ -17,6 +17,11 @@ from ..math._steps import row_at, step_at
 from ._network import features_of
 
 
+class _Told(NamedTuple):
+    inner: PyTree
+    step: Array  # of the last call, because `applied` gets no time
+
+
 class Scheduled(AbstractController):
     r"""A controller for each time step, $u_k = \pi_k(t_k, y_k)$.
 
@@ -75,18 +80,36 @@ class Scheduled(AbstractController):
                 f"common, got lengths {sorted(lengths)}."
             )
 
-    def _at(self, t: Any) -> AbstractController:
-        arrays, rest = eqx.partition(self.controllers, eqx.is_array)
-        count = len(jax.tree.leaves(arrays)[0])
-        k = step_at(t, self.dt, count, "Scheduled")
+    @property
+    def _listens(self) -> bool:
+        """Whether the controllers override `applied`."""
+        return type(self.controllers).applied is not AbstractController.applied
+
+    def _step(self, t: Any) -> Array:
+        arrays = jax.tree.leaves(eqx.filter(self.controllers, eqx.is_array))
+        count = len(arrays[0])
         # Only the end is clipped: row -1, before the start, is NaN on purpose.
-        return eqx.combine(row_at(arrays, jnp.minimum(k, count - 1)), rest)
+        return jnp.minimum(step_at(t, self.dt, count, "Scheduled"), count - 1)
+
+    def _at(self, k: Array) -> AbstractController:
+        arrays, rest = eqx.partition(self.controllers, eqx.is_array)
+        return eqx.combine(row_at(arrays, k), rest)
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
-        return self._at(0.0).init(key=key)
+        first = jnp.zeros((), int)
+        inner = self._at(first).init(key=key)
+        return _Told(inner, first) if self._listens else inner
 
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
-        return self._at(t)(t, y, state)
+        k, listens = self._step(t), self._listens
+        u, inner = self._at(k)(t, y, state.inner if listens else state)
+        return u, _Told(inner, k) if listens else inner
+
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
+        if not self._listens:
+            return state
+        inner = self._at(state.step).applied(u, cost, state.inner)
+        return state._replace(inner=inner)
 
 
 class _Past(NamedTuple):
