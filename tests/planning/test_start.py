@@ -133,6 +133,16 @@ def test_the_cheapest_start_is_taken():
 
 
 @once
+def test_several_starts_are_shifted_in_time():
+    U = np.arange(6.0).reshape(2, 3, 1)
+    gains, states = U[..., None], np.arange(8.0).reshape(2, 4, 1)
+    later = Start(U, states, gains).shifted()
+    assert_close(later.controls[..., 0], [[1, 2, 2], [4, 5, 5]])
+    assert_close(later.states[..., 0], [[1, 2, 3, 3], [5, 6, 7, 7]])
+    assert_close(later.gains[..., 0, 0], later.controls[..., 0])
+
+
+@once
 def test_samplers_start_from_it_too():
     x0, key = jnp.ones(1), jax.random.key(0)
     few = dict(samples=4, iterations=1)

@@ -97,7 +97,9 @@ class Start(eqx.Module):
     def shifted(self) -> "Start":
         """The start for the next time step; the last step is repeated."""
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
-        start, y = jax.tree.map(shift, self.trajectories), self.multipliers
+        # Of several starts, each one is shifted. They share their multipliers.
+        each = shift if self.controls.ndim == 2 else jax.vmap(shift)
+        start, y = jax.tree.map(each, self.trajectories), self.multipliers
         if y is not None:
             moving = dict(
                 stage=y.stage, states=y.states, controls=y.controls, costates=y.costates
