@@ -47,6 +47,14 @@ def test_plans_end_with_the_cost_to_go():
     assert cost(local_mpc(env, horizon=3)) > 1.01 * cost(lqr)
 
 
+def test_a_plan_starts_from_the_lqr_after_a_turn():
+    env = dlx.make("pendulum")
+    mpc = local_mpc(env, local_lqr(env), planner=dlx.planning.ILQR(1))
+    angles = jnp.array([0.1, 0.1 + 2 * jnp.pi])
+    act = jax.jit(lambda angle: mpc(0.0, jnp.array([angle, 0.0]), mpc.init())[0])
+    assert_close(*map(act, angles), atol=1e-9)
+
+
 def test_the_point_is_the_target_of_the_cost():
     # This motor is to turn; at the rest of its plant its LQR would hold it.
     env = dlx.make("permanent_magnet_motor")

@@ -217,5 +217,5 @@ def local_mpc(
     if planner is None and not real_time:
         planner = ILQR(max_iterations=8)
     options: dict[str, Any] = dict(planner=planner, real_time=real_time, throw=throw)
-    bounds = environment.control_bounds
-    return MPC(dynamics, cost, horizon, bounds=bounds, **options)
+    options |= dict(bounds=environment.control_bounds, difference=dynamics.difference)
+    return MPC(dynamics, cost, horizon, **options)
