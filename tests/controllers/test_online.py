@@ -312,6 +312,16 @@ def test_explore_identifies():
     assert reached < 0.3 * mean_cost(K, w)
 
 
+@pytest.mark.parametrize("low, K", [(-0.5, [[0.0, 0.0]]), (-0.1, [[0.2, 0.8]])])
+def test_explore_identifies_through_bounds(low, K):
+    """Bounds that clip each random control, and with a gain also what it asks for."""
+    A = np.array([[0.5, 0.3], [0.0, 0.4]])
+    plant, w = dlx.LinearDynamics(A, B), np.full((20_001, 2), 0.1)
+    learner = c.Explore(lambda model: c.Zero(1), np.array(K), steps=20_000)
+    found = run(learner, w, plant, control_bounds=(low, 0.5)).controller_state.model
+    assert np.max(np.abs(found.B - B)) < 0.1 and np.max(np.abs(found.A - A)) < 0.1
+
+
 def mean_cost(K, w):
     """Of a gain, over the last 500 steps."""
     x, costs = np.zeros(2), []

@@ -25,8 +25,9 @@ class ExploreState(NamedTuple):
 
     - `step`: the number of steps so far.
     - `excitations`: the last random controls, newest first.
-    - `moments`: sums of the products of the state and the random control `j + 1` steps
-        before, shape `(order + 1, n, m)`.
+    - `clipped`: what the environment added to the last control, by clipping.
+    - `moments`: sums of the products of the state and `clipped` with the random control
+        `j + 1` steps before the state, shape `(order + 1, n + m, m)`.
     - `model`: the identified dynamics. `arrays`: the arrays of its controller.
         `inner`: the state of that controller.
     - `key`: the random key of the next control.
@@ -34,7 +35,8 @@ class ExploreState(NamedTuple):
 
     step: Int[Array, ""]
     excitations: Float[Array, "order+1 m"]
-    moments: Float[Array, "order+1 n m"]
+    clipped: Float[Array, " m"]
+    moments: Float[Array, "order+1 n+m m"]
     model: LinearDynamics
     arrays: PyTree
     inner: PyTree
@@ -45,14 +47,21 @@ class Explore(AbstractController):
     r"""Explore, identify, then control: an online learner for an unknown linear plant.
 
     In the first `steps` steps the control is $u_t = -K x_t + a\, e_t$, where the
-    entries of $e_t$ are random signs. The correlation of $e_t$ with the states that
-    follow does not depend on the disturbances, even if an adversary chooses them:
+    entries of $e_t$ are random signs. The environment may clip this control, which adds
+    $c_t$ to it. The correlations of $e_t$ with the states and with the $c_t$ that follow
+    do not depend on the disturbances, even if an adversary chooses them:
 
-    $$N_j = \tfrac1a \operatorname{mean}_t\, x_{t+j+1} e_t^\top \to (A - B K)^j B$$
+    $$N_j = \tfrac1a \operatorname{mean}_t\, x_{t+j+1} e_t^\top, \qquad
+    C_j = \tfrac1a \operatorname{mean}_t\, c_{t+j} e_t^\top$$
 
-    So $B = N_0$, and $A - B K$ is the least-squares solution of
+    $$N_0 \to B\, (I + C_0), \qquad N_j \to (A - B K)\, N_{j-1} + B C_j$$
 
-    $$(A - B K)\, [N_0 \cdots N_{q-1}] = [N_1 \cdots N_q]$$
+    So $B = N_0\, (I + C_0)^{-1}$, and $A - B K$ is the least-squares solution of
+
+    $$(A - B K)\, [N_0 \cdots N_{q-1}] = [N_1 - B C_1 \cdots N_q - B C_q]$$
+
+    If clipping leaves nothing of a random control, the identified dynamics are not
+    finite.
 
     After these steps the control comes from the controller that `build` makes for
     $x_{t+1} = A x_t + B u_t$. With [`delucax.controllers.gpc`][] and `steps` near
@@ -126,7 +135,8 @@ class Explore(AbstractController):
         return ExploreState(
             step=jnp.zeros((), jnp.int32),
             excitations=jnp.zeros((self.order + 1, m), dtype),
-            moments=jnp.zeros((self.order + 1, n, m), dtype),
+            clipped=jnp.zeros(m, dtype),
+            moments=jnp.zeros((self.order + 1, n + m, m), dtype),
             model=model,
             arrays=arrays,
             inner=inner,
@@ -139,7 +149,8 @@ class Explore(AbstractController):
         dtype, y = y.dtype, y.astype(self.K.dtype)
         # Signs e have E[e e'] = I and are independent of all else, so the mean of x e'
         # is the response, for any disturbances. Row j is from j + 1 steps ago.
-        moments = y[:, None] * state.excitations[:, None, :] / self.scale**2
+        response = jnp.concatenate([y, state.clipped])[:, None]
+        moments = response * state.excitations[:, None, :] / self.scale**2
         exploring = state.step < self.steps
         moments = jnp.where(exploring, state.moments + moments, state.moments)
         state = state._replace(moments=moments)
@@ -152,6 +163,7 @@ class Explore(AbstractController):
         state = state._replace(
             inner=_where(exploring, state.inner, inner),
             excitations=shift(excitation, state.excitations),
+            clipped=-u,  # `applied` adds the control after clipping
             key=key,
         )
         return u.astype(dtype), state
@@ -159,21 +171,24 @@ class Explore(AbstractController):
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         inner = self._controller(state).applied(u, cost, state.inner)
         inner = _where(state.step < self.steps, state.inner, inner)
-        return state._replace(inner=inner, step=state.step + 1)
+        clipped = state.clipped + u.astype(state.clipped.dtype)
+        return state._replace(inner=inner, clipped=clipped, step=state.step + 1)
 
     def _identified(self, state: ExploreState) -> ExploreState:
         # There are j fewer observations of lag j.
         counts = self.steps - 1 - jnp.arange(self.order + 1)
-        N = state.moments / counts[:, None, None].astype(state.moments.dtype)
+        moments = state.moments / counts[:, None, None].astype(state.moments.dtype)
+        N, C = jnp.split(moments, [self.K.shape[1]], axis=1)
+        B = solve(jnp.eye(len(C[0]), dtype=C.dtype) + C[0].T, N[0].T).T
         before = jnp.concatenate(list(N[:-1]), axis=1)
-        after = jnp.concatenate(list(N[1:]), axis=1)
+        after = jnp.concatenate(list(N[1:] - B @ C[1:]), axis=1)
         gram = before @ before.T
         # Regularised, for directions that were not excited.
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
         gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
         closed_loop = solve(gram, before @ after.T).T
         # The identified closed loop is A - B K.
-        model = LinearDynamics(closed_loop + N[0] @ self.K, N[0], dt=self.dt)
+        model = LinearDynamics(closed_loop + B @ self.K, B, dt=self.dt)
         arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)
 
