@@ -86,6 +86,17 @@ def partial(base=None):
     return plant, c.drc(plant, dlx.costs.Quadratic(R, R), base=base, memory=3)
 
 
+def test_a_small_disturbance_beside_a_large_state():
+    """A disturbance is compared with the terms of its own entry."""
+    plant = dlx.LinearDynamics(0.9 * np.eye(2), np.eye(2))
+    env, w = dlx.Environment(plant, COST), np.full((4, 2), [0.0, 1e-8])
+    learner = c.gpc(plant, COST)
+    states, *_ = follow(env, learner, np.array([1e9, 1.0]), w)
+    signal = states.loop.signal[1:, 0]
+    assert np.all(signal[:, 0] == 0)
+    assert_close(signal[:, 1], w[:-1, 1], atol=1e-14)
+
+
 def test_natures_output():
     """It is what the base alone would have shown, whatever was added."""
     plant, learner = partial()

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -55,6 +56,8 @@ class ClosedLoopState(NamedTuple):
     - `signal`: the last values of the signal, newest first.
     - `predicted`: the next state without a disturbance, by the model; `None` if the
         state is not observed.
+    - `terms`: the size of the terms of which each entry of `predicted` is a sum; `None`
+        with `predicted`.
     - `added`: the last added controls, newest first.
     - `forced`: the forced response, which is the state due to the added controls alone;
         `None` if the signal is not nature's output.
@@ -70,6 +73,7 @@ class ClosedLoopState(NamedTuple):
     started: Array
     signal: Float[Array, "memory p"]
     predicted: Float[Array, " n"] | None
+    terms: Float[Array, " n"] | None
     added: Float[Array, "h m"]
     forced: Float[Array, " q"] | None
     now: Tangents | None
@@ -191,6 +195,7 @@ class ClosedLoop(eqx.Module):
             started=jnp.zeros((), bool),
             signal=zeros(self.memory, p),
             predicted=zeros(n) if self.observed else None,
+            terms=zeros(n) if self.observed else None,
             added=zeros(horizon, m),
             forced=zeros(q) if self.nature else None,
             now=now if varies else None,
@@ -221,10 +226,10 @@ class ClosedLoop(eqx.Module):
 
     def _disturbance(self, state: ClosedLoopState) -> Float[Array, " n"]:
         """The last disturbance: the state minus the state that the model predicted."""
-        assert state.predicted is not None
+        assert state.predicted is not None and state.terms is not None
         # w_{t-1} = x_t - F(x_{t-1}, u_{t-1}), with wrapped angles.
         off = self.dynamics.difference(state.y, state.predicted)
-        size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
+        size = jnp.abs(state.y) + state.terms
         # A step that is compiled twice may differ in rounding, which is no disturbance.
         is_more = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
         return jnp.where(state.started & is_more, off, 0)
@@ -245,8 +250,13 @@ class ClosedLoop(eqx.Module):
         tangents: Any = self.tangents if state.now is None else state.now
         v = u - state.u_base
         predicted, impulses, forced = state.predicted, state.impulses, state.forced
+        terms = state.terms
         if predicted is not None:
-            predicted, _ = self.dynamics.advance(state.t, state.y, u, None)
+            step = lambda x, u: self.dynamics.advance(state.t, x, u, None)[0]
+            predicted, slopes = value_and_jacobians(step, state.y, u)
+            pairs = zip(slopes, (state.y, u), strict=True)
+            sizes = [matvec(jnp.abs(slope), jnp.abs(z)) for slope, z in pairs]
+            terms = lax.stop_gradient(jnp.abs(predicted) + sum(sizes))
         if impulses is not None:
             # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}. Each
             # product is updated by one factor.
@@ -258,6 +268,7 @@ class ClosedLoop(eqx.Module):
             base=self.base.applied(u, cost, state.base),
             started=jnp.ones_like(state.started),
             predicted=predicted,
+            terms=terms,
             added=shift(v, state.added),
             forced=forced,
             impulses=impulses,
