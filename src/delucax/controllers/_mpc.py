@@ -107,10 +107,11 @@ class MPC(AbstractController):
             y = measure()
             u, state = mpc.feedback(t, y, state)
 
-    Calling the controller does both. The first program approximates the problem about
-    the first trajectory of `start`, so pass a converged plan as `start` if you have
-    one. If a program cannot be solved, the next program approximates the problem about
-    the same plan, shifted by one more step.
+    Calling the controller does both. If there is a `fallback`, also call
+    `state = mpc.applied(u, cost, state)` at the end of each step. The first program
+    approximates the problem about the first trajectory of `start`, so pass a converged
+    plan as `start` if you have one. If a program cannot be solved, the next program
+    approximates the problem about the same plan, shifted by one more step.
 
     **Derivatives.** The derivatives of the control are the derivatives of the planner.
     [`delucax.planning.ILQR`][] uses the implicit function theorem, and gives NaN if a
