@@ -164,6 +164,8 @@ def local_mpc(
 ) -> MPC:
     r"""The MPC of an environment, with the model, cost and bounds of the environment.
 
+    Differences of angles are wrapped, as `environment.dynamics.difference` does.
+
     With an `lqr`, the final cost of each plan is the cost to go of that regulator,
     $\delta x^\top P\, \delta x$.
 
