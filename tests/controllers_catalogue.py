@@ -128,6 +128,11 @@ def scheduled(size):
     return c.Scheduled(eqx.filter_vmap(lambda g: c.Linear(g * FEEDBACK))(gains), DT)
 
 
+def scheduled_pid(size):
+    make = lambda kp: c.PID(kp, 2.0, 0.3, dt=DT, output=[[1.0, 0.1]])
+    return c.Scheduled(eqx.filter_vmap(make)(size * jnp.linspace(1, 2, 5)), DT)
+
+
 def receding(size, **options):
     cost = dlx.costs.Quadratic(size * jnp.eye(2), 0.1 * jnp.eye(1), final=jnp.eye(2))
     return c.MPC(dlx.LinearDynamics(A, B, dt=DT), cost, 4, **options)
@@ -212,6 +217,7 @@ CASES = {
     "Categorical": Case(choosing, reads_all=False),
     "Categorical, greedy": Case(lambda size: choosing(size).greedy, reads_all=False),
     "Scheduled": Case(scheduled),
+    "Scheduled PID": Case(scheduled_pid),
     "Residual": Case(
         lambda size: c.Residual(c.Linear(size * FEEDBACK), mlp(size), (-1.0, 1.0))
     ),

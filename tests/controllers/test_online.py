@@ -89,8 +89,8 @@ def partial(base=None):
 def test_a_small_disturbance_beside_a_large_state():
     """A disturbance is compared with the terms of its own entry."""
     plant = dlx.LinearDynamics(0.9 * np.eye(2), np.eye(2))
-    env, w = dlx.Environment(plant, COST), np.full((4, 2), [0.0, 1e-8])
-    learner = c.gpc(plant, COST)
+    cost, w = dlx.costs.Quadratic(Q, np.eye(2)), np.full((4, 2), [0.0, 1e-8])
+    env, learner = dlx.Environment(plant, cost), c.gpc(plant, cost)
     states, *_ = follow(env, learner, np.array([1e9, 1.0]), w)
     signal = states.loop.signal[1:, 0]
     assert np.all(signal[:, 0] == 0)
@@ -330,7 +330,7 @@ def test_explore_identifies_through_bounds(low, K):
     plant, w = dlx.LinearDynamics(A, B), np.full((20_001, 2), 0.1)
     learner = c.Explore(lambda model: c.Zero(1), np.array(K), steps=20_000)
     found = run(learner, w, plant, control_bounds=(low, 0.5)).controller_state.model
-    assert np.max(np.abs(found.B - B)) < 0.1 and np.max(np.abs(found.A - A)) < 0.1
+    assert np.max(np.abs(found.B - B)) < 0.05 and np.max(np.abs(found.A - A)) < 0.3
 
 
 def mean_cost(K, w):

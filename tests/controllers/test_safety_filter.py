@@ -337,15 +337,16 @@ def test_derivatives_between_bounds_that_may_be_infinite():
 @needs_x64
 def test_derivatives_of_a_program():
     """At a corner of two conditions, where there is no closed form."""
-    safe = made(2, 3)
+    z = np.array([1.0, 0.2, 0.0, 0.1, 1.0, -0.3, -2.0, -1.5, 0.1, 0.2, 0.3, 1, 1, 2])
+    for safe in (made(2, 3), made(2, 3, bounds=(-np.inf, 9.0))):
 
-    def control(z):
-        u, _ = act(safe, z[:6].reshape(2, 3), z[6:8], z[8:])
-        return u @ jnp.array([1.0, -2.0, 0.5])
+        def control(z, safe=safe):
+            safe = eqx.tree_at(lambda s: s.weight, safe, z[11:])
+            u, _ = act(safe, z[:6].reshape(2, 3), z[6:8], z[8:11])
+            return u @ jnp.array([1.0, -2.0, 0.5])
 
-    z = np.array([1.0, 0.2, 0.0, 0.1, 1.0, -0.3, -2.0, -1.5, 0.1, 0.2, 0.3])
-    gradient = assert_gradient(control, z, atol=1e-6)
-    assert np.all(gradient[:8] != 0)
+        gradient = assert_gradient(control, z, atol=1e-6)
+        assert np.all(gradient[:8] != 0)
 
 
 @needs_x64

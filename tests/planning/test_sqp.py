@@ -145,12 +145,11 @@ def test_hard_bounds_stay_hard_next_to_soft_limits():
     weights = jnp.linspace(0.01, 0.02, 20)[:, None]
     soft = Constraints(controls=dlx.qp.Soft(-0.5, 0.5, quadratic=weights))
 
-    @jax.jit
-    @jax.value_and_grad(has_aux=True)
-    def solved(high):
+    def solve(high):
         plan = SQP()(dynamics, cost, x0, 20, bounds=(-1.0, high), constraints=soft)
         return plan.cost, plan
 
+    solved = jax.jit(jax.value_and_grad(solve, has_aux=True))
     (_, plan), slope = solved(1.0)
     u = plan.controls
     assert_close((jnp.min(u), jnp.max(u)), (-1.0, 1.0), atol=1e-8)

@@ -160,9 +160,15 @@ def _by_program(task: Task, s: Array, A: Array) -> Array:
         linear = jnp.where(soft, 0, linear)
         quadratic = jnp.where(soft, jnp.where(soft, price, 0) * size, 0)
     rows = qp.Rows(A / length[:, None], lower=lower, linear=linear, quadratic=quadratic)
+
+    def scaled(end):
+        # An infinite end would make the derivative by the weights NaN.
+        finite = jnp.isfinite(end)
+        return jnp.where(finite, root * (jnp.where(finite, end, n) - n) / far, end)
+
     bounds = None
     if low is not None and high is not None:
-        bounds = root * (low - n) / far, root * (high - n) / far
+        bounds = scaled(low), scaled(high)
     P, q = jnp.eye(len(n), dtype=s.dtype), jnp.zeros(len(n), s.dtype)
     # Tighter than the default, because bounds may be large in this unit.
     tol = float(jnp.finfo(s.dtype).eps) ** 0.625

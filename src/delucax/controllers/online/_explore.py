@@ -48,8 +48,8 @@ class Explore(AbstractController):
 
     In the first `steps` steps the control is $u_t = -K x_t + a\, e_t$, where the
     entries of $e_t$ are random signs. The environment may clip this control, which adds
-    $c_t$ to it. The correlations of $e_t$ with the states and with the $c_t$ that follow
-    do not depend on the disturbances, even if an adversary chooses them:
+    $c_t$ to it. The correlations of $e_t$ with $c_t$ and with all that follows do not
+    depend on the disturbances, even if an adversary chooses them:
 
     $$N_j = \tfrac1a \operatorname{mean}_t\, x_{t+j+1} e_t^\top, \qquad
     C_j = \tfrac1a \operatorname{mean}_t\, c_{t+j} e_t^\top$$
