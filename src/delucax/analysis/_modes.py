@@ -13,6 +13,8 @@ from ._state_space import LinearModel, state_space, StateSpace
 
 
 _SEARCHES = 3
+_SWEEPS = 24
+"""The largest number of balancing sweeps."""
 
 
 class ModalTest(eqx.Module):
@@ -370,8 +372,9 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
 
     $$\begin{bmatrix} A - z I & B \\ C & 0 \end{bmatrix}$$
 
-    The algorithm removes the states that the outputs observe directly. Then it applies
-    this step to the transposed system. The poles of the remaining system are the zeros.
+    The algorithm first balances the matrices, so the units of the plant hardly matter.
+    It removes the states that the outputs observe directly. Then it applies this step
+    to the transposed system. The poles of the remaining system are the zeros.
     The number of zeros depends on the values of the matrices, so the matrices cannot be
     traced.
 
@@ -411,8 +414,8 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
             "zeros: model must be concrete, got one that is being traced (by jax.jit, "
             "jax.vmap or jax.grad). The number of zeros depends on its values."
         )
-    A, B, C, D = (np.asarray(M) for M in system[:4])
     # By NumPy, because the sizes of the reduced systems depend on ranks.
+    A, B, C, D = _balanced(*(np.asarray(M) for M in system[:4]))
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
     A, B, C, D = _hidden_part(A, B, C, D, tolerance)
@@ -423,6 +426,39 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
     # The zeros are the modes under the input that keeps the outputs at zero.
     left = A - B @ np.linalg.solve(D, C) if D.size else A
     return eigenvalues(left)
+
+
+def _balanced(A, B, C, D):
+    """The system in other units of its states, inputs and outputs. The largest entries
+    of the row and of the column of each state have about the same size. `D` is zero.
+
+    Source: Osborne, 1960.
+    """
+    n = len(A)
+    table = np.block([[A, B], [C, D]])
+    A, B, C, D = table[:n, :n], table[:n, n:], table[n:, :n], table[n:, n:]
+    for _ in range(_SWEEPS):
+        # Inputs and outputs are smaller than A, so that they decide the unit of a state
+        # only if no other state does.
+        half = np.max(np.abs(A)) / 2
+        for M, axis in (B, 0), (C, 1):
+            M *= _unit(half, np.max(np.abs(M), axis=axis, keepdims=True))
+        before = table.copy()
+        for i in range(n):
+            lines = np.delete(table[i], i), np.delete(table[:, i], i)
+            unit = _unit(*(np.max(np.abs(line)) for line in lines), root=2)
+            table[i] /= unit
+            table[:, i] *= unit
+        if np.array_equal(table, before):
+            break
+    return A, B, C, D
+
+
+def _unit(a, b, root=1):
+    """A power of two near `(a / b)^(1 / root)`, or 1 if `a` or `b` is zero."""
+    usable = (a > 0) & (b > 0)
+    exponent = np.log2(np.where(usable, a, 1)) - np.log2(np.where(usable, b, 1))
+    return np.ldexp(a.dtype.type(1), np.rint(exponent / root).astype(int))
 
 
 def _hidden_part(A, B, C, D, tolerance):
