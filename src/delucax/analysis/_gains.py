@@ -16,6 +16,7 @@ from .._module import as_float_array, shown
 from .._results import choose, raise_if, raise_on_failure, Result, RESULTS
 from .._typing import Array, BoolScalar, Scalar
 from ..math._linear_solve import eigenvalues, lu_solve
+from ..math._norms import one_if_zero
 from ._gramians import stable_gramian
 from ._state_space import (
     expanded_gain,
@@ -133,7 +134,12 @@ def dcgain(
 def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
     # A pole at frequency zero makes this matrix singular, up to rounding.
     matrix = system.eye - system.A if system.is_discrete else -system.A
-    values = xp.linalg.svd(stop_gradient(matrix), compute_uv=False)
+    # With rows and columns of one size, because states and times have any units.
+    scaled = stop_gradient(matrix)
+    for axis in (1, 0):
+        sizes = xp.max(xp.abs(scaled), axis=axis, keepdims=True)
+        scaled = scaled / one_if_zero(sizes)
+    values = xp.linalg.svd(scaled, compute_uv=False)
     eps = xp.finfo(values.dtype).eps
     singular = ~(values[-1] > len(values) * eps * values[0])
     invertible = xp.where(singular, system.eye, matrix)
