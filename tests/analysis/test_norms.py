@@ -170,6 +170,23 @@ def test_a_gain_of_zero():
     assert np.all(np.isfinite(slope))
 
 
+def test_of_nan_the_norms_are_nan():
+    """A search for the least norm must not end there."""
+
+    @jax.jit
+    @jax.vmap
+    def norms(a, b):
+        model = LinearSystem(-a * jnp.eye(1), b * jnp.eye(1))
+        peak = an.hinf_norm(model, throw=False)
+        ill_posed = peak.result == dlx.RESULTS.ill_posed
+        return jnp.stack([an.h2_norm(model), peak.gain]), ill_posed
+
+    found, ill_posed = norms(np.array([2, np.nan, 2]), np.array([1, 1, np.nan]))
+    nan = np.full(2, np.nan)
+    assert_close(found, [[0.5, 0.5], nan, nan], rtol=1e-6)
+    np.testing.assert_array_equal(ill_posed, [False, True, True])
+
+
 def test_frequency_response_and_dcgain_are_controls():
     for discrete in (False, True):
         model, theirs = random_model(3, 4, 2, 3, discrete)

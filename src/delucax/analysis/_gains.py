@@ -206,7 +206,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
         [`delucax.LinearDynamics`][].
     - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
 
-    **Returns:** the norm, a scalar.
+    **Returns:** the norm, a scalar; NaN if a number of a traced model is not finite.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown.
@@ -234,9 +234,11 @@ def _h2_norm(system: StateSpace) -> Scalar:
     W = stable_gramian(system.stable_or_placeholder(stable))
     # The square root has no derivative at zero, so the unused branch uses 1.
     square = xp.trace(system.C @ W @ system.C.T)
-    positive = square > 0
+    # Negated, so that a NaN stays NaN.
+    positive = ~(square <= 0)
     norm = xp.where(positive, xp.sqrt(xp.where(positive, square, 1)), 0)
-    return xp.where(stable, norm, xp.inf)
+    norm = xp.where(stable, norm, xp.inf)
+    return xp.where(system.is_finite(), norm, xp.nan)
 
 
 @host_unless_traced
@@ -267,7 +269,8 @@ def hinf_norm(
     - `throw`: raise an error if the search does not converge (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.analysis.PeakGain`][].
+    **Returns:** a [`delucax.analysis.PeakGain`][]. If a number of a traced model is not
+    finite, the gain is NaN and `result` is `RESULTS.ill_posed`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown. With `throw`, an error at run time if the search does not converge.
@@ -320,10 +323,15 @@ def peak_gain(system: StateSpace) -> PeakGain:
         at_pole = xp.abs(xp.imag(least))
     else:
         at_pole = xp.abs(xp.angle(least)) / stop_gradient(system.dt)
+    gain = xp.where(stable, gain, xp.inf)
+    frequency = xp.where(stable, frequency, at_pole)
+    result = choose(ended, RESULTS.successful, RESULTS.not_converged)
+    # The search passes over NaN.
+    posed = system.is_finite()
     return PeakGain(
-        xp.where(stable, gain, xp.inf),
-        xp.where(stable, frequency, at_pole),
-        choose(ended, RESULTS.successful, RESULTS.not_converged),
+        xp.where(posed, gain, xp.nan),
+        xp.where(posed, frequency, xp.nan),
+        choose(posed, result, RESULTS.ill_posed),
     )
 
 

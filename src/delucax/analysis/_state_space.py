@@ -52,6 +52,11 @@ class StateSpace(NamedTuple):
         poles = eigenvalues(stop_gradient(self.A))
         return xp.all(self.growth(poles) < 0)
 
+    def is_finite(self) -> BoolScalar:
+        """Whether all numbers are finite."""
+        numbers = [xp.ravel(M) for M in self if M is not None]
+        return xp.all(xp.isfinite(xp.concatenate(numbers)))
+
     def stable_or_placeholder(self, stable: BoolScalar) -> "StateSpace":
         """This system, or a stable placeholder if it is not stable, so that discarded
         results have finite derivatives."""
