@@ -9,6 +9,7 @@ from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
 from .._jax import compiled_unless_on_host, host_unless_traced, xp
 from .._typing import Array, Difference, Numbers
 from ..dynamics import c2d, linearize, OperatingPoint
+from ..math._exponential import unit_beside
 from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
@@ -78,14 +79,18 @@ def _weights_over(
     A: Array, B: Array, Q: Array, R: Array, S: Any, dt: ArrayLike
 ) -> tuple[Array, Array, Array]:
     n, m = B.shape
+    dt = xp.asarray(dt, A.dtype)
+    # The control in a unit for which a large B does not lose the digits of A.
+    unit = unit_beside(B * dt, A * dt)
+    B, S, R = B / unit, S / unit, R / unit**2
     # With the held control as a state, du/dt = 0, the cost of a step is a Gramian,
     # which takes one matrix exponential (Van Loan).
     zero = xp.zeros((m, n + m), A.dtype)
     field = xp.concatenate([xp.concatenate([A, B], axis=1), zero])
     charge = xp.block([[Q, S], [S.T, R]]).astype(A.dtype)
     # The integral of expm(F' s) charge expm(F s) over [0, dt] has blocks Qd, Sd, Rd.
-    total = gramian_over(field.T, charge, xp.asarray(dt, A.dtype))
-    return total[:n, :n], total[n:, n:], total[:n, n:]
+    total = gramian_over(field.T, charge, dt)
+    return total[:n, :n], total[n:, n:] * unit**2, total[:n, n:] * unit
 
 
 def lqrd(

@@ -11,7 +11,8 @@ from .._check_models import check_time_invariant
 from .._jax import compiled_unless_on_host, host_unless_traced, stop_gradient, xp
 from .._results import raise_if
 from .._typing import Array, BoolScalar, Matrix, Scalar, Vector
-from ..math._exponential import exponential
+from ..math._balancing import balanced
+from ..math._exponential import exponential_of_blocks
 from ..math._linear_solve import full_precision, solve
 from ..systems import LinearSystem
 from ._linear import LinearDynamics
@@ -174,22 +175,27 @@ def _sampled(
     the conversion failed."""
     n, inputs = system.state_size, _inputs(system, system.dx_ref)
     dt = xp.asarray(dt, inputs.dtype)
+    # In units of the states that balance A. Otherwise a large entry of A hides others.
+    A, unit = balanced(system.A)
+    unit = unit[:, None]
+    inputs = inputs / unit
     if method == "zoh":
         # exp([[A, B], [0, 0]] dt) holds exp(A dt) and the integral times B, however
         # singular A is.
-        zero = xp.zeros((inputs.shape[1], n + inputs.shape[1]), inputs.dtype)
-        block = xp.concatenate([xp.concatenate([system.A, inputs], axis=1), zero])
-        sampled = exponential(block * dt)[:n]
+        zero = xp.zeros((inputs.shape[1], inputs.shape[1]), inputs.dtype)
+        A, inputs, _ = exponential_of_blocks(A * dt, inputs * dt, zero)
         failed = xp.asarray(False)
     else:
         # x_next - x = dt (A (x + x_next) / 2 + B u).
-        half = system.A * (dt / 2)
+        half = A * (dt / 2)
         eye = xp.eye(n, dtype=half.dtype)
         right = xp.concatenate([eye + half, inputs * dt], axis=1)
         sampled = solve(eye - half, right)
+        A, inputs = sampled[:, :n], sampled[:, n:]
         failed = ~xp.all(xp.isfinite(sampled))
-    B, drift, E = _parts(sampled[:, n:], system)
-    return (sampled[:, :n], B, E, system.x_ref + drift), failed
+    A, inputs = A * unit / unit.T, inputs * unit
+    B, drift, E = _parts(inputs, system)
+    return (A, B, E, system.x_ref + drift), failed
 
 
 @host_unless_traced
@@ -201,7 +207,11 @@ def _held(dynamics: LinearDynamics, method: str) -> tuple[_Matrices, BoolScalar]
     # Control, constant and disturbance are converted together, as columns of one
     # matrix.
     inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
-    A, inputs, failed = _INVERSES[method][0](dynamics.A, inputs, dynamics.dt)
+    # In units of the states that balance A. Otherwise a large entry of A hides others.
+    A, unit = balanced(dynamics.A)
+    unit = unit[:, None]
+    A, inputs, failed = _INVERSES[method][0](A, inputs / unit, dynamics.dt)
+    A, inputs = A * unit / unit.T, inputs * unit
     B, drift, E = _parts(inputs, dynamics)
     return (A, B, E, drift), failed
 

@@ -1,10 +1,12 @@
 """The matrix exponential."""
 
+import functools
 import math
 
 from .._jax import fori_loop, stop_gradient, xp
-from .._typing import Square
+from .._typing import Array, Scalar, Square
 from ._linear_solve import solve
+from ._norms import power_of_two
 
 
 _ORDER = 13
@@ -45,3 +47,24 @@ def exponential(A: Square) -> Square:
         return xp.where(more, safe @ safe, E)
 
     return fori_loop(0, _MAX_SQUARINGS, double, start)
+
+
+def exponential_of_blocks(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
+    """The blocks of `exp([[A, B], [0, C]])` that are not zero: upper left, upper right
+    and lower right.
+
+    `B` is made smaller, because the squarings for a large `B` would lose the digits of
+    `A` and `C`. The upper right block is linear in `B`.
+    """
+    n, unit = len(A), unit_beside(B, A, C)
+    zero = xp.zeros((len(C), n), A.dtype)
+    E = exponential(xp.block([[A, B / unit], [zero, C]]))
+    return E[:n, :n], E[:n, n:] * unit, E[n:, n:]
+
+
+def unit_beside(B: Array, *others: Array) -> Scalar:
+    """A power of two of at least 1. In this unit, `B` is at most about as large as 1 or
+    the largest of `others`."""
+    size = lambda M: xp.linalg.norm(stop_gradient(M), 1)
+    most = functools.reduce(xp.maximum, map(size, others), 1)
+    return power_of_two(xp.maximum(size(B) / most, 1))

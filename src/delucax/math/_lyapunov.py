@@ -5,7 +5,8 @@ from jaxtyping import Float
 
 from .._jax import lax, matmul, scan, stop_gradient, while_loop, xp
 from .._typing import Array, Scalar, Square
-from ._exponential import exponential
+from ._balancing import balanced
+from ._exponential import exponential_of_blocks
 from ._linear_solve import full_precision, solve, symmetric
 from ._norms import largest, relative_size
 
@@ -159,15 +160,17 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
 
     Source: Van Loan, 1978.
     """
-    n = A.shape[0]
+    # In units of the states that balance A. Otherwise a large entry of A hides others.
+    A, unit = balanced(A)
+    units = unit[:, None] * unit
+    Q = Q / units
     fastest = stop_gradient(time * xp.linalg.norm(A))
     doublings = xp.clip(xp.ceil(xp.log2(xp.maximum(fastest, 1))), 0, MAX_DOUBLINGS)
     short = time * 0.5**doublings
-    block = xp.block([[-A, Q], [xp.zeros_like(A), A.T]]) * short
     # exp([[-A, Q], [0, A']] t) = [[exp(-A t), exp(-A t) W], [0, exp(A' t)]].
-    blocks = exponential(block)
-    power = blocks[n:, n:].T
-    W = power @ blocks[:n, n:]
+    _, beside, power = exponential_of_blocks(-A * short, Q * short, A.T * short)
+    power = power.T
+    W = power @ beside
 
     # W(2t) = W(t) + exp(A t) W(t) exp(A' t), in a loop of fixed length, which reverse
     # mode needs.
@@ -180,4 +183,4 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
         return (W_next, xp.where(more, safe_power @ safe_power, power)), None
 
     (W, _), _ = scan(double, (W, power), xp.arange(MAX_DOUBLINGS))
-    return symmetric(W)
+    return symmetric(W) * units

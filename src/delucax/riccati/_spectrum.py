@@ -6,7 +6,8 @@ import numpy as np
 
 from .._jax import matmul, while_loop, xp
 from .._typing import BoolScalar, Scalar, Square
-from ..math._norms import largest, power_of_two, size
+from ..math._balancing import balanced
+from ..math._norms import largest, size
 
 
 _SQUARINGS = 60
@@ -17,7 +18,6 @@ _LARGE = 16
 """For a larger matrix, the squaring continues in the few directions that remain."""
 _BLOCK = 4
 _TAYLOR_DEGREE = 12
-_SWEEPS = 24
 
 
 def spectral_radius(A: Square) -> Scalar:
@@ -37,7 +37,7 @@ def spectral_radius(A: Square) -> Scalar:
 
 def spectral_abscissa(A: Square) -> Scalar:
     """The largest real part of an eigenvalue, up to rounding of the balanced matrix."""
-    return abscissa_and_size(balanced(A))[0]
+    return abscissa_and_size(balanced(A)[0])[0]
 
 
 def abscissa_and_size(
@@ -79,7 +79,7 @@ def is_stable(discrete: bool, A: Square, margin: Scalar | float) -> BoolScalar:
     if discrete:
         flow, limit = A, xp.log1p(-xp.asarray(margin, A.dtype))
     else:
-        flow, h = _short_flow(balanced(A))
+        flow, h = _short_flow(balanced(A)[0])
         limit = -margin * h
     return _growth(flow, False, limit)[0] < limit
 
@@ -159,33 +159,3 @@ def _growth(A, probing, limit=None):
     _, span, kept, logarithm, weight, finished = while_loop(more, body, start)
     narrow = finished & xp.isfinite(logarithm)
     return above(logarithm, weight), narrow, span, kept
-
-
-def balanced(A: Square) -> Square:
-    """`D^-1 A D` with a diagonal `D` that gives rows and columns similar sizes.
-
-    `D` has powers of two, so that there is no rounding. Source: Osborne, 1960.
-    """
-
-    def more(carry):
-        k, _, ratio = carry
-        return (k < _SWEEPS) & (xp.max(xp.abs(xp.log2(ratio))) > 1)
-
-    def sweep(carry):
-        k, scale, _ = carry
-        scaled = xp.abs(A) * scale[None, :] / scale[:, None]
-        off = scaled - xp.diag(xp.diagonal(scaled))
-        rows, columns = xp.sum(off, axis=1), xp.sum(off, axis=0)
-        usable = (rows > 0) & (columns > 0)
-        # The square root of this ratio makes a row and its column equally large.
-        ratio = xp.where(usable, rows, 1) / xp.where(usable, columns, 1)
-        # All scales change at once, so take half of the step of a single scale.
-        scale = scale * ratio**0.25
-        return k + 1, scale / xp.exp2(xp.round(xp.mean(xp.log2(scale)))), ratio
-
-    # Balancing need not be exact.
-    one = xp.ones(A.shape[0], A.dtype)
-    _, scale, _ = while_loop(more, sweep, (0, one, 4 * one))
-    usable = xp.isfinite(scale) & (scale > 0)
-    scale = power_of_two(xp.where(usable, scale, 1))
-    return A * scale[None, :] / scale[:, None]
