@@ -81,9 +81,10 @@ def test_small_products(m, n):
 
 
 @once
-def test_matvec_names_the_shapes():
-    with pytest.raises(ValueError, match=r"\(2, 3\).*\(2,\)"):
-        dlx.math.matvec(jnp.ones((2, 3)), jnp.ones(2))
+@pytest.mark.parametrize("name, size", [("matvec", 2), ("quadratic_form", 3)])
+def test_small_products_name_the_shapes(name, size):
+    with pytest.raises(ValueError, match=rf"{name}: .*\(2, 3\).*\({size},\)"):
+        getattr(dlx.math, name)(jnp.ones((2, 3)), jnp.ones(size))
 
 
 @needs_x32

@@ -98,7 +98,12 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
         Array(5., dtype=float32)
         ```
     """
-    vector = jnp.asarray(vector)
+    matrix, vector = jnp.asarray(matrix), jnp.asarray(vector)
+    if vector.ndim != 1 or matrix.shape != 2 * vector.shape:
+        raise ValueError(
+            "quadratic_form: matrix and vector must have shapes (n, n) and (n,), got "
+            f"{matrix.shape} and {vector.shape}."
+        )
     return dot(vector, matvec(matrix, vector))
 
 
