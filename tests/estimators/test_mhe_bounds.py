@@ -122,3 +122,17 @@ def test_an_observation_that_is_not_finite():
     assert mhe.status(after) == dlx.RESULTS.diverged
     assert_close(mhe.estimate(after).mean, mhe.estimate(before).mean)
     assert mhe.status(update(jnp.array([1.0]), after)) == dlx.RESULTS.successful
+
+
+def test_single_precision_of_data_is_kept():
+    """Also with bounds in double precision."""
+    rng = np.random.default_rng(0)
+    mean, ys = rng.normal(size=2), 2 * rng.normal(size=(N, 1))
+    given = DYNAMICS, W, V, mean, P, ys
+    single = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), given)
+    dynamics, *noise, start, spread, seen = single
+    options = dict(bounds=(LOW[:n], HIGH[:n]), disturbance_bounds=(LOW[n:], HIGH[n:]))
+    mhe = c.MHE(dynamics, *noise, N, mean=start, covariance=spread, **options)
+    found = estimated(mhe, seen).x[-1]
+    assert found.dtype == jnp.float32
+    assert_close(found, by_dense_program(mean, ys, LOW, HIGH), atol=1e-4)

@@ -168,7 +168,11 @@ class MHE(AbstractEstimator):
     def _model(self) -> tuple[Model, Belief]:
         """The model with the parameters as states, and the prior of the first state."""
         dynamics, W, P, mean = self.dynamics, self.W, self.covariance, self.mean
-        states, noise, dtype = self.bounds, self.disturbance_bounds, mean.dtype
+        dtype = mean.dtype
+        states, noise = (
+            pair and tuple(end.astype(dtype) for end in pair)
+            for pair in (self.bounds, self.disturbance_bounds)
+        )
         if walks := tuple(self.parameters.values()):
             wide = WithParameters(dynamics, tuple(self.parameters))
             sizes = [value.size for value in wide.values(wide.start).values()]

@@ -128,7 +128,8 @@ def smoothed(steps: Steps, rows: Rows, start: Belief, W: Array) -> Smoothed:
         A, Q, b, rows = here
         if is_wide:
             m = jnp.concatenate([m, jnp.zeros(k, m.dtype)])
-            P = jnp.block([[P, jnp.zeros((n, k), P.dtype)], [jnp.zeros((k, n)), W]])
+            beside = jnp.zeros((n, k), P.dtype)
+            P = jnp.block([[P, beside], [beside.T, W]])
         m, P, kept = observed(m, P, Rows(*rows))
         P = A @ P @ A.T + Q
         return (jnp.sum(A * m, axis=1) + b, (P + P.T) / 2), (before, kept)
