@@ -323,6 +323,7 @@ def test_derivatives_of_the_differential_equation():
         ({"d": np.array([np.nan, 0])}, "d must be finite"),
         ({"final": np.eye(3)}, r"final must have shape \(2, 2\)"),
         ({"final_q": np.ones(3)}, r"final_q must have shape \(2,\)"),
+        ({"final_q": np.array([np.nan, 0])}, "final_q must be finite"),
         ({"horizon": None}, "horizon must be given"),
         ({"horizon": 0}, "horizon must be a whole number"),
         ({"q": np.ones((3, 2))}, r"length of the time axis of q \(3\), got 4"),

@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 
-from .._check import as_vector
+from .._check import finite_vector
 from .._jax import compiled_unless_on_host, host_unless_traced, on_host, vmap, xp
 from .._module import shown
 from .._results import choose, raise_on_failure, Result, RESULTS
@@ -173,7 +173,7 @@ def dre(
     is_affine = any(v is not None for v in (d, q, r, final_q))
     # Without linear terms, p, s and k are zero and are not computed.
     final_q = xp.zeros(n) if final_q is None else final_q
-    final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
+    final_q = finite_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(*stage.values(), final, final_q, is_affine, parallel)
     step = lambda: (
         f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
