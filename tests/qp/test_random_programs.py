@@ -124,3 +124,16 @@ def test_a_hessian_that_is_not_convex_has_a_status_under_a_trace():
     assert s.result == dlx.RESULTS.ill_posed
     s = solver()(data[0], np.nan * data[1], *data[2:])
     assert s.result == dlx.RESULTS.ill_posed
+
+
+def test_a_bound_without_weights_is_no_bound():
+    """The rows that are left are hard."""
+    H, q, *_, G, lower, upper = program(1, "feasible")
+    eye, free = np.eye(N, dtype=dtype()), np.arange(P) < 4
+    weights = np.where(free, 0, np.inf).astype(dtype())
+    soft = dlx.qp.Rows(G, lower=lower, upper=upper, linear=weights)
+    rest = dlx.qp.Rows(G[~free], lower=lower[~free], upper=upper[~free])
+    programs = (dlx.qp.Dense(H + eye, q, rows=rows) for rows in (soft, rest))
+    found, expected = (dlx.qp.solve(program, throw=False) for program in programs)
+    assert found.result == expected.result == dlx.RESULTS.successful
+    assert_close(found.x, expected.x, atol=tolerance(1e-3, 1e-7))

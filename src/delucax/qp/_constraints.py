@@ -17,7 +17,8 @@ class Soft(eqx.Module):
 
     A violation $t \ge 0$ of a bound costs $v\, t + \tfrac12 W t^2$. The penalty is
     exact if $v$ is larger than the multiplier of the hard bound: with such a $v$, the
-    solution violates the bound only if no feasible point satisfies it.
+    solution violates the bound only if no feasible point satisfies it. If both weights
+    are 0, the bound has no effect.
 
     **Arguments:**
 

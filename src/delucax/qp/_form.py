@@ -110,8 +110,11 @@ class AbstractForm(eqx.Module):
         finite = jnp.isfinite(bounds)
         equal = finite[0] & (self.lower == self.upper)
         if self.soft is not None:
+            v, W = self.soft
             # A soft equation may be violated on both sides, so it is two inequalities.
-            equal = equal & ~_are_soft(*self.soft)[0]
+            equal = equal & ~_are_soft(v, W)[0]
+            # A bound has no effect if its violation costs nothing.
+            finite = finite & ~((v == 0) & (W == 0))
         # An equation takes part once, as the upper side.
         equality = jnp.stack([equal, jnp.zeros_like(equal)])
         inequality = finite & ~equal
