@@ -78,6 +78,10 @@ def test_honest_where_it_cannot_be_done():
     assert apart.result == dlx.RESULTS.not_separated
     with pytest.raises(RuntimeError, match="lyap: .*cannot be separated"):
         solve(both, np.eye(60))
+    # Complex data are solved as real matrices of twice the size.
+    for n, status in (8, "successful"), (9, "not_separated"):
+        apart = solve(both[:n, :n] + 0j, np.eye(n), throw=False)
+        assert apart.result == getattr(dlx.RESULTS, status)
 
 
 def test_complex_data():

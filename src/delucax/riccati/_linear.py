@@ -89,7 +89,8 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
 
     The solver is the sign iteration if all eigenvalues of $A$ are on one side of the
     imaginary axis. Otherwise it solves the equation as one dense linear system up to
-    $n = 16$. If $n$ is larger, `result` is `RESULTS.not_separated`.
+    $n = 16$, or to $n = 8$ for complex data, because these are solved as real matrices
+    of twice the size. If $n$ is larger, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
@@ -137,8 +138,9 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     white noise of covariance $Q$.
 
     The solver is doubling if all eigenvalues of $A$ are on one side of the unit circle.
-    Otherwise it solves the equation as one dense linear system up to $n = 16$. If $n$
-    is larger, `result` is `RESULTS.not_separated`.
+    Otherwise it solves the equation as one dense linear system up to $n = 16$, or to
+    $n = 8$ for complex data, because these are solved as real matrices of twice the
+    size. If $n$ is larger, `result` is `RESULTS.not_separated`.
 
     **Arguments:** `A`, `Q` and `throw`: as in [`delucax.riccati.lyap`][].
 
@@ -177,8 +179,9 @@ def sylvester(
 
     The solver is a shift followed by the sign iteration if a vertical line
     $\mathrm{Re}\, z = s$ separates the eigenvalues of $A$ from the eigenvalues of $-B$.
-    Otherwise it solves the equation as one dense linear system up to 256 unknowns. For
-    more unknowns, `result` is `RESULTS.not_separated`.
+    Otherwise it solves the equation as one dense linear system up to 256 unknowns, or
+    to 64 for complex data, because these are solved as real matrices of twice the size.
+    For more unknowns, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
@@ -225,7 +228,8 @@ def dsylvester(
 
     The solver is doubling if the product of the spectral radii of $A$ and $B$ is below
     one, and a Cayley transform if both spectra are outside the unit circle. Otherwise
-    it solves the equation as one dense linear system up to 256 unknowns. For more
+    it solves the equation as one dense linear system up to 256 unknowns, or to 64 for
+    complex data, because these are solved as real matrices of twice the size. For more
     unknowns, `result` is `RESULTS.not_separated`.
 
     **Arguments:** `A`, `B`, `C` and `throw`: as in [`delucax.riccati.sylvester`][].
