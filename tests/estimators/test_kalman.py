@@ -8,6 +8,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    tolerance,
     user_error,
 )
 
@@ -150,6 +151,17 @@ def test_smoother_solves_the_whole_record_at_once(known_start):
     assert_close(smoothed.filtered.log_likelihood, density, **CLOSE)
     assert_close(smoothed.mean[-1], smoothed.filtered.updated.mean[-1])
     assert smoothed.result == dlx.RESULTS.successful
+
+
+def test_smoother_of_many_states_with_one_noise():
+    """The rounding of their singular covariances is not semidefinite."""
+    kalman, ys, us = problem(12, 2, k=1)
+    zero = jnp.zeros_like(kalman.covariance)
+    kalman = eqx.tree_at(lambda k: k.covariance, kalman, zero)
+    mean, covariance, _ = batch_solution(kalman, ys, us)
+    smoothed = c.smooth(kalman, ys, us)
+    assert_close(smoothed.mean, mean, atol=tolerance(1e-4, 1e-11))
+    assert_close(smoothed.covariance, covariance, atol=tolerance(1e-2, 1e-9))
 
 
 def test_steady_state():

@@ -31,10 +31,8 @@ from .._typing import (
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._linear_solve import (
-    factorised,
     full_precision,
     is_definite,
-    SMALL,
     solve,
     symmetric,
 )
@@ -87,12 +85,10 @@ class Joint(eqx.Module):
         """The gain `G` in `E[x | z] = E[x] + G (z - E[z])`."""
         if self.known_gain is not None:
             return self.known_gain
-        # G = cov(x, z) S^-1 is solved as S G' = cov(z, x), without an inverse.
+        # G = cov(x, z) S^-1 is solved as S G' = cov(z, x), without an inverse. Not by
+        # Cholesky, because a singular S may be indefinite by more than its slack.
         S, _ = _regular(self.covariance)
-        if S.shape[0] <= SMALL:
-            return solve(S, self.cross.T).T
-        tag = lx.positive_semidefinite_tag
-        return factorised(S, lx.Cholesky(), tag)(self.cross.T).T
+        return solve(S, self.cross.T).T
 
     @full_precision
     def remainder(self, G):

@@ -148,7 +148,8 @@ def smooth(
     The covariance is computed in a form that stays semidefinite. For a nonlinear
     filter, $P_k A^T$ is the covariance of the state with the next state, which the
     filter computes. Covariances may be singular, for example for a known first state,
-    or if only some of the states have noise.
+    or if only some of the states have noise. The smoothed covariances then lose digits,
+    so compute them in float64.
 
     **Arguments:**
 
