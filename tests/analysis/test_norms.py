@@ -7,14 +7,12 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    tolerance,
     user_error,
 )
 
 import delucax as dlx
 from delucax.systems import LinearSystem
-
-
-pytestmark = needs_x64
 
 
 an = dlx.analysis
@@ -54,7 +52,7 @@ def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
         peak = an.hinf_norm(model)
         gain, omega = swept(model, discrete)
         assert peak.result == dlx.RESULTS.successful
-        slack = 1e-13
+        slack = tolerance(1e-5, 1e-13)
         assert gain * (1 - slack) <= peak.gain <= gain * (1 + 2e-4)
         if omega > 0:
             assert_close(peak.frequency, omega, rtol=2e-2)
@@ -62,22 +60,23 @@ def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
             assert_close(peak.frequency, 0, atol=1e-3)
         there = an.frequency_response(model, peak.frequency)
         there = np.linalg.norm(np.asarray(there), 2)
-        assert_close(there, peak.gain, rtol=1e-13)
+        assert_close(there, peak.gain, rtol=tolerance(1e-5, 1e-13))
         h2 = control.system_norm(theirs, 2)
-        assert_close(an.h2_norm(model), h2, rtol=1e-12)
+        assert_close(an.h2_norm(model), h2, rtol=tolerance(1e-4, 1e-12))
         if shape[1] == shape[2]:  # python-control refuses others
             hinf = control.system_norm(theirs, "inf", tol=1e-11)
-            assert_close(peak.gain, hinf, rtol=1e-10)
+            assert_close(peak.gain, hinf, rtol=tolerance(1e-4, 1e-10))
 
 
-@pytest.mark.parametrize("damping", [0.3, 1e-3, 1e-6])
+@pytest.mark.parametrize("damping", [0.3, 1e-3, pytest.param(1e-6, marks=needs_x64)])
 def test_resonance_is_the_formula(damping):
     A = jnp.array([[0.0, 1.0], [-1.0, -2 * damping]])
     oscillator = LinearSystem(A, jnp.array([[0.0], [1.0]]), C=jnp.array([[1.0, 0.0]]))
     peak = an.hinf_norm(oscillator)
     gain = 1 / (2 * damping * np.sqrt(1 - damping**2))
-    assert_close(peak.gain, gain, rtol=1e-9)
-    assert_close(peak.frequency, np.sqrt(1 - 2 * damping**2), rtol=1e-9)
+    close = tolerance(1e-3, 1e-9)
+    assert_close(peak.gain, gain, rtol=close)
+    assert_close(peak.frequency, np.sqrt(1 - 2 * damping**2), rtol=close)
 
 
 def test_of_two_peaks_the_higher_is_found():
@@ -111,6 +110,7 @@ def measures(e, A, B, C, dA, dB):
     return peak.gain + 0.3 * an.h2_norm(model), peak.frequency
 
 
+@needs_x64
 def test_derivatives_are_central_differences_beside_an_unstable_model():
     """To second order, of a spring, and one of channels alike."""
     h, still = 1e-5, np.zeros((2, 2))
@@ -196,11 +196,12 @@ def test_frequency_response_and_dcgain_are_controls():
         s = np.exp(1j * omegas * 0.3) if discrete else 1j * omegas
         expected = theirs(s.reshape(-1), squeeze=False)
         expected = np.moveaxis(expected, -1, 0).reshape(found.shape)
-        close = 1e-12
+        close = tolerance(1e-4, 1e-12)
         assert_close(found, expected, rtol=close, atol=close)
         assert_close(an.dcgain(model), theirs.dcgain(), rtol=close, atol=close)
 
 
+@needs_x64
 def test_frequency_response_is_differentiable_in_the_frequency():
     model, _ = random_model(4, 3, 1, 1, False)
     decibels = lambda w: 20 * jnp.log10(jnp.abs(an.frequency_response(model, w)[0, 0]))

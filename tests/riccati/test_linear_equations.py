@@ -5,19 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, tolerance, user_error
 
 import delucax as dlx
-
-
-pytestmark = needs_x64
 
 
 rng = np.random.default_rng(0)
 A, B = rng.normal(size=(6, 6)) / np.sqrt(6), rng.normal(size=(3, 3)) / np.sqrt(3)
 Q, C = rng.normal(size=(6, 6)), rng.normal(size=(6, 3))
 EYE = np.eye(6)
-CLOSE = {"rtol": 1e-10, "atol": 1e-11}
+CLOSE = {"rtol": tolerance(1e-4, 1e-10), "atol": tolerance(1e-4, 1e-11)}
 
 
 @pytest.mark.parametrize("moved", [-2, 2, 0], ids=["stable", "unstable", "both"])
@@ -26,7 +23,7 @@ def test_lyap(moved):
     solution = dlx.riccati.lyap(matrix, Q)
     X = scipy.linalg.solve_continuous_lyapunov(matrix, -Q)
     assert_close(solution.X, X, **CLOSE)
-    assert solution.residual < 1e-13
+    assert solution.residual < tolerance(1e-5, 1e-13)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +35,7 @@ def test_dlyap(matrix):
     solution = dlx.riccati.dlyap(matrix, Q)
     X = scipy.linalg.solve_discrete_lyapunov(matrix, Q)
     assert_close(solution.X, X, **CLOSE)
-    assert solution.residual < 1e-13
+    assert solution.residual < tolerance(1e-5, 1e-13)
 
 
 @pytest.mark.parametrize("a, b", [(-2, -2), (-5, 2), (5, -2), (0, 0)])
@@ -53,9 +50,10 @@ def test_dsylvester(a, b):
     left, right = scipy.linalg.expm(A + a * EYE), scipy.linalg.expm(B + b * np.eye(3))
     solution = dlx.riccati.dsylvester(left, right, C)
     rest = left @ solution.X @ right - solution.X + C
-    assert np.linalg.norm(rest) < 1e-10 * np.linalg.norm(C)
+    assert np.linalg.norm(rest) < tolerance(1e-4, 1e-10) * np.linalg.norm(C)
 
 
+@needs_x64
 def test_large_and_wide():
     rng = np.random.default_rng(1)
     n = 60
@@ -91,7 +89,7 @@ def test_complex_data():
     turned = dlx.riccati.lyap(
         turn @ stable @ turn.conj(), turn @ weight @ turn.conj()
     ).X
-    assert_close(turned, turn @ plain @ turn.conj(), atol=1e-12)
+    assert_close(turned, turn @ plain @ turn.conj(), atol=tolerance(1e-5, 1e-12))
 
 
 def test_one_bad_member_harms_no_other():
