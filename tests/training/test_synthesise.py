@@ -179,6 +179,9 @@ def test_each_kind_of_plant_gets_its_structures():
     assert names(env(), lqr, True) == {"LQR + memory", "network"}
     assert names(env(), None, True) == {"memory", "network"}
     assert names(hidden(), None, False) == {"memory"}
+    noise = dlx.disturbances.Gaussian(0.01, size=2)
+    noisy = dataclasses.replace(env(), sensor_noise=noise)
+    assert names(noisy, regulator(noisy, KEY), False) == {"memory", "LQG + memory"}
     lqg = regulator(hidden(), KEY)
     assert names(hidden(), lqg, False) == {"memory", "LQG + memory"}
 
@@ -272,6 +275,9 @@ def test_it_ends_where_the_regulator_is_enough(monkeypatch, better):
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     search.enter(known("LQR", dlx.controllers.Zero(1), 1.0, 1.0))
     assert search.is_settled() == (not better)
+    # A rival that fails proves nothing.
+    monkeypatch.setattr(module, "costs_of_plan", lambda *_: np.array([2.0, np.nan]))
+    assert not search.is_settled()
     # Nor is it where the LQR fails and something else does not.
     search.best = {"LQR": known("LQR", dlx.controllers.Zero(1), 1.0, np.inf)}
     assert not search.is_settled()
@@ -360,12 +366,21 @@ def test_a_cost_that_stays_infinite(monkeypatch):
         synthesise(env(), key=KEY, progress=False)
 
 
+class NoEnd(dlx.costs.Quadratic):
+    def final(self, t, x):
+        return jnp.log(-jnp.sum(x**2))
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
         (dict(initial_state=lambda key: jnp.full(2, jnp.nan)), "initial state must be"),
         (
             dict(cost=dlx.costs.Function(lambda t, x, u: jnp.log(-(x[0] ** 2)))),
+            "cost of an initial state must be finite",
+        ),
+        (
+            dict(cost=NoEnd([1.0, 1.0], [1.0])),
             "cost of an initial state must be finite",
         ),
         (
@@ -378,6 +393,41 @@ def test_bad_tasks(change, match):
     task = dataclasses.replace(env(), **change)
     with pytest.raises(ValueError, match=f"synthesise: the {match}"):
         synthesise(task, key=KEY)
+
+
+def test_each_plant_of_a_family_is_checked():
+    class Grows(dlx.AbstractSystem):
+        state_names, control_names = ("x",), ("u",)
+        rate: jax.Array = dlx.parameter(0.0)
+
+        def vector_field(self, t, x, u, w):
+            return jnp.exp(self.rate * x) + u
+
+    task = dataclasses.replace(plain(Grows()), initial_state=[1.0])
+    ranges = {"dynamics.system.rate": (800.0, 900.0)}
+    with pytest.raises(ValueError, match="none of 16 controls keeps the first step"):
+        synthesise(task, key=KEY, ranges=ranges)
+
+
+def test_a_budget_that_is_over_before_the_training(monkeypatch):
+    monkeypatch.setattr(PolicySearch, "seconds", 8.0)
+    monkeypatch.setattr(PolicySearch, "attempt", lambda _, line, method: line)
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    with pytest.warns(UserWarning, match="a budget of 10 s is too small .* took 8 s"):
+        search.run(4, 1)
+
+
+def test_a_comparison_that_fails_does_not_lose_the_policy(monkeypatch):
+    def fails(*_):
+        raise RuntimeError("out of memory")
+
+    module = sys.modules[PolicySearch.__module__]
+    monkeypatch.setattr(module, "costs_of_mpc", fails)
+    monkeypatch.setattr(module, "costs_of_plan", lambda *given: np.ones(4))
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    with pytest.warns(UserWarning, match="no comparison with MPC: out of memory"):
+        costs = dict(search.compared(dlx.controllers.Zero(1)))
+    assert set(costs) == {"policy", "zero", "plan"}
 
 
 def test_starts_that_are_lost_are_named_before_the_training(monkeypatch):
@@ -412,7 +462,7 @@ def test_a_start_that_no_control_keeps():
             return jnp.exp(x) + u
 
     task = dataclasses.replace(plain(Explodes()), initial_state=[200.0])
-    with pytest.raises(ValueError, match="no control keeps the first step finite"):
+    with pytest.raises(ValueError, match="none of 16 controls keeps the first step"):
         synthesise(task, key=KEY)
 
 

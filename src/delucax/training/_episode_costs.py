@@ -48,6 +48,12 @@ class TamedCost(eqx.Module):
         )
 
 
+def is_hidden(environment: Environment) -> bool:
+    """Whether a policy needs a memory, because an observation is not the state."""
+    observes_state = environment.dynamics.observes_state
+    return not observes_state or environment.sensor_noise is not None
+
+
 def on_plants(
     environment: Environment, ranges: dict[str, Any] | None, keys: Array, of: Any
 ) -> Any:
@@ -91,9 +97,11 @@ def costs_of_plan(environment, ranges, policy, keys):
     def of(plant, key):
         keep = ("states", "controls", "disturbances")
         run: Any = rollout(plant, policy, key=key, keep=keep, throw=False)
+        # Where the run diverges, its controls are not finite, and no plan starts there.
+        start = jnp.nan_to_num(run.controls)
         given: Any = dict(w=run.disturbances, bounds=plant.control_bounds, throw=False)
         x0, planner = run.states[0], ILQR(max_iterations=100)
-        plan = planner(plant.dynamics, plant.cost, x0, run.controls, **given)
+        plan = planner(plant.dynamics, plant.cost, x0, start, **given)
         planned = rollout(plant, OpenLoop(plan.controls), key=key, **_QUIETLY)
         return jnp.fmin(planned.total_cost, run.total_cost)
 
@@ -101,18 +109,19 @@ def costs_of_plan(environment, ranges, policy, keys):
 
 
 @eqx.filter_jit
-def first_steps(environment, keys):
-    """Initial states, their costs without control, and the next states under several
-    controls."""
+def first_steps(environment, ranges, keys):
+    """Initial states, the costs of a step and of an end there, and the next states
+    under several controls."""
     m, bounds = environment.control_size, environment.control_bounds
     controls = jnp.concatenate([jnp.zeros((1, m)), jr.normal(keys[0], (15, m))])
     if bounds is not None:
         low, high = (jnp.nan_to_num(jnp.broadcast_to(e, m)) for e in bounds)
         controls = jnp.concatenate([controls, low[None], high[None]])
 
-    def one(key):
-        x0 = environment.reset(environment.split_key(key)[0])
-        steps = jax.vmap(lambda u: environment.step(jnp.zeros(()), x0, u))(controls)
-        return x0, steps.cost[0], steps.state
+    def of(plant, key):
+        x0 = plant.reset(plant.split_key(key)[0])
+        steps = jax.vmap(lambda u: plant.step(jnp.zeros(()), x0, u))(controls)
+        end = plant.cost.final(plant.horizon * plant.dt, x0)
+        return x0, steps.cost[0] + end, steps.state
 
-    return jax.vmap(one)(keys)
+    return on_plants(environment, ranges, keys, of)

@@ -22,6 +22,7 @@ from ._episode_costs import (
     costs_of,
     costs_of_mpc,
     costs_of_plan,
+    is_hidden,
     on_plants,
     tamed,
 )
@@ -51,8 +52,9 @@ _TOGETHER = 4
 # A round of training ends early if it has taken this share of the budget since its
 # first block, which compiles.
 _ROUND = 0.05
-# The initial learning rate of a method. It falls by the second number when the method
-# does not gain, and below the third the method is not used for this policy any more.
+# The initial learning rate of a method. It falls by the second factor when the method
+# does not gain, and below the third number the method is not used for this policy any
+# more. The standard deviation of an evolution falls by the same factor.
 _RATE, _SLOWER, _LEAST_RATE = 2e-2, 0.1, 1e-3
 # The usual cost before it is known, so large that no cost is far above it.
 _ANY = 1e30
@@ -107,7 +109,7 @@ class PolicySearch:
         self.tried: list[Attempt] = []
         self.ended = "interrupted"
         self.law: LQR | LQG | None = None
-        name = "LQR" if environment.dynamics.observes_state else "LQG"
+        name = "LQG" if is_hidden(environment) else "LQR"
         # The structures that need no training.
         self.floor = "zero", name
         lasting = min(environment.horizon, LONGEST) * float(environment.dt)
@@ -157,6 +159,13 @@ class PolicySearch:
                 took = self.seconds - began
                 self.tried.append(Attempt(name, "none", self.mean(line), took))
         self.warn_of_lost_starts()
+        if not self.may_train:
+            warnings.warn(
+                f"synthesise: a budget of {self.budget:g} s is too small for this "
+                f"plant, because its first programs took {self.seconds:.0f} s to "
+                "compile. Only one policy is trained.",
+                stacklevel=3,
+            )
         family, key = self.ranges is not None, self.fresh_key()
         made = structures(self.environment, self.law, family, width, depth, key)
         # Each policy is trained from the start by the gradient, with less and less
@@ -208,9 +217,10 @@ class PolicySearch:
             laws = " and the ".join(["zero control", self.floor[1]][: len(known)])
             warnings.warn(
                 f"synthesise: the cost is not finite from {np.sum(lost)} of "
-                f"{len(lost)} initial states under {laws}. If no control keeps the "
-                "plant finite from there, no policy will: draw other initial states, "
-                "or end the episode before (`terminated`).",
+                f"{len(lost)} initial states under {laws}: the plant runs away, or the "
+                "cost is not defined everywhere. If no control keeps the plant finite "
+                "from there, no policy will: draw other initial states, or end the "
+                "episode before (`terminated`).",
                 stacklevel=4,
             )
 
@@ -242,7 +252,8 @@ class PolicySearch:
         own = np.mean(self.best["LQR"].costs[: self.count])
         rival = "plan" if self.is_known else "MPC"
         other = self.costs_of_rival(rival, self.law, keys)
-        if other is None or not np.isfinite(own):
+        # A rival that fails proves nothing.
+        if other is None or not np.all(np.isfinite([own, *other])):
             return False
         return not _is_better(np.mean(other), own)
 
@@ -267,21 +278,22 @@ class PolicySearch:
 
     def trained(self, line: Line, method: str) -> AbstractController:
         """The policy of a line after one round of training with a method."""
-        ends: list[float] = []
+        ends = None
 
         def is_over(*_: Any) -> bool:
+            nonlocal ends
             self.show()
             # The first block compiles.
-            ends.append(ends[0] if ends else self.seconds + _ROUND * self.budget)
-            return not self.may_train or self.seconds > ends[0]
+            ends = self.seconds + _ROUND * self.budget if ends is None else ends
+            return not self.may_train or self.seconds > ends
 
         given = self.environment, self.ranges, line.policy
         options: Any = dict(key=self.fresh_key(), callbacks=(is_over,))
+        rate = line.rates.get(method, _RATE)
         if method != _EVOLUTION:
-            rate = line.rates.get(method, _RATE)
             return by_gradient(*given, self.methods[method], rate, **options)
         width = _WIDE if line.structure == "network" else _NARROW
-        sigma = width if line.method == "none" else _NEAR
+        sigma = width if line.method == "none" else _NEAR * rate / _RATE
         return by_evolution(*given, sigma, self.usual, **options)
 
     def improve(self, line: Line, seconds: float = np.inf) -> Line:
@@ -432,6 +444,12 @@ class PolicySearch:
         for name in ("MPC", "plan") if observed else ("plan",):
             if self.may_compare(name):
                 keys = self.comparison[: self.count]
-                costs = self.costs_of_rival(name, policy, keys)
+                try:
+                    costs = self.costs_of_rival(name, policy, keys)
+                except (ValueError, RuntimeError) as error:
+                    # The policy is trained, and must not be lost for a comparison.
+                    text = f"synthesise: there is no comparison with {name}: {error}"
+                    warnings.warn(text, stacklevel=3)
+                    continue
                 if costs is not None:
                     yield name, costs

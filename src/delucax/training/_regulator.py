@@ -11,6 +11,7 @@ import numpy as np
 from .._typing import PRNGKey
 from ..controllers import local_lqr, local_model, LQG, LQR
 from ..environments import Environment
+from ._episode_costs import is_hidden
 
 
 # Draws of the initial state, and steps of the disturbance and of the sensor noise.
@@ -23,12 +24,12 @@ _LEAST = 1e-6
 
 
 def regulator(environment: Environment, key: PRNGKey) -> LQR | LQG:
-    """The LQR of an environment, or the LQG if the state is not observed.
+    """The LQR of an environment, or the LQG if the state is hidden.
 
     **Raises:** `ValueError` or `RuntimeError` if there is no such regulator.
     """
     dynamics = environment.dynamics
-    if dynamics.observes_state:
+    if not is_hidden(environment):
         return local_lqr(environment)
     plant, Q, R, S = local_model(environment)
     start, W, V = (np.asarray(e, float) for e in _covariances(environment, key))

@@ -22,6 +22,7 @@ from ..controllers import (
 )
 from ..environments import Environment
 from ..simulation import rollout
+from ._episode_costs import is_hidden
 
 
 # Episodes of each constant control and of the law, for the scales of features and
@@ -41,8 +42,8 @@ def structures(
     a network alone.
 
     For a family of plants, the first network is recurrent, and without an LQR it is the
-    whole policy. If the state is not observed, both networks are recurrent, and the
-    first one corrects the LQG.
+    whole policy. If the state is hidden, both networks are recurrent, and the first one
+    corrects the LQG.
     """
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds
@@ -75,7 +76,7 @@ def structures(
     memory = lambda bounds, key: GRU(
         size, m, width, features=features, bounds=bounds, key=key
     )
-    hidden = not environment.dynamics.observes_state
+    hidden = is_hidden(environment)
     recurrent = is_family or hidden
     made: dict[str, AbstractController] = {}
     if law is not None:

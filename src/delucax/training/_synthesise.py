@@ -50,8 +50,9 @@ class Synthesis(NamedTuple):
         run the same episodes, which were not used for training or for the choice of the
         policy. A controller is missing if it does not exist for the environment or if
         the budget left no time for it. MPC and the plan know the plant, and the plan
-        also knows the whole state and all disturbances in advance. So no policy may
-        reach the cost of the plan.
+        also knows the whole state and all disturbances in advance. So a policy may not
+        be able to reach the cost of the plan. But the plan is a local minimum: iLQR
+        starts from the controls of the policy, and without a gradient it stays there.
     - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings;
         the first ones are zero control and the LQR or LQG. `pandas.DataFrame(tried)`
         makes a table of it.
@@ -140,13 +141,14 @@ def synthesise(
     and compares the result with known controllers:
 
     1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][]. If
-        the state is not observed, the second baseline is an LQG
+        the state is not observed, or the sensor has noise, the state is called hidden.
+        Then the second baseline is an LQG
         ([`delucax.controllers.LQG`][]) for the same linear model. A baseline is left
         out, with a warning, if it does not exist for the environment.
     2. Trials. The policies are a network that corrects the LQR
         ([`delucax.controllers.Residual`][]) and a network alone. The correction is
         recurrent with `ranges`, so that it can identify the plant from past
-        observations. If the state is not observed, both policies are recurrent. Each
+        observations. If the state is hidden, both policies are recurrent. Each
         policy is trained from the start in two ways. The first way is the gradient of a
         rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]). At first
         it is damped with a time constant of a thirtieth of the rollout, then of a tenth
@@ -156,8 +158,8 @@ def synthesise(
     3. Refinement. The better half of the trained policies is trained further, until one
         of them is left, and then the others if time is left. The method that lowered
         the cost most comes first. If a method does not lower the cost any more, its
-        learning rate is reduced to a tenth once, and then it is not used any more for
-        this policy.
+        learning rate (or, of an evolution, the standard deviation) is reduced to a
+        tenth once, and then it is not used any more for this policy.
     4. Choice. The candidates are the four best policies and the baselines. The
         criterion is the mean cost over up to 512 initial states that were not used for
         training. In this mean, a cost above 20 times the usual cost grows only
@@ -178,8 +180,10 @@ def synthesise(
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
         default, at least 10. Training may take 70% of it, and the rest is for the
-        choice and the comparison. A program that compiles when the time is over
-        finishes first. The number of trials depends on the speed of the machine, so the
+        choice and the comparison. A comparison may take a tenth more than the budget,
+        and a program that compiles when the time is over finishes first. If the budget
+        ends before the first training, you get a warning, and a single policy is
+        trained. The number of trials depends on the speed of the machine, so the
         result depends on the machine too.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
         works on a family of plants: each episode draws a plant. The LQR is designed for
@@ -192,7 +196,8 @@ def synthesise(
     **Returns:** a [`delucax.training.Synthesis`][].
 
     **Raises:** `ValueError`, before any training, if an argument has the wrong type,
-    the cost of an initial state is not finite, no control keeps the first step finite,
+    the cost of an initial state is not finite, none of about 16 controls keeps the
+    first step finite,
     or the dynamics or the cost are not differentiable. Warns if the cost of the policy
     is not finite in some episodes of the comparison.
 
@@ -268,7 +273,7 @@ def _check_environment(
             f"differentiate, got: {reason} If that is not possible, use "
             "delucax.training.evolve."
         ) from error
-    starts, costs, steps = map(np.asarray, first_steps(env, keys))
+    starts, costs, steps = map(np.asarray, first_steps(env, ranges, keys))
     checked = ("initial state", starts), ("cost of an initial state", costs)
     for what, values in checked:
         finite = np.isfinite(values.reshape(len(keys), -1)).all(axis=1)
@@ -280,6 +285,6 @@ def _check_environment(
     kept = np.isfinite(steps).all(axis=-1).any(axis=1)
     if not kept.all():
         raise ValueError(
-            f"{_WHERE}: no control keeps the first step finite from x0 = "
-            f"{starts[kept.argmin()]}."
+            f"{_WHERE}: none of {steps.shape[1]} controls keeps the first step finite "
+            f"from x0 = {starts[kept.argmin()]}."
         )
