@@ -18,14 +18,14 @@ from benchmarks._machine import describe
 
 RESULTS = Path(__file__).parent / "results"
 Row = dict[str, Any]
+CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+"""Those that this process began with: a benchmark may keep itself on fewer."""
 
 
 def answer(case: Callable[..., Row]) -> None:
-    """Print what a case gives: the other side of `run`."""
-    # With all cores, as a user has; the benchmark itself may be on one.
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    print(json.dumps(case(**json.loads(sys.argv[1]))))
+    """Print what a case gives, and on what: the other side of `run`."""
+    given = case(**json.loads(sys.argv[1]))
+    print(json.dumps(given | {"machine": describe()}))
 
 
 def stored(store: Path) -> list[Row]:
@@ -49,7 +49,7 @@ def run(
     """The rows of these cases, those that are missing run first, and each said."""
     cases, rows = list(cases), stored(store)
     missing = [case for case in cases if not _of(case, rows)]
-    with ThreadPoolExecutor(at_once) as pool:
+    with ThreadPoolExecutor(at_once, initializer=_on_all_cores) as pool:
         running = {pool.submit(_row, module, case): case for case in missing}
         for future in as_completed(running):
             name = ", ".join(str(value) for value in running[future].values())
@@ -69,11 +69,16 @@ def _of(case: Row, rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if all(row.get(k) == v for k, v in case.items())][-1:]
 
 
+def _on_all_cores() -> None:
+    """The cases that this thread starts have all cores, as for a user."""
+    if CORES is not None:
+        os.sched_setaffinity(0, CORES)
+
+
 def _row(module: str, case: Row) -> Row | str:
     """The row of a case, or the last words of one that failed."""
     command = [sys.executable, "-m", module, json.dumps(case)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         return (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-    given = json.loads(done.stdout.splitlines()[-1])
-    return case | given | {"machine": describe()}
+    return case | json.loads(done.stdout.splitlines()[-1])
