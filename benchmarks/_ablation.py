@@ -38,7 +38,7 @@ WITHOUT = (
 )
 
 
-def case(task: str, without: str, seed: int) -> dict[str, Any]:
+def case(task: str, without: str, seed: int, budget: float) -> dict[str, Any]:
     """The policy of one task and seed without a part of the search."""
     began = time.perf_counter()
     from delucax.studies._scoreboard import task_of
@@ -51,7 +51,7 @@ def case(task: str, without: str, seed: int) -> dict[str, Any]:
             return None if alone or without == "no LQR inside" else super().regulator()
 
     key = jax.random.key(seed)
-    search = Reduced(task_of(task), None, key, budget=BUDGET, progress=False)
+    search = Reduced(task_of(task), None, key, budget=budget, progress=False)
     dropped = {
         "no damping": lambda name: name.startswith("gradient,"),
         "no evolution": lambda name: name == "evolution",
@@ -68,10 +68,10 @@ def case(task: str, without: str, seed: int) -> dict[str, Any]:
     return about | {"costs": costs, "tried": tried}
 
 
-def ablation(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
+def ablation(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
     """Run what is missing; a row for each task, a column for each part left out."""
     cases = [
-        {"task": task, "without": without, "seed": seed}
+        {"task": task, "without": without, "seed": seed, "budget": BUDGET}
         for seed in range(seeds)
         for task in only or TASKS
         for without in WITHOUT
@@ -80,7 +80,7 @@ def ablation(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str,
     def said(row):
         return f"{row['structure']}, {np.mean(row['costs']['policy']):.5g}"
 
-    rows = _cases.run("benchmarks._ablation", STORE, cases, said, at_once)
+    rows = _cases.run("benchmarks._ablation", STORE, cases, said, **how)
     table = pd.DataFrame(_above_best(rows))
     table = table.pivot_table("above", "task", "without", aggfunc="median")
     table = table[[name for name in WITHOUT if name in table]]

@@ -45,9 +45,14 @@ def run(
     cases: Iterable[Row],
     said: Callable[[Row], str],
     at_once: int = 1,
+    fresh: bool = False,
 ) -> list[Row]:
-    """The rows of these cases, those that are missing run first, and each said."""
-    cases, rows = list(cases), stored(store)
+    """The rows of these cases, those that are missing run first, and each said. With
+    `fresh` all are run again."""
+    cases = list(cases)
+    for case in cases if fresh else ():
+        forget(store, **case)
+    rows = stored(store)
     missing = [case for case in cases if not _of(case, rows)]
     with ThreadPoolExecutor(at_once, initializer=_on_all_cores) as pool:
         running = {pool.submit(_row, module, case): case for case in missing}

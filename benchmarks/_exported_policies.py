@@ -132,7 +132,7 @@ def off(cost: float, expected: float) -> float:
     return 0.0 if cost == expected else abs(cost - expected) / abs(expected)
 
 
-def exported(only: list[str], at_once: int = 1) -> dict[str, Any]:
+def exported(only: list[str], **how: Any) -> dict[str, Any]:
     """Run what is missing, and print what all reach."""
     cases = [
         {"task": task, "precision": precision}
@@ -144,7 +144,7 @@ def exported(only: list[str], at_once: int = 1) -> dict[str, Any]:
         each = row["structures"].items()
         return ", ".join(f"{name} {s['difference']:.1e}" for name, s in each)
 
-    rows = _cases.run("benchmarks._exported_policies", STORE, cases, said, at_once)
+    rows = _cases.run("benchmarks._exported_policies", STORE, cases, said, **how)
     table = pd.DataFrame(
         {"task": row["task"], "precision": row["precision"], "structure": name} | of
         for row in rows

@@ -151,7 +151,7 @@ def failures(row: dict[str, Any]) -> np.ndarray:
     return np.array([int(one) for one in row["failed"]])
 
 
-def family(at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
+def family(seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
     """Run what is missing, and print what all reach."""
     cases = [{"law": law, "seed": 0} for law in LAWS]
     cases += [{"law": law, "seed": s} for s in range(seeds) for law in TRAINED]
@@ -159,7 +159,7 @@ def family(at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
     def said(row):
         return f"{np.mean(failures(row)):.1%} fail, in {row['seconds']:.0f} s"
 
-    rows = _cases.run("benchmarks._family", STORE, cases, said, at_once)
+    rows = _cases.run("benchmarks._family", STORE, cases, said, **how)
     by_law = {law: [row for row in rows if row["law"] == law] for law in LAWS + TRAINED}
     mpc = failures(by_law["MPC of each plant"][0])
     made = []

@@ -195,7 +195,7 @@ def methods(task: str) -> list[str]:
     return [f"{algorithm}, {setting(algorithm)}" for algorithm in ("PPO", "SAC")]
 
 
-def rivals(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
+def rivals(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
     """Run what is missing, and print what all reach."""
     names = only or list(TASKS)
     cases = [
@@ -204,7 +204,7 @@ def rivals(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, A
         for task in names
     ]
     said = lambda row: f"costs {np.mean(row['costs']):.4g}, {row['taken']:.0f} s"
-    own = _cases.run("benchmarks._rivals", STORE, cases, said, at_once)
+    own = _cases.run("benchmarks._rivals", STORE, cases, said, **how)
     cases = [
         {
             "task": row["task"],
@@ -215,7 +215,7 @@ def rivals(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, A
         for row in cases
         for method in methods(row["task"])
     ]
-    rows = own + _cases.run("benchmarks._rivals", STORE, cases, said, at_once)
+    rows = own + _cases.run("benchmarks._rivals", STORE, cases, said, **how)
     made = []
     for task in names:
         ours = costs(rows, task, OURS)

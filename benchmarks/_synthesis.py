@@ -56,7 +56,7 @@ def case(task: str, seed: int) -> dict[str, Any]:
     return about | {"costs": costs, "tried": tried}
 
 
-def run(only: list[str], seeds: int, at_once: int) -> list[dict[str, Any]]:
+def run(only: list[str], seeds: int, **how: Any) -> list[dict[str, Any]]:
     """The cases, those that are missing run first."""
     # A seed of every task before the next, so that a run that is cut off shows all.
     cases = [
@@ -68,7 +68,7 @@ def run(only: list[str], seeds: int, at_once: int) -> list[dict[str, Any]]:
     def said(row):
         return f"{row['structure']}, {regret(row):+.1%} in {row['seconds']:.0f} s"
 
-    return _cases.run("benchmarks._synthesis", STORE, cases, said, at_once)
+    return _cases.run("benchmarks._synthesis", STORE, cases, said, **how)
 
 
 def regret(row: dict[str, Any], of: str = "policy") -> float:
@@ -131,9 +131,9 @@ def kind(task: str) -> str:
     return "events" if task_of(task).dynamics.event_names else "usual"
 
 
-def tasks(only: list[str], at_once: int = 1, seeds: int = SEEDS) -> dict[str, Any]:
+def tasks(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
     """Run what is missing, and print what all reach."""
-    reached = table(run(only, seeds, at_once))
+    reached = table(run(only, seeds, **how))
     print(reached.to_string(index=False, float_format="%.3g"))
     summary = []
     for name, group in reached.groupby("kind"):

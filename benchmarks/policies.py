@@ -10,7 +10,8 @@ Parts, written to `benchmarks/results/policies.json` when they are done:
   one of the budgets;
 
 and those that store each case in a file of their own, `results/*.jsonl`, and go on
-where they were cut off:
+where they were cut off (a case that is stored is not run again, unless `--fresh` is
+given):
 
 - `tasks`: every named task by `training.synthesise`, five seeds each; `--task pendulum`
   runs one;
@@ -327,6 +328,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="of each case; 5, or 3 of rivals")
     parser.add_argument("--at-once", type=int, default=1, help="cases at a time")
     parser.add_argument(
+        "--fresh",
+        action="store_true",
+        help="forget what is stored of the chosen parts, tasks and seeds, and run it "
+        "again; if this run is cut off, go on without it",
+    )
+    parser.add_argument(
         "--small",
         action="store_true",
         help="to try swing-up, tuning or learning; not written",
@@ -340,12 +347,13 @@ def main() -> None:
     about = {"machine": describe()}
     runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}
     seeds = {} if options.seeds is None else {"seeds": options.seeds}
+    how: dict[str, Any] = {"at_once": options.at_once, "fresh": options.fresh}
     row_by_row = {
-        "tasks": lambda: tasks(options.task, options.at_once, **seeds),
-        "ablation": lambda: ablation(options.task, options.at_once, **seeds),
-        "family": lambda: family(options.at_once, **seeds),
-        "rivals": lambda: rivals(options.task, options.at_once, **seeds),
-        "export": lambda: exported(options.task, options.at_once),
+        "tasks": lambda: tasks(options.task, **seeds, **how),
+        "ablation": lambda: ablation(options.task, **seeds, **how),
+        "family": lambda: family(**seeds, **how),
+        "rivals": lambda: rivals(options.task, **seeds, **how),
+        "export": lambda: exported(options.task, **how),
     }
     parts = options.part or PARTS
     if options.small and not row_by_row.keys().isdisjoint(parts):

@@ -42,3 +42,47 @@ def test_a_case_has_the_cores_that_its_benchmark_began_with(
         os.sched_setaffinity(0, usable)
     assert row["machine"]["cores_used"] == len(cases.CORES)
     assert (row["seed"], row["seconds"]) == (0, 0.5)
+
+
+@pytest.fixture
+def ran(module, monkeypatch):
+    """The cases that were run, each of which gives the number of those before."""
+    made = []
+
+    def row(_, case):
+        made.append(case)
+        return case | {"count": len(made)}
+
+    monkeypatch.setattr(module("_cases"), "_row", row)
+    return made
+
+
+def test_what_is_stored_runs_again_only_afresh(module, ran, tmp_path):
+    cases, store = module("_cases"), tmp_path / "store.jsonl"
+    both = [{"task": task, "seed": 0} for task in ("a", "b")]
+    run = lambda which, **how: [
+        row["count"] for row in cases.run("", store, which, str, **how)
+    ]
+    assert run(both) == run(both) == [1, 2]
+    # What was not chosen is kept, and a row without a part of the case is another's.
+    assert run(both[:1], fresh=True) == [3] and run(both) == [3, 2]
+    assert run([both[1] | {"budget": 1.0}]) == [4] and run(both) == [3, 4]
+    assert len(cases.stored(store)) == 3
+    cases.forget(store, seed=0)
+    assert cases.stored(store) == []
+
+
+def test_a_case_of_the_ablation_has_its_budget(module, tmp_path, monkeypatch):
+    ablation, costs = module("_ablation"), {"policy": [1.0], "zero": [2.0]}
+    monkeypatch.setattr(ablation, "STORE", tmp_path / "store.jsonl")
+    seen = []
+    monkeypatch.setattr(
+        ablation._cases,
+        "_row",
+        lambda _, case: seen.append(case) or case | {"structure": "", "costs": costs},
+    )
+    for budget in (1.0, 1.0, 2.0):
+        monkeypatch.setattr(ablation, "BUDGET", budget)
+        ablation.ablation(["pendulum"], seeds=1)
+    count = len(ablation.WITHOUT)
+    assert [case["budget"] for case in seen] == [1.0] * count + [2.0] * count
