@@ -86,3 +86,41 @@ def test_a_case_of_the_ablation_has_its_budget(module, tmp_path, monkeypatch):
         ablation.ablation(["pendulum"], seeds=1)
     count = len(ablation.WITHOUT)
     assert [case["budget"] for case in seen] == [1.0] * count + [2.0] * count
+
+
+def row_of(task, seed=0, **costs):
+    """A row of the part `tasks`, on two starts."""
+    costs = {name: [float(cost)] * 2 for name, cost in costs.items()}
+    about = {"structure": "network", "seconds": 1.0}
+    return {"task": task, "seed": seed, "costs": costs} | about
+
+
+def test_regret_is_to_the_best_of_each_start(module):
+    regret = module("_synthesis").regret
+    row = row_of("pendulum", policy=3.0, zero=8.0) | {"task": "pendulum"}
+    row["costs"]["plan"] = [2.0, 4.0]
+    assert regret(row) == pytest.approx(6 / 5 - 1)
+    assert regret(row, "zero") == pytest.approx(16 / 5 - 1)
+    # A plan knows the disturbances of `lds`, and a reward is a negative cost.
+    assert regret(row | {"task": "lds"}) == 0
+    assert regret(row_of("pendulum", policy=-3.0, plan=-4.0)) == pytest.approx(0.25)
+    assert regret(row_of("pendulum", policy=float("nan"), plan=1.0)) == float("inf")
+
+
+def test_tasks_that_need_no_training_are_counted(module, monkeypatch):
+    """By what the LQR, the LQG and no control cost, and not by what was returned."""
+    synthesis = module("_synthesis")
+    made = {
+        "pendulum": dict(LQR=1.04),
+        "cartpole": dict(LQR=1.06),
+        "balloon_lung": dict(LQG=1.0),
+        "cstr": dict(LQR=[1.0, 9.0, 9.0]),
+    }
+    rows = []
+    for task, law in made.items():
+        for seed in range(3):
+            each = {k: v[seed] if isinstance(v, list) else v for k, v in law.items()}
+            rows.append(row_of(task, seed, policy=1, zero=9, plan=1, **each))
+    monkeypatch.setattr(synthesis, "run", lambda *_, **__: rows)
+    (summary,) = synthesis.tasks([])["summary"]
+    assert (summary["tasks"], summary["near"], summary["by LQR"]) == (4, 4, 2)
