@@ -3,11 +3,16 @@
 
 The same search within 40 s, without one of its parts, on tasks of each kind. `gradient
 alone` is what one writes without it: a network, trained by the gradient of the rollout.
+`no LQR` is without the LQR altogether: in the policies, among what may be returned, in
+the final cost of MPC, and in the scale of the controls. `no clipping` takes the mean
+gradient of a batch, and `no last choice` returns the best on the starts of the training.
 """
 
 import time
 from typing import Any
+from unittest import mock
 
+import equinox as eqx
 import jax
 import numpy as np
 import pandas as pd
@@ -31,24 +36,42 @@ TASKS = (
 ALL = "all of it"
 WITHOUT = (
     ALL,
-    "no LQR inside",
+    "no LQR",
     "no damping",
+    "no clipping",
     "no evolution",
+    "no last choice",
     "gradient alone",
 )
+SEVERAL = 3
+"""Seeds from which on their range is shown."""
+
+
+class MeanGradient(eqx.Module):
+    """The mean of several gradients, none of which is clipped."""
+
+    samples: int = eqx.field(static=True)
+
+    def __call__(self, loss: Any, model: Any, key: Any) -> Any:
+        from delucax.training import analytic
+
+        keys = jax.random.split(key, self.samples)
+        each = jax.vmap(lambda key: analytic(loss, model, key))(keys)
+        return jax.tree.map(lambda leaf: jax.numpy.mean(leaf, axis=0), each)
 
 
 def case(task: str, without: str, seed: int, budget: float) -> dict[str, Any]:
     """The policy of one task and seed without a part of the search."""
     began = time.perf_counter()
     from delucax.studies._scoreboard import task_of
+    from delucax.training import _rounds
     from delucax.training._policy_search import PolicySearch
 
     alone = without == "gradient alone"
 
     class Reduced(PolicySearch):
         def regulator(self):
-            return None if alone or without == "no LQR inside" else super().regulator()
+            return None if alone or without == "no LQR" else super().regulator()
 
     key = jax.random.key(seed)
     search = Reduced(task_of(task), None, key, budget=budget, progress=False)
@@ -58,8 +81,12 @@ def case(task: str, without: str, seed: int, budget: float) -> dict[str, Any]:
         "gradient alone": lambda name: name != "gradient",
     }.get(without, lambda name: False)
     search.methods = {n: m for n, m in search.methods.items() if not dropped(n)}
-    search.run(width=32, depth=1)
-    search.choose()
+    unclipped = without == "no clipping"
+    estimator = MeanGradient if unclipped else _rounds.ClippedSamples
+    with mock.patch.object(_rounds, "ClippedSamples", estimator):
+        search.run(width=32, depth=1)
+    if without != "no last choice":
+        search.choose()
     structure, policy = search.chosen()
     costs = {n: cost.tolist() for n, cost in search.compared(policy)}
     seconds = time.perf_counter() - began
@@ -69,7 +96,8 @@ def case(task: str, without: str, seed: int, budget: float) -> dict[str, Any]:
 
 
 def ablation(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
-    """Run what is missing; a row for each task, a column for each part left out."""
+    """Run what is missing; a row for each task, a column for each part left out, and
+    with several seeds their range beside it."""
     cases = [
         {"task": task, "without": without, "seed": seed, "budget": BUDGET}
         for seed in range(seeds)
@@ -81,12 +109,36 @@ def ablation(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
         return f"{row['structure']}, {np.mean(row['costs']['policy']):.5g}"
 
     rows = _cases.run("benchmarks._ablation", STORE, cases, said, **how)
-    table = pd.DataFrame(_above_best(rows))
-    table = table.pivot_table("above", "task", "without", aggfunc="median")
-    table = table[[name for name in WITHOUT if name in table]]
-    print("Above the best known of each start, median of the seeds")
-    print(table.to_string(float_format="{:+.1%}".format))
-    return {"seeds": seeds, "rows": table.reset_index().to_dict("records")}
+    made = summary(rows)
+    print("Above the best known of each start, median of the seeds (range)")
+    shown = [
+        {"task": row["task"]} | {n: cell(row, n) for n in WITHOUT if n in row}
+        for row in made
+    ]
+    print(pd.DataFrame(shown).to_string(index=False))
+    return {"seeds": seeds, "rows": made}
+
+
+def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each task: the median of each search, and its least and most."""
+    made: dict[str, dict[str, Any]] = {}
+    for (task, name), group in pd.DataFrame(_above_best(rows)).groupby(
+        ["task", "without"]
+    ):
+        above = group["above"]
+        row = made.setdefault(str(task), {"task": task})
+        row[str(name)] = float(above.median())
+        if len(above) >= SEVERAL:
+            row |= {f"{name}, least": above.min(), f"{name}, most": above.max()}
+    return list(made.values())
+
+
+def cell(row: dict[str, Any], name: str, show: Any = "{:+.1%}".format) -> str:
+    """The median, and the range if there is one."""
+    if f"{name}, least" not in row:
+        return show(row[name])
+    low, high = (show(row[f"{name}, {end}"]) for end in ("least", "most"))
+    return f"{show(row[name])} ({low} to {high})"
 
 
 def _above_best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from benchmarks._ablation import ALL, WITHOUT
+from benchmarks._ablation import ALL, cell, WITHOUT
 from benchmarks._page import DOCS, markdown, write_page
 from benchmarks._synthesis import HARD
 
@@ -52,7 +52,8 @@ def parts(rows: list[dict[str, Any]]) -> str:
     named = {ALL: "whole search"}
     columns = [name for name in WITHOUT if name in rows[0]]
     body = [
-        [f"`{row['task']}`", *(percent(row[name]) for name in columns)] for row in rows
+        [f"`{row['task']}`", *(cell(row, name, percent) for name in columns)]
+        for row in rows
     ]
     return markdown(["task", *(named.get(n, n) for n in columns)], body, 1)
 

@@ -4,6 +4,9 @@ import importlib
 import os
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import once
 
@@ -124,3 +127,52 @@ def test_tasks_that_need_no_training_are_counted(module, monkeypatch):
     monkeypatch.setattr(synthesis, "run", lambda *_, **__: rows)
     (summary,) = synthesis.tasks([])["summary"]
     assert (summary["tasks"], summary["near"], summary["by LQR"]) == (4, 4, 2)
+
+
+def test_the_ablation_shows_the_range_of_several_seeds(module):
+    ablation, page = module("_ablation"), module("_policy_page")
+    rows = [
+        row_of("pendulum", seed, policy=1 + above) | {"without": name}
+        for name, of in {ablation.ALL: (0, 0, 0), "no LQR": (0.3, 0.1, 0.2)}.items()
+        for seed, above in enumerate(of)
+    ]
+    (row,) = ablation.summary(rows)
+    assert ablation.cell(row, "no LQR") == "+20.0% (+10.0% to +30.0%)"
+    assert "| `pendulum` | 0.0 (0.0 to 0.0) | 20.0 (10.0 to 30.0) |" in page.parts([row])
+    # Of one seed there is no range.
+    (row,) = ablation.summary(rows[::3])
+    assert page.parts([row]).endswith("| `pendulum` | 0.0 | 30.0 |\n")
+
+
+@pytest.mark.parametrize(
+    "without, is_clipped, is_chosen",
+    [("no LQR", True, True), ("no clipping", False, True), ("no last choice", True, False)],
+)
+def test_what_the_ablation_leaves_out(
+    module, monkeypatch, without, is_clipped, is_chosen
+):
+    from delucax.training import _policy_search, _rounds, ClippedSamples
+
+    def train(environment, ranges, policy, *_, **__):
+        used.append(_rounds.ClippedSamples)
+        return policy
+
+    search, used, chosen = _policy_search.PolicySearch, [], []
+    monkeypatch.setattr(_policy_search, "by_gradient", train)
+    monkeypatch.setattr(_policy_search, "by_evolution", train)
+    monkeypatch.setattr(search, "choose", lambda self: chosen.append(self))
+    monkeypatch.setattr(search, "may_compare", lambda *_: False)
+    found = module("_ablation").case("double_integrator", without, 0, budget=0.0)
+    assert {kind is ClippedSamples for kind in used} == {is_clipped}
+    assert bool(chosen) == is_chosen
+    assert ("LQR" in found["costs"]) == (without != "no LQR")
+
+
+def test_a_gradient_that_is_not_clipped(module):
+    ablation = module("_ablation")
+    key, w = jax.random.key(0), jnp.ones(2)
+    loss = lambda w, key: jnp.exp(9 * jax.random.normal(key)) * jnp.sum(w**2)
+    value, gradient = ablation.MeanGradient(4)(loss, w, key)
+    draws = [loss(w, k) for k in jax.random.split(key, 4)]
+    np.testing.assert_allclose(value, np.mean(draws), rtol=1e-5)
+    np.testing.assert_allclose(gradient, value * np.ones(2), rtol=1e-5)
