@@ -176,3 +176,17 @@ def test_a_gradient_that_is_not_clipped(module):
     draws = [loss(w, k) for k in jax.random.split(key, 4)]
     np.testing.assert_allclose(value, np.mean(draws), rtol=1e-5)
     np.testing.assert_allclose(gradient, value * np.ones(2), rtol=1e-5)
+
+
+def test_the_limits_of_the_swing_up_are_judged(module, capsys):
+    policies = module("policies")
+    rows = [
+        {"method": "analytic", "seeds with 95 of 100": 10, "seconds": [5.1, 1.0]},
+        {"method": "PPO, all seeds at once", "seeds with 95 of 100": 8, "seconds": [9]},
+    ]
+    assert [row["met"] for row in policies.judged(rows, 10)] == [True, False, True]
+    assert capsys.readouterr().out.count("NOT met") == 1
+    # Limits are those of ten seeds.
+    rows[0] |= {"seeds with 95 of 100": 2, "seconds": [5.0]}
+    rows[1] |= {"seeds with 95 of 100": 1}
+    assert [row["met"] for row in policies.judged(rows, 2)] == [True, True, False]
