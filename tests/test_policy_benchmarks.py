@@ -190,3 +190,10 @@ def test_the_limits_of_the_swing_up_are_judged(module, capsys):
     rows[0] |= {"seeds with 95 of 100": 2, "seconds": [5.0]}
     rows[1] |= {"seeds with 95 of 100": 1}
     assert [row["met"] for row in policies.judged(rows, 2)] == [True, True, False]
+
+
+def test_differences_of_an_exported_policy_do_not_cancel(module):
+    off, costs = module("_exported_policies").off, np.array([1.0, -4.0, 0.0, np.inf])
+    assert off(costs, costs) == 0
+    assert off(costs + [0.1, -0.1, 0, 0], costs) == pytest.approx(0.1)
+    assert np.isnan(off(costs + [np.nan, 0, 0, 0], costs))
