@@ -74,7 +74,7 @@ def family(rows: list[dict[str, Any]]) -> str:
 
 def rivals(rows: list[dict[str, Any]]) -> str:
     """A row for each task and method."""
-    apart = "`synthesise` less the method, 95% interval"
+    apart = "`synthesise` less the method, range over pairs of seeds"
     body = []
     for row in rows:
         ends = f"[{number(row['low'])}, {number(row['high'])}]"

@@ -6,10 +6,16 @@ Ours is in seconds of the clock and theirs of the processor, so that a busy mach
 costs them nothing; evaluations are not counted. Their best policy on starts of a
 validation is kept, checked 20 times on the way. The settings are those
 that the authors publish for Gym's version of the task (rl-baselines3-zoo,
-`hyperparams/`), or the defaults where there are none. The networks are small, so that
-each training has one thread.
+`hyperparams/`), or the defaults where there are none. Gym's cart-pole has two actions
+and a reward of one a step; ours has a force, and costs in the thousands. So there both
+also have `VecNormalize` in the training, for observations and rewards; an evaluation
+has the observations by the same statistics, frozen, and the cost as it is. The networks
+are small, so that each training has one thread.
 
-All are compared on the same starts, which none was trained or chosen on.
+All are compared on the same starts, which none was trained or chosen on. Between the
+seeds of two methods there are no pairs. So beside the mean difference stands its range
+over all pairs of a seed of ours and one of theirs: ours is better if each of our seeds
+is better than each of theirs. Of three seeds a bootstrap would be no interval of 95%.
 """
 
 import copy
@@ -30,7 +36,7 @@ STORE = _cases.RESULTS / "rivals.jsonl"
 SEEDS, BUDGET, TIMES = 3, 30.0, 20
 STARTS, VALIDATION, CHECKS = 32, 16, 20
 TASKS = ("pendulum", "acrobot", "cart-pole")
-OURS = "synthesise"
+OURS, LQR = "synthesise", "LQR"
 PPO_OF_PENDULUM: dict[str, Any] = dict(
     n_steps=1024,
     gae_lambda=0.95,
@@ -69,6 +75,8 @@ PUBLISHED: dict[tuple[str, str], dict[str, Any]] = {
         falling=("learning_rate", "clip_range"),
     ),
 }
+NORMALISED = ("cart-pole",)
+"""The tasks on which `VecNormalize` stands around the published settings."""
 
 
 def task_of(name: str) -> dlx.Environment:
@@ -84,21 +92,24 @@ def drawn(env: Any, seed: int, count: int) -> np.ndarray:
 def case(task: str, method: str, seed: int, seconds: float = 0.0) -> dict[str, Any]:
     """What one policy costs from each start, in this process."""
     env = task_of(task)
-    if method != OURS:
-        algorithm, setting = method.split(", ")
-        return theirs(env, task, algorithm, setting, seed, seconds)
+    if method not in (OURS, LQR):
+        return theirs(env, task, method.split(", ")[0], seed, seconds)
     began = time.perf_counter()
-    how: Any = dict(key=jr.key(seed), budget=BUDGET, progress=False)
-    made = dlx.training.synthesise(env, **how)
+    if method == LQR:
+        structure, policy = LQR, dlx.controllers.local_lqr(env)
+    else:
+        how: Any = dict(key=jr.key(seed), budget=BUDGET, progress=False)
+        made = dlx.training.synthesise(env, **how)
+        structure, policy = made.structure, made.policy
     taken = time.perf_counter() - began
     quiet: Any = dict(key=jr.key(0), keep=(), throw=False)
-    run = lambda x0: dlx.rollout(env, made.policy, x0=x0, **quiet).total_cost
+    run = lambda x0: dlx.rollout(env, policy, x0=x0, **quiet).total_cost
     costs = [float(run(x0)) for x0 in drawn(env, 2**20, STARTS)]
-    return {"structure": made.structure, "taken": taken, "costs": costs}
+    return {"structure": structure, "taken": taken, "costs": costs}
 
 
 def theirs(
-    env: Any, task: str, algorithm: str, setting: str, seed: int, seconds: float
+    env: Any, task: str, algorithm: str, seed: int, seconds: float
 ) -> dict[str, Any]:
     """PPO or SAC, for so many seconds."""
     import stable_baselines3  # pyright: ignore
@@ -113,8 +124,9 @@ def theirs(
     from delucax.interop.gymnasium import GymnasiumEnv
 
     torch.set_num_threads(1)
-    given = dict(PUBLISHED[task, algorithm]) if setting == "published" else {}
-    count, normalised = given.pop("envs", 1), given.pop("normalised", False)
+    given = dict(PUBLISHED.get((task, algorithm), {}))
+    count = given.pop("envs", 1)
+    normalised = given.pop("normalised", task in NORMALISED)
 
     def one():
         plant = GymnasiumEnv(env, discrete=False, backend="c")
@@ -123,7 +135,7 @@ def theirs(
 
     venv: Any = DummyVecEnv([one] * count)
     if normalised:
-        venv = VecNormalize(venv, gamma=given["gamma"])
+        venv = VecNormalize(venv, gamma=given.get("gamma", 0.99))
 
     class Clock(BaseCallback):
         """Stops in time, and keeps the best policy."""
@@ -191,7 +203,12 @@ def costs_of(model: Any, venv: Any, one: Any, starts: np.ndarray) -> np.ndarray:
 
 def methods(task: str) -> list[str]:
     """The rivals of a task."""
-    setting = lambda name: "published" if (task, name) in PUBLISHED else "defaults"
+
+    def setting(algorithm):
+        if task in NORMALISED:
+            return "normalised"
+        return "published" if (task, algorithm) in PUBLISHED else "defaults"
+
     return [f"{algorithm}, {setting(algorithm)}" for algorithm in ("PPO", "SAC")]
 
 
@@ -203,8 +220,9 @@ def rivals(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
         for seed in range(seeds)
         for task in names
     ]
+    laws = [{"task": task, "method": LQR, "seed": 0} for task in names]
     said = lambda row: f"costs {np.mean(row['costs']):.4g}, {row['taken']:.0f} s"
-    own = _cases.run("benchmarks._rivals", STORE, cases, said, **how)
+    own = _cases.run("benchmarks._rivals", STORE, cases + laws, said, **how)
     cases = [
         {
             "task": row["task"],
@@ -219,27 +237,16 @@ def rivals(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
     made = []
     for task in names:
         ours = costs(rows, task, OURS)
-        for method in (OURS, *methods(task)):
+        for method in (LQR, OURS, *methods(task)):
             other = costs(rows, task, method)
-            if not len(ours) or other.shape != ours.shape:
-                continue
-            low, high = interval(ours - other)
-            made.append(
-                {
-                    "task": task,
-                    "method": method,
-                    "cost": np.mean(other),
-                    "worst seed": np.max(np.mean(other, axis=1)),
-                    "ours less theirs": np.mean(ours - other),
-                    "low": low,
-                    "high": high,
-                }
-            )
+            wanted = 1 if method == LQR else seeds
+            if len(ours) == seeds and len(other) == wanted:
+                made.append({"task": task, "method": method} | beside(ours, other))
     table = pd.DataFrame(made)
     print(table.to_string(index=False, float_format="%.4g"))
     if len(table):
-        judge(table[table["method"] != OURS])
-    missing = len(cases) + len(own) - len(rows)
+        judge(table[~table["method"].isin([LQR, OURS])])
+    missing = len(cases) + seeds * len(names) + len(laws) - len(rows)
     if missing:
         print(f"{missing} trainings failed, and their methods are left out")
     return {"seeds": seeds, "times": TIMES, "rows": table.to_dict("records")}
@@ -253,13 +260,18 @@ def costs(rows: list[dict[str, Any]], task: str, method: str) -> np.ndarray:
     )
 
 
-def interval(values: np.ndarray, resamples: int = 2000) -> np.ndarray:
-    """The ends of the 95% interval of a mean over seeds and starts, by the bootstrap of
-    both."""
-    rng, (seeds, starts) = np.random.default_rng(0), values.shape
-    rows = rng.integers(seeds, size=(resamples, seeds, 1))
-    columns = rng.integers(starts, size=(resamples, 1, starts))
-    return np.quantile(np.mean(values[rows, columns], axis=(1, 2)), [0.025, 0.975])
+def beside(ours: np.ndarray, other: np.ndarray) -> dict[str, float]:
+    """The cost of a method; the range of its seeds; and how much less ours is, with the
+    range over all pairs of a seed of ours and one of theirs."""
+    own, theirs = np.mean(ours, axis=1), np.mean(other, axis=1)
+    return {
+        "cost": np.mean(theirs),
+        "best seed": np.min(theirs),
+        "worst seed": np.max(theirs),
+        "ours less theirs": np.mean(own) - np.mean(theirs),
+        "low": np.min(own) - np.max(theirs),
+        "high": np.max(own) - np.min(theirs),
+    }
 
 
 def judge(table: Any) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import once
 
@@ -197,3 +198,33 @@ def test_differences_of_an_exported_policy_do_not_cancel(module):
     assert off(costs, costs) == 0
     assert off(costs + [0.1, -0.1, 0, 0], costs) == pytest.approx(0.1)
     assert np.isnan(off(costs + [np.nan, 0, 0, 0], costs))
+
+
+def test_rivals_are_told_apart_by_all_pairs_of_seeds(module, capsys):
+    rivals = module("_rivals")
+    ours, theirs = np.array([[1.0, 3.0], [2.0, 4.0]]), np.array([[4.0, 6.0], [3.0, 4.0]])
+    row = rivals.beside(ours, theirs)
+    assert (row["cost"], row["best seed"], row["worst seed"]) == (4.25, 3.5, 5.0)
+    assert (row["ours less theirs"], row["low"], row["high"]) == (-1.75, -3.0, -0.5)
+    other = rivals.beside(ours, theirs - 1)
+    table = pd.DataFrame({"task": "a", "method": name} | r for name, r in
+                         {"PPO": row, "SAC": other}.items())
+    rivals.judge(table)
+    said = capsys.readouterr().out
+    assert "synthesise is not told from SAC" in said and "better than 1 of 2" in said
+    # A law without a seed is one row beside several.
+    assert rivals.beside(ours, theirs[:1])["high"] == -2.0
+
+
+def test_rivals_of_a_task(module, monkeypatch):
+    rivals = module("_rivals")
+    assert rivals.methods("pendulum") == ["PPO, published", "SAC, published"]
+    assert rivals.methods("cart-pole") == ["PPO, normalised", "SAC, normalised"]
+    monkeypatch.setattr(rivals, "STARTS", 3)
+    asked = []
+    monkeypatch.setattr(rivals, "theirs", lambda *given: asked.append(given[1:]))
+    rivals.case("cart-pole", "PPO, normalised", 0, seconds=1.0)
+    assert asked == [("cart-pole", "PPO", 0, 1.0)]
+    lqr = rivals.case("cart-pole", "LQR", 0)
+    assert lqr["structure"] == "LQR" and len(lqr["costs"]) == 3
+    assert np.all(np.isfinite(lqr["costs"]))
