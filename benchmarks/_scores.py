@@ -1,7 +1,8 @@
 """What each method of the scoreboard costs, and how far that is above the best known.
 
 A method is compared on each task by its excess, in units of the lesser of two costs:
-that of the best known, and what the best known saves against zero control.
+that of the best known, and what the best known saves against zero control. The unit is
+at least a hundredth of the former.
 """
 
 import dataclasses
@@ -23,8 +24,9 @@ COLUMNS["Training"] += (OWN,)
 METHODS = tuple(method for family in COLUMNS.values() for method in family)
 """The methods that have a score: all but the plan, which is no controller."""
 NEAR, GROUPS = 0.05, ("LQR within 5%", "LQR farther, or none", "events", "lungs")
-# The best known saves something against zero control if it is more than this share.
-_SAVING = 0.01
+# The least unit, as a share of the cost of the best known. At a share from which on the
+# saving counts at all, the scores would jump.
+_LEAST = 0.01
 
 
 class Spread(NamedTuple):
@@ -104,18 +106,20 @@ class Board:
     def excess(self, task: str, method: str) -> float | None:
         """How much more a method costs than the best known: 0 is the best known, 0.03
         is 3% more, infinite diverges. `None` if it does not suit."""
-        cost, best = self.cost(task, method), self.best(task)
-        if cost is None:
-            return None
-        if not np.isfinite(cost.middle):
+        cost = self.cost(task, method)
+        return None if cost is None else self.above(task, cost.middle)
+
+    def above(self, task: str, cost: float) -> float:
+        """The excess of a cost."""
+        best = self.best(task)
+        if not np.isfinite(cost):
             return np.inf
+        if cost == best:
+            return 0.0
         saved = self.cost_of_zero(task) - best
         size = abs(best) or saved
-        scale = saved if _SAVING * size < saved < size else size
-        above = cost.middle - best
-        if above == 0:
-            return 0.0
-        return above / scale if scale else np.inf
+        unit = min(size, max(saved, _LEAST * size))
+        return (cost - best) / unit if unit else np.inf
 
     def cost_of_zero(self, task: str) -> float:
         """The cost of no control."""

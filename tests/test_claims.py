@@ -560,9 +560,13 @@ def test_the_score_of_the_scoreboard(monkeypatch):
 
     assert np.isclose(excess(1000.0, 103.0, 100.0), 0.03)
     assert np.isclose(excess(110.0, 103.0, 100.0), 0.3)
+    # No jump where the best known saves a hundredth, or as much as it costs.
+    for edge in (101.0, 200.0):
+        below, above = (excess(edge + off, 103.0, 100.0) for off in (-1e-6, 1e-6))
+        assert np.isclose(below, above, rtol=1e-4)
     # Rewards; what zero control does as well; and a best known of zero.
     assert np.isclose(excess(0.0, -40.0, -100.0), 0.6)
-    assert np.isclose(excess(100.1, 103.0, 100.0), 0.03)
+    assert np.isclose(excess(100.1, 103.0, 100.0), 3.0)
     assert np.isclose(excess(4.0, 1.0, 0.0), 0.25)
     assert excess(np.inf, np.inf, 100.0) == excess(0.0, 3.0, 0.0) == np.inf
     assert excess(np.inf, np.inf, np.inf) == np.inf and excess(0.0, 0.0, 0.0) == 0
