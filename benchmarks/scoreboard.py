@@ -105,7 +105,9 @@ def tables(board: Board) -> str:
         "of 8, including the controller. Two processes ran at the same time, on the "
         "two threads of one core.\n"
     )
+    timed = {method for _, method in board.speeds}
     for name, family in _families(board):
+        family = [method for method in family if method in timed]
         took = lambda task, method: board.speeds.get((task, method))
         show = lambda speed: _number(speed, 3) if speed else ""
         made += [f"### {name}: time\n", _by_task(board, family, took, show)]
