@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import matplotlib.colors
+import matplotlib.style
 import numpy as np
 import pytest
 from helpers import once, user_error
@@ -15,6 +16,7 @@ from matplotlib.collections import PolyCollection
 from PIL import Image
 
 import delucax as dlx
+from delucax._figures import PALETTE
 
 
 pytestmark = once
@@ -340,6 +342,13 @@ def test_settings_are_left_alone_and_nothing_warns(trajectory, batch):
         for figure in (dlx.plot(trajectory), dlx.plot(batch)):
             figure.savefig(io.BytesIO(), format="pdf")
     assert dict(matplotlib.rcParams) == before
+
+
+def test_the_style_sheet_has_the_palette_of_the_figures(trajectory):
+    with matplotlib.style.context("delucax.plotting.style"):
+        cycle = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
+    assert tuple(cycle) == PALETTE
+    assert data_lines(dlx.plot(trajectory).axes[0])[0].get_color() == cycle[0]
 
 
 def test_errors_name_the_argument(env, linear, trajectory, key):
