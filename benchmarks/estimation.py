@@ -271,7 +271,7 @@ def draw(content: dict[str, Any]) -> None:
 
     shown = content["typical record"]
     states, t = np.array(shown["states"]), 0.1 * np.arange(len(shown["states"]))
-    plt.rcParams["svg.hashsalt"] = "delucax"
+    plt.style.use("delucax.plotting.style")
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
     lines = {
         "extended Kalman filter": "extended Kalman filter",
@@ -287,8 +287,7 @@ def draw(content: dict[str, Any]) -> None:
         ax.set(
             title=title, xlabel="time", xlim=(0, t[-1]), ylim=((-4.5, 4), (-0.5, 9))[i]
         )
-        ax.grid(alpha=0.25, lw=0.5)
-    axes[1].legend(frameon=False, fontsize=8)
+    axes[1].legend(fontsize=8)
     figure.savefig(FIGURE, metadata={"Date": None})
 
 

@@ -382,7 +382,7 @@ def draw(content: dict[str, Any]) -> None:
     """The first wind and the first start."""
     import matplotlib.pyplot as plt
 
-    plt.rcParams["svg.hashsalt"] = "delucax"
+    plt.style.use("delucax.plotting.style")
     figure, (eight, past) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     t = np.linspace(0, 2 * np.pi, 200)
     eight.plot(np.sin(t), 0.5 * np.sin(2 * t), "k:", lw=1.2, label="figure-eight")
@@ -396,9 +396,7 @@ def draw(content: dict[str, Any]) -> None:
         past.plot(x, y, lw=1.2, label=name)
     for ax in (eight, past):
         ax.set(aspect="equal", xlabel="x, m")
-        ax.grid(alpha=0.25, lw=0.5)
         ax.legend(
-            frameon=False,
             fontsize=7,
             loc="upper center",
             ncols=2,

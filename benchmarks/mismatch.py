@@ -342,7 +342,7 @@ def draw(content: dict[str, Any]) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import FixedLocator
 
-    plt.rcParams["svg.hashsalt"] = "delucax"
+    plt.style.use("delucax.plotting.style")
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     titles = {"wind": "quadrotor in wind", "gravity": "arm under gravity"}
     for ax, (name, title) in zip(axes, titles.items(), strict=True):
@@ -368,10 +368,9 @@ def draw(content: dict[str, Any]) -> None:
             axis.set_major_locator(FixedLocator(ticks))
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("")
-        ax.grid(alpha=0.25, lw=0.5)
     axes[0].set_ylabel("cost")
     handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(*handles, loc="outside lower center", ncols=5)
     figure.savefig(FIGURE, metadata={"Date": None})
 
 

@@ -170,7 +170,7 @@ def draw() -> None:
     """The controls that were found, and the fits beside the measurements."""
     import matplotlib.pyplot as plt
 
-    plt.rcParams["svg.hashsalt"] = "delucax"
+    plt.style.use("delucax.plotting.style")
     figure, axes = plt.subplots(3, 3, figsize=(9.5, 6.5), layout="constrained")
     for (name, title), ax in zip(TITLES.items(), axes.flat, strict=True):
         problem = getattr(dlx.problems, name)()
@@ -187,7 +187,6 @@ def draw() -> None:
             for control in plan.controls.T:
                 ax.stairs(control, times, baseline=None, lw=1.2)
         ax.set_title(title, fontsize=10)
-        ax.grid(alpha=0.25, lw=0.5)
     figure.supxlabel("time")
     figure.savefig(FIGURE, metadata={"Date": None})
     lines = FIGURE.read_text().splitlines()

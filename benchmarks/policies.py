@@ -22,7 +22,7 @@ given):
   `sb3`);
 - `export`: the policies in C.
 
-`--page` puts the tables of these into `docs/policies.md`.
+`--page` puts the tables of these into `docs/policies.md`, and draws the figure.
 
 With `--at-once 2` two cases share the cores, each with the same seconds.
 
@@ -311,7 +311,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
     """Cost against steps."""
     import matplotlib.pyplot as plt
 
-    plt.rcParams["svg.hashsalt"] = "delucax"
+    plt.style.use("delucax.plotting.style")
     figure, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
     table = pd.DataFrame(rows)
     for name, group in table[table["budget"] > 0].groupby("method", sort=False):
@@ -328,8 +328,9 @@ def draw(rows: list[dict[str, Any]]) -> None:
     zero = table.loc[table["budget"] == 0, "cost, IQM"].iloc[0]
     ax.axhline(zero, color="0.5", ls=":", label="zero control")
     ax.set(xlabel="steps of the environment", ylabel="cost of 200 steps", xscale="log")
-    ax.grid(alpha=0.25, lw=0.5)
-    ax.legend(frameon=False)
+    ax.set_xticks(BUDGETS, [f"{budget:,}" for budget in BUDGETS])
+    ax.minorticks_off()
+    ax.legend()
     figure.savefig(FIGURE, metadata={"Date": None})
 
 
@@ -356,10 +357,11 @@ def main() -> None:
         action="store_true",
         help="to try swing-up, tuning or learning; not written",
     )
-    parser.add_argument("--page", action="store_true", help="only write the tables")
+    parser.add_argument("--page", action="store_true", help="the tables and the figure")
     options = parser.parse_args()
     if options.page:
         write(RESULTS)
+        draw(json.loads(RESULTS.read_text())["learning"]["rows"])
         return
     compile_anew()
     about = {"machine": describe()}

@@ -27,6 +27,7 @@ from jaxtyping import Array
 
 import delucax as dlx
 from benchmarks._machine import describe, keep_programs, limit_cores
+from delucax._figures import PALETTE
 
 
 ROOT = Path(__file__).parents[1]
@@ -327,48 +328,40 @@ def plain(content: Any) -> Any:
 
 def draw(rows: list[dict[str, Any]], lengths: tuple[int, ...]) -> None:
     """Regret, the interquartile mean over seeds, against T, a panel a plant."""
-    import matplotlib
-
-    matplotlib.use("agg")
     import matplotlib.pyplot as plt
+
+    plt.style.use("delucax.plotting.style")
+    plt.rcParams["font.size"] = 9
 
     names = list(dict.fromkeys(row["plant"] for row in rows))
     kinds = dict.fromkeys(row["disturbance"] for row in rows)
-    colours = {kind: f"C{index}" for index, kind in enumerate(kinds)}
-    style: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-    style |= {"svg.fonttype": "path", "svg.hashsalt": "regret"}
+    colours = dict(zip(kinds, [*PALETTE, "0.2"], strict=True))
     T = np.array(lengths, float)
-    with plt.rc_context(style):
-        figure, axes = plt.subplots(
-            1, len(names), figsize=(11, 3.6), layout="constrained"
-        )
-        for ax, name in zip(axes, names, strict=True):
-            here = [row for row in rows if row["plant"] == name]
-            for row in here:
-                colour = colours[row["disturbance"]]
-                for what, line, width in (("regret", "o-", 1.4), ("regulator", ":", 1)):
-                    y = np.array(row[f"{what}, mean"], float)
-                    y = np.where(y > 0, y, np.nan)
-                    label = row["disturbance"] if what == "regret" else None
-                    ax.loglog(T, y, line, color=colour, lw=width, ms=3, label=label)
-            low, high = ax.get_ylim()
-            start = np.max([row["regret, mean"][0] for row in here])
-            slope = 2 / 3 if here[0]["learner"] == "Explore" else 1 / 2
-            guide = 1.8 * start * (T / T[0]) ** slope
-            ax.loglog(T, guide, "--", color="0.4", lw=1)
-            text = "$T^{2/3}$" if slope > 0.6 else r"$\sqrt{T}$"
-            ax.annotate(text, (T[2], guide[2]), (-4, 7), textcoords="offset points")
-            ax.set_ylim(low, high)
-            ax.set_title(f"{here[0]['learner']}: {name}", fontsize=9)
-            ax.set_xlabel("steps T")
-            ax.grid(alpha=0.25, lw=0.5)
-        axes[0].set_ylabel("regret (dotted: the regulator's)")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside lower center", ncols=7, frameon=False
-        )
-        FIGURE.parent.mkdir(exist_ok=True)
-        figure.savefig(FIGURE, metadata={"Date": None})
+    figure, axes = plt.subplots(1, len(names), figsize=(11, 3.6), layout="constrained")
+    for ax, name in zip(axes, names, strict=True):
+        here = [row for row in rows if row["plant"] == name]
+        for row in here:
+            colour = colours[row["disturbance"]]
+            for what, line, width in (("regret", "o-", 1.4), ("regulator", ":", 1)):
+                y = np.array(row[f"{what}, mean"], float)
+                y = np.where(y > 0, y, np.nan)
+                label = row["disturbance"] if what == "regret" else None
+                ax.loglog(T, y, line, color=colour, lw=width, ms=3, label=label)
+        low, high = ax.get_ylim()
+        start = np.max([row["regret, mean"][0] for row in here])
+        slope = 2 / 3 if here[0]["learner"] == "Explore" else 1 / 2
+        guide = 1.8 * start * (T / T[0]) ** slope
+        ax.loglog(T, guide, "--", color="0.4", lw=1)
+        text = "$T^{2/3}$" if slope > 0.6 else r"$\sqrt{T}$"
+        ax.annotate(text, (T[2], guide[2]), (-4, 7), textcoords="offset points")
+        ax.set_ylim(low, high)
+        ax.set_title(f"{here[0]['learner']}: {name}", fontsize=9)
+        ax.set_xlabel("steps T")
+    axes[0].set_ylabel("regret (dotted: the regulator's)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=7)
+    FIGURE.parent.mkdir(exist_ok=True)
+    figure.savefig(FIGURE, metadata={"Date": None})
 
 
 def main() -> None:

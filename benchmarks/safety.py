@@ -397,7 +397,7 @@ def draw(content: dict[str, Any]) -> None:
     """One run of each plant, under the worst disturbance."""
     import matplotlib.pyplot as plt
 
-    plt.rcParams["svg.hashsalt"] = "delucax"
+    plt.style.use("delucax.plotting.style")
     figure, axes = plt.subplots(1, 3, figsize=(9.5, 3.2), layout="constrained")
     styles = {"unsafe": ("C1", "without"), "safe": ("C0", "with the filter")}
     for ax, name in zip(axes, TASKS, strict=True):
@@ -413,8 +413,7 @@ def draw(content: dict[str, Any]) -> None:
             else:
                 column = 0 if name == "double integrator" else 1
                 ax.plot(times, x[:, column], color=colour, lw=1.4, label=words)
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.set_title(name, fontsize="medium")
+        ax.set_title(name)
         if name == "unicycle":
             for x, y, radius in np.asarray(DISCS):
                 ax.add_patch(plt.Circle((x, y), radius, color="0.85", lw=0))
@@ -427,7 +426,7 @@ def draw(content: dict[str, Any]) -> None:
             ax.fill_between(times, wall, 1.6, color="0.85", lw=0)
             ax.set(xlabel="time, s", ylabel="position, m", ylim=(None, 1.6))
     handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(*handles, loc="outside lower center", ncols=2)
     figure.savefig(FIGURE, metadata={"Date": None})
 
 
