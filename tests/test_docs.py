@@ -1,4 +1,5 @@
-"""Every Python block of the pages and of the README runs, page by page.
+"""Every Python block of the pages and of the README runs, page by page, except those
+marked `notest`.
 
 The blocks of a page share one namespace. A `text` block right under one is what it
 shows, as under the cell of a notebook. A comment `<!-- raises -->` before a block says
