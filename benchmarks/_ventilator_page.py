@@ -83,7 +83,7 @@ def _tasks(results: dict[str, Any]) -> str:
         ]
         for row in results["least error of other tasks at 35 cmH2O"]
     ]
-    head = ["task", "least error", "of it before any control can act"]
+    head = ["task", "least error", "part before any control can act"]
     return _markdown(head, body)
 
 

@@ -197,7 +197,8 @@ def estimator_variance(small: bool = False) -> Finding:
         ),
         Claim(
             "The variance of REINFORCE does not depend on the number of parameters "
-            "(slope -0.2 to 0.2), but adds to that of the problem",
+            "(slope -0.2 to 0.2), and it adds to the variance that the problem itself "
+            "has",
             f"slope {flat:.2f}, {last:.3g} times the squared gradient",
             abs(flat) <= 0.2 and last > 0,
         ),
