@@ -69,14 +69,16 @@ def task_of(name: str) -> dlx.Environment:
 
 def policies(env: Any, task: str) -> dict[str, Any]:
     """One of each structure, trained."""
-    from delucax.training._regulator import regulator
     from delucax.training._structures import structures
 
     key = jr.key(0)
     found = dlx.training.synthesise(env, key=key, budget=BUDGET, progress=False)
     made = {f"synthesise ({found.structure})": found.policy}
     try:
-        law = regulator(env, key)
+        if env.dynamics.observes_state:
+            law = dlx.controllers.local_lqr(env)
+        else:
+            law = dlx.controllers.local_lqg(env, key=key)
     except (ValueError, RuntimeError):
         law = None
     if law is not None:

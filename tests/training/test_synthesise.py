@@ -12,11 +12,11 @@ import pytest
 from helpers import once
 
 import delucax as dlx
+from delucax.controllers import local_lqg
 from delucax.training import synthesise
 from delucax.training._attempt import Line
 from delucax.training._episode_costs import tamed
 from delucax.training._policy_search import PolicySearch
-from delucax.training._regulator import regulator
 from delucax.training._structures import structures
 
 
@@ -181,14 +181,15 @@ def test_each_kind_of_plant_gets_its_structures():
     assert names(hidden(), None, False) == {"memory"}
     noise = dlx.disturbances.Gaussian(0.01, size=2)
     noisy = dataclasses.replace(env(), sensor_noise=noise)
-    assert names(noisy, regulator(noisy, KEY), False) == {"memory", "LQG + memory"}
-    lqg = regulator(hidden(), KEY)
+    lqg = local_lqg(noisy, key=KEY)
+    assert names(noisy, lqg, False) == {"memory", "LQG + memory"}
+    lqg = local_lqg(hidden(), key=KEY)
     assert names(hidden(), lqg, False) == {"memory", "LQG + memory"}
 
 
 def test_an_lqg_may_be_enough():
     task = hidden()
-    lqg = regulator(task, KEY)
+    lqg = local_lqg(task, key=KEY)
     floor = {"zero": np.full(2, 9.0), "LQG": np.full(2, 1.0)}
     search = PolicySearch(task, None, KEY, 10.0, progress=False)
     for name, costs in floor.items():

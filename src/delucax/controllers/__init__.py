@@ -17,6 +17,7 @@ from ._local import (
     local_mpc as local_mpc,
     LocalModel as LocalModel,
 )
+from ._local_lqg import local_lqg as local_lqg
 from ._lqr import LQI as LQI, LQR as LQR
 from ._mpc import MPC as MPC
 from ._network import (

@@ -14,7 +14,7 @@ from .._controller import AbstractController
 from .._module import get_path
 from .._progress import tqdm
 from .._typing import PRNGKey
-from ..controllers import LQG, LQR, Zero
+from ..controllers import local_lqg, local_lqr, LQG, LQR, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
 from ._attempt import Attempt, Line
@@ -26,7 +26,6 @@ from ._episode_costs import (
     on_plants,
     tamed,
 )
-from ._regulator import regulator
 from ._rounds import by_evolution, by_gradient, LONGEST
 from ._structures import structures
 
@@ -226,8 +225,11 @@ class PolicySearch:
 
     def regulator(self) -> LQR | LQG | None:
         """The LQR or LQG, or `None` if it does not exist for this environment."""
+        key = self.fresh_key()
         try:
-            return regulator(self.environment, self.fresh_key())
+            if is_hidden(self.environment):
+                return local_lqg(self.environment, key=key)
+            return local_lqr(self.environment)
         except (ValueError, RuntimeError) as error:
             name = self.floor[1]
             warnings.warn(

@@ -142,9 +142,8 @@ def synthesise(
 
     1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][]. If
         the state is not observed, or the sensor has noise, the state is called hidden.
-        Then the second baseline is an LQG
-        ([`delucax.controllers.LQG`][]) for the same linear model. A baseline is left
-        out, with a warning, if it does not exist for the environment.
+        Then the second baseline is the LQG of [`delucax.controllers.local_lqg`][]. A
+        baseline is left out, with a warning, if it does not exist for the environment.
     2. Trials. The policies are a network that corrects the LQR
         ([`delucax.controllers.Residual`][]) and a network alone. The correction is
         recurrent with `ranges`, so that it can identify the plant from past
