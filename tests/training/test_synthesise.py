@@ -88,6 +88,38 @@ def test_a_family_tells_its_worst_plant():
     assert alone == pytest.approx(costs["policy"][3], rel=1e-5)
 
 
+def shortest(monkeypatch, task, **options):
+    """The result of the shortest search: one policy is trained, in one block."""
+    monkeypatch.setattr(sys.modules[synthesise.__module__], "_LEAST_BUDGET", 0.0)
+    options |= dict(key=KEY, budget=1.0, width=2, progress=False)
+    return synthesise(task, **options)
+
+
+def test_a_family_gets_a_policy_that_works_on_its_plants(monkeypatch):
+    path = "dynamics.system.mass"
+    made = shortest(monkeypatch, env(), ranges={path: (0.5, 2.0)})
+    tried = [attempt.structure for attempt in made.tried]
+    assert tried == ["zero", "LQR", "LQR + memory"] and "time" in made.ended
+    assert set(made.costs) == {"policy", "zero", "LQR"}
+    drawn = made.plants[path]
+    assert drawn.shape == made.costs["policy"].shape
+    assert 0.5 <= drawn.min() < 1 < drawn.max() <= 2
+    assert np.all(made.costs["policy"] < made.costs["zero"])
+
+
+def test_a_hidden_state_gets_a_policy_that_works_without_it(monkeypatch):
+    task = hidden()
+    made = shortest(monkeypatch, task)
+    tried = [attempt.structure for attempt in made.tried]
+    assert tried == ["zero", "LQG", "LQG + memory"]
+    # MPC needs the state.
+    assert set(made.costs) == {"policy", "zero", "LQG"}
+    run = dlx.rollout(task, made.policy, key=KEY)
+    assert run.observations.shape == (task.horizon, 1)
+    zero = dlx.rollout(task, dlx.controllers.Zero(1), key=KEY)
+    assert run.total_cost < 0.2 * zero.total_cost
+
+
 def test_a_network_where_the_regulator_is_worse():
     # Nothing is trained: what is better by more than half a percent is chosen.
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
