@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks._ablation import ALL, cell, WITHOUT
 from benchmarks._page import DOCS, markdown, write_page
-from benchmarks._synthesis import HARD
+from benchmarks._synthesis import hard
 
 
 PAGE = DOCS / "policies.md"
@@ -43,7 +43,7 @@ def tasks(rows: list[dict[str, Any]]) -> str:
         + [percent(row[k]) for k in ("above best", "worst seed", "beside all")]
         for row in sorted(rows, key=lambda row: (kinds.index(row["kind"]), row["task"]))
     ]
-    assert sum(row["kind"] == "hard" for row in rows) == len(HARD)
+    assert sum(row["kind"] == "hard" for row in rows) == len(hard())
     return markdown(head, body, 2)
 
 

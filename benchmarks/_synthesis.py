@@ -15,15 +15,6 @@ from benchmarks import _cases
 
 STORE = _cases.RESULTS / "synthesis.jsonl"
 SEEDS = 5
-HARD = (
-    "cartpole_swing_up",
-    "double_pendulum_cart",
-    "drift",
-    "furuta",
-    "quadrotor_flip",
-    "reactor_start_up",
-    "slung_load",
-)
 WITHIN = {"usual": 0.05, "events": 0.05, "hard": 0.1}
 """How far from the best known the median seed may be."""
 FLOOR = ("zero", "LQR", "LQG")
@@ -38,6 +29,13 @@ def names() -> list[str]:
     from delucax.environments import registered
 
     return [name for name in registered() if "/" not in name]
+
+
+def hard() -> list[str]:
+    """The harder tasks."""
+    from delucax.environments._registry import TASKS
+
+    return TASKS["_hard"].split()
 
 
 def case(task: str, seed: int) -> dict[str, Any]:
@@ -128,7 +126,7 @@ def kind(task: str) -> str:
     """`hard`, `events` or `usual`."""
     from delucax.studies._scoreboard import task_of
 
-    if task in HARD:
+    if task in hard():
         return "hard"
     return "events" if task_of(task).dynamics.event_names else "usual"
 
