@@ -5,7 +5,7 @@ The same search within 40 s, without one of its parts, on tasks of each kind. `g
 alone` is what one writes without it: a network, trained by the gradient of the rollout.
 `no LQR` is without the LQR altogether: in the policies, among what may be returned, in
 the final cost of MPC, and in the scale of the controls. `no clipping` takes the mean
-gradient of a batch, and `no last choice` returns the best on the starts of the training.
+gradient of a batch. `no last choice` returns the best on the starts of the training.
 """
 
 import time

@@ -30,7 +30,8 @@ def answer(case: Callable[..., Row]) -> None:
 
 def stored(store: Path) -> list[Row]:
     """The rows so far."""
-    return [json.loads(line) for line in store.open()] if store.exists() else []
+    lines = store.read_text().splitlines() if store.exists() else []
+    return [json.loads(line) for line in lines]
 
 
 def forget(store: Path, **which: Any) -> None:

@@ -75,9 +75,18 @@ def best_table(board: Board) -> str:
         ranked = board.ranked(task)
         (zero,) = (excess for excess, method in ranked if method == "zero")
         ranked = [(e, method) for e, method in ranked if e < zero][:BEST]
-        named = [f"{short(method)} {percent(excess)}" for excess, method in ranked]
+        named = [_named(board, task, method, excess) for excess, method in ranked]
         body.append([f"`{task}`", ", ".join(named) or "none better than zero control"])
     return markdown(["task", "best controllers"], body, 2)
+
+
+def _named(board: Board, task: str, method: str, excess: float) -> str:
+    """A controller with its score, and the range of several trainings."""
+    cost, said = board.cost(task, method), f"{short(method)} {percent(excess)}"
+    if cost is None or cost.count == 1:
+        return said
+    low, high = (score(board.above(task, end)) for end in (cost.low, cost.high))
+    return f"{said} ({low} to {high})"
 
 
 def tables(board: Board) -> str:

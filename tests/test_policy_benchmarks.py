@@ -139,7 +139,9 @@ def test_the_ablation_shows_the_range_of_several_seeds(module):
     ]
     (row,) = ablation.summary(rows)
     assert ablation.cell(row, "no LQR") == "+20.0% (+10.0% to +30.0%)"
-    assert "| `pendulum` | 0.0 (0.0 to 0.0) | 20.0 (10.0 to 30.0) |" in page.parts([row])
+    assert "| `pendulum` | 0.0 (0.0 to 0.0) | 20.0 (10.0 to 30.0) |" in page.parts(
+        [row]
+    )
     # Of one seed there is no range.
     (row,) = ablation.summary(rows[::3])
     assert page.parts([row]).endswith("| `pendulum` | 0.0 | 30.0 |\n")
@@ -147,7 +149,11 @@ def test_the_ablation_shows_the_range_of_several_seeds(module):
 
 @pytest.mark.parametrize(
     "without, is_clipped, is_chosen",
-    [("no LQR", True, True), ("no clipping", False, True), ("no last choice", True, False)],
+    [
+        ("no LQR", True, True),
+        ("no clipping", False, True),
+        ("no last choice", True, False),
+    ],
 )
 def test_what_the_ablation_leaves_out(
     module, monkeypatch, without, is_clipped, is_chosen
@@ -202,13 +208,18 @@ def test_differences_of_an_exported_policy_do_not_cancel(module):
 
 def test_rivals_are_told_apart_by_all_pairs_of_seeds(module, capsys):
     rivals = module("_rivals")
-    ours, theirs = np.array([[1.0, 3.0], [2.0, 4.0]]), np.array([[4.0, 6.0], [3.0, 4.0]])
+    ours, theirs = (
+        np.array([[1.0, 3.0], [2.0, 4.0]]),
+        np.array([[4.0, 6.0], [3.0, 4.0]]),
+    )
     row = rivals.beside(ours, theirs)
     assert (row["cost"], row["best seed"], row["worst seed"]) == (4.25, 3.5, 5.0)
     assert (row["ours less theirs"], row["low"], row["high"]) == (-1.75, -3.0, -0.5)
     other = rivals.beside(ours, theirs - 1)
-    table = pd.DataFrame({"task": "a", "method": name} | r for name, r in
-                         {"PPO": row, "SAC": other}.items())
+    table = pd.DataFrame(
+        {"task": "a", "method": name} | r
+        for name, r in {"PPO": row, "SAC": other}.items()
+    )
     rivals.judge(table)
     said = capsys.readouterr().out
     assert "synthesise is not told from SAC" in said and "better than 1 of 2" in said
@@ -228,3 +239,17 @@ def test_rivals_of_a_task(module, monkeypatch):
     lqr = rivals.case("cart-pole", "LQR", 0)
     assert lqr["structure"] == "LQR" and len(lqr["costs"]) == 3
     assert np.all(np.isfinite(lqr["costs"]))
+
+
+def test_the_best_of_a_task_has_the_range_of_its_trainings(module):
+    made, scores = module("scoreboard"), module("_scores")
+    each = {"zero": [9.0], "MPC": [1.03], "MLP": [1.2, 1.04, 1.1], "synthesise": [1.0]}
+    costs = {
+        ("pendulum", m): np.array([[c] * 2 for c in row]) for m, row in each.items()
+    }
+    board = scores.Board(costs, {})
+    assert made.best_table(board).endswith(
+        "synthesise +0.0%, MPC +3.0%, MLP +10% (4.0 to 20) |\n"
+    )
+    assert board.trainings("pendulum", "MLP") == 3 and board.best("pendulum") == 1
+    assert board.excess("pendulum", "LQR") is None
