@@ -228,7 +228,8 @@ def _lung(out: str, **options: Any) -> None:
 
 
 @_command(
-    "show the tasks, controllers, planners, studies and suites, or the cases of FILE",
+    "show the tasks, controllers, planners, estimators, studies and suites, or the "
+    "cases of FILE",
     _option(
         "file",
         f"show the cases of {_FILE} (default: show all names)",
