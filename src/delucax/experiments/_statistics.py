@@ -19,8 +19,6 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     data. If the number of values is not a multiple of 4, the values at the edges of the
     middle half have a reduced weight.
 
-    Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
-
     **Arguments:**
 
     - `values`: numbers. Infinite values in the outer quarters have no effect. If a
@@ -30,6 +28,8 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     **Returns:** a number, or an array without that axis.
 
     **Raises:** `ValueError` if `values` is empty.
+
+    Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
 
     !!! example
 
@@ -87,8 +87,6 @@ def compare(
     pairs. The bootstrap draws seeds within each case, or cases if each case has only
     one seed.
 
-    Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
-
     **Arguments:**
 
     - `results`: from [`delucax.experiments.run`][].
@@ -112,6 +110,8 @@ def compare(
 
     **Raises:** `ValueError` if `by`, `baseline` or `metric` does not exist in the
     results, or if the metric is not a number.
+
+    Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
 
     !!! example
 
