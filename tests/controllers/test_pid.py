@@ -215,7 +215,7 @@ def test_wrong_arguments(kind):
     with user_error(match="output must be an index from 0.*got .-1,"):
         kind(1.0, dt=DT, output=-1)
     y = jnp.zeros(2)
-    with user_error(match=r"expects 1 outputs.*observation has shape \(2,\).*output=0"):
+    with user_error(match=r"outputs must be 1.*observation has shape \(2,\).*output=0"):
         pid = kind(1.0, dt=DT)
         pid(0.0, y, pid.init())
     with user_error(match="selects component 2, but the observation has size 2"):

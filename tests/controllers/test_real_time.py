@@ -129,7 +129,7 @@ def test_wrong_use():
         (mpc := controller(real_time=False, planner=dlx.planning.SQP())).prepare(
             0.0, mpc.init()
         )
-    with user_error(match="state must come from prepare"):
+    with user_error(match="state must be one that MPC.prepare returned"):
         (mpc := controller()).feedback(0.0, X0, mpc.init())
     with user_error(match="fallback"):
         controller(fallback=3.0)

@@ -167,8 +167,9 @@ class LQR(AbstractController):
         shapes = self.feed_forward.M.shape, self.feed_forward.signals.dynamics.B.shape
         if shapes != ((m, n), (n, m)):
             raise ValueError(
-                f"LQR: feed_forward must fit K, for {n} states and {m} controls, got M "
-                f"of shape {shapes[0]} and dynamics with B of shape {shapes[1]}."
+                f"LQR: feed_forward must fit K, for {n} states and {m} controls, got "
+                f"feed_forward.M of shape {shapes[0]} and "
+                f"feed_forward.signals.dynamics.B of shape {shapes[1]}."
             )
         known = self.feed_forward.signals
         given = known.reference, known.control_reference, known.disturbance

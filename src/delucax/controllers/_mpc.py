@@ -353,7 +353,9 @@ class MPC(AbstractController):
         _check_real_time(self.real_time, "feedback")
         check_state(self, y, self.dynamics.state_size)
         if state.prepared is None:
-            raise ValueError("MPC.feedback: state must come from prepare.")
+            raise ValueError(
+                "MPC.feedback: state must be one that MPC.prepare returned."
+            )
         u, lost, result, state = _fed_back(self, as_float_array(t), y, state)
         return _checked(self, u, lost, result), state
 

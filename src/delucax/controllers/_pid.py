@@ -139,8 +139,9 @@ class _AbstractPID(AbstractController):
         if measured.shape != (loops,):
             what = "the observation has" if output is None else "output gives"
             raise ValueError(
-                f"{name}: expects {loops} outputs, one per loop, but {what} shape "
-                f"{measured.shape}. Choose what each loop follows, such as output=0."
+                f"{name}: the number of outputs must be {loops}, one per loop, but "
+                f"{what} shape {measured.shape}. Choose what each loop follows, such "
+                "as output=0."
             )
         reference = self.reference(t) if callable(self.reference) else self.reference
         reference = jnp.asarray(0 if reference is None else reference)

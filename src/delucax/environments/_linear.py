@@ -191,7 +191,8 @@ def lds(
             raise ValueError("lds: C needs A and B. For a random C, pass observations.")
         if A is not None and observations is not None:
             raise ValueError(
-                "lds: observations is only for random matrices. Pass C with A and B."
+                "lds: observations applies only if the matrices are random. Pass C "
+                "with A and B."
             )
         if A is None:
             A, B, C = _random(key, states, controls, observations, spectral_radius)

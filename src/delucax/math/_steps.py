@@ -30,10 +30,11 @@ def check_steps(count: int, dtype: Any, what: str, where: str) -> None:
     """Raise if times of this precision do not resolve `count` steps."""
     most = most_steps(dtype)
     if count > most:
+        name = jnp.dtype(dtype).name
         raise ValueError(
-            f"{where}: {what} must have at most {most} steps in "
-            f"{jnp.dtype(dtype).name}, whose times resolve no more, got {count}. Use "
-            "double precision (JAX_ENABLE_X64=1) or a shorter horizon."
+            f"{where}: {what} must have at most {most} steps, because {name} cannot "
+            f"tell the times of more steps apart, got {count}. Use double precision "
+            "(JAX_ENABLE_X64=1) or a shorter horizon."
         )
 
 

@@ -40,11 +40,11 @@ def demo(
     """Design, train and compare controllers for Gym's pendulum, then reproduce the
     Deluca paper with fewer seeds and steps.
 
-    The first part designs an LQR about the upright, and trains MLPs by differentiating
-    the rollout. Then it runs zero control, the LQR and the first MLP from the same 100
-    initial states, without and with a shock in the middle of the run. The first part
-    writes a table, the MLP, a figure and an animation. The second part calls
-    [`delucax.studies.reproduce`][] with `small=True` for all studies except the
+    The first part designs an LQR about the upright position, and trains MLPs by
+    differentiating the rollout. Then it runs zero control, the LQR and the first MLP
+    from the same 100 initial states, without and with a shock in the middle of the run.
+    The first part writes a table, the MLP, a figure and an animation. The second part
+    calls [`delucax.studies.reproduce`][] with `small=True` for all studies except the
     ventilator, and writes to the folder `paper` inside `out`.
 
     **Arguments:**
@@ -75,7 +75,7 @@ def demo(
     out = _writable(Path(out))
     env = pendulum()
 
-    say("LQR, designed from the ODE linearised about the upright:")
+    say("LQR, designed from the ODE linearised about the upright position:")
     weights = np.diag([1.0, 0.1]), np.eye(1) * 0.001
     difference = env.dynamics.difference
     lqr = LQR(linearize(env.dynamics), *weights, difference=difference)
@@ -219,8 +219,8 @@ def _beside_gymnasium(steps_per_second: float) -> str:
 
 
 def _derivative() -> str:
-    """A sentence about the derivative of the cost by the length, and a central
-    difference."""
+    """A sentence about the derivative of the cost with respect to the length, and a
+    central difference."""
     with jax.enable_x64(True):
         env = pendulum(solver=diffrax.Tsit5(), dt=0.02)
         policy, key = Linear(jnp.array([[20.0, 5.0]])), jax.random.key(0)
@@ -237,7 +237,7 @@ def _derivative() -> str:
         exact = float(both(length)[1])
         numeric = float((both(length + step)[0] - both(length - step)[0]) / (2 * step))
     return (
-        "The derivative of the cost by the pendulum's length is "
+        "The derivative of the cost with respect to the pendulum's length is "
         f"{exact:.9f} through the ODE;\na central difference gives {numeric:.9f} "
         "(Tsit5, float64)."
     )
