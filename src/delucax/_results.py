@@ -18,7 +18,7 @@ from ._typing import Array
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """The status of a computation: success, or the reason of a failure.
+    """The status of a computation: success, or the reason for a failure.
 
     Test for success with `result == RESULTS.successful`. Read the message with
     `RESULTS[result]`; it is empty for a success.

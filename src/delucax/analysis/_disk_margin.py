@@ -21,7 +21,7 @@ class DiskMargin(eqx.Module):
     - `gain_low`, `gain_high`: the loop stays stable if its gain is multiplied by a real
         factor between `gain_low` and `gain_high`.
     - `phase`: the phase change, of either sign, that the loop tolerates, in radians.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     !!! example
 

@@ -161,7 +161,7 @@ class PeakGain(eqx.Module):
     - `gain`: the H-infinity norm; infinite if the model is not stable.
     - `frequency`: the frequency of the largest gain, in radians per unit of time. If
         the model is not stable, `frequency` is the frequency of the least stable pole.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     `gain` and `frequency` are differentiable.
 

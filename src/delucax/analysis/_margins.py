@@ -41,7 +41,7 @@ class Margins(eqx.Module):
     - `is_stable`: whether the closed loop is stable. If it is not stable, `gain_margin`
         and `gain_reduction` are 1, the other margins are 0, and the frequencies are
         NaN.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     All attributes except `is_stable` and `result` are differentiable.
 

@@ -70,7 +70,7 @@ class PeriodicOrbit(eqx.Module):
     - `multipliers`: the eigenvalues of `jacobian`, shape `(n,)`, complex, the largest
         first. The orbit is stable if all multipliers are inside the unit circle. At
         least one multiplier is zero, because every event happens on the same surface.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     !!! example
 

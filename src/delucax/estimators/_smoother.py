@@ -161,7 +161,7 @@ def smooth(
     - `mean`: the mean of each state given the whole record, shape `(T, n)`;
     - `covariance`: the covariance of each state, shape `(T, n, n)`;
     - `filtered`: the result of the filter, as `run_filter` returns it;
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     **Raises:** as `run_filter`.
 

@@ -36,7 +36,7 @@ class Solution(eqx.Module):
     - `complementarity`: the largest product of a multiplier and its slack.
     - `gap`: the absolute difference of the cost and the cost of the dual program.
     - `iterations`: the number of iterations, each with one factorisation.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     !!! example
 

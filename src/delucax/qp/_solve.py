@@ -59,9 +59,9 @@ def solve(
     - `rtol`, `atol`: tolerances. A residual may be at most `atol + rtol * size`, where
         `size` is the size of the terms that cancel in the residual. Both tolerances are
         `1e-8` by default, or `1e-4` in single precision.
-    - `max_steps`: the largest number of iterations.
-    - `refinements`: the largest number of refinements of each linear system. The solver
-        makes refinements only if rounding errors require them.
+    - `max_steps`: the largest number of iterations, 100 by default.
+    - `refinements`: the largest number of refinements of each linear system, 3 by
+        default. The solver makes refinements only if rounding errors require them.
     - `throw`: raise an error if the solver finds no solution (default). If false, check
         `result`.
 

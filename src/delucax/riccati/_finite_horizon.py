@@ -44,7 +44,7 @@ class FiniteHorizonSolution(eqx.Module):
     - `K`: the gains, shape `(T, m, n)`, or `(N, m, n)` in continuous time.
     - `closed_loop`: the matrices $A - B K$, shape `(T, n, n)`, or `(N, n, n)` in
         continuous time.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
     - `p`: the linear part of the cost-to-go, shape `(T+1, n)`. `p`, `s` and `k` are
         zero if the problem has no linear terms, and `None` in continuous time.
     - `s`: the constant part of the cost-to-go, shape `(T+1,)`.

@@ -52,7 +52,7 @@ class GameSolution(eqx.Module):
     - `gamma`: the level $\gamma$ that the control attains.
     - `closed_loop`: the matrix $A - B K$, shape `(n, n)`; over a finite horizon
         `(T, n, n)`, or `(N, n, n)`.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
     - `residual`: an upper bound on the relative residual: the norm of the residual of
         the equation, divided by the sum of the norms of its terms. The bound includes
         the rounding errors of its own evaluation. `None` over a horizon.

@@ -44,7 +44,7 @@ class MatrixSolution(eqx.Module):
         The residual is the size of a relative change of the data for which $X$ would be
         exact.
     - `iterations`: the number of doublings, or of steps of the sign iteration.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     `X` is differentiable. If the solve failed, the derivatives of the solution are
     zero.

@@ -73,7 +73,7 @@ class RiccatiSolution(eqx.Module):
         `closed_loop`, to about eight digits. The loop is stable if the spectral radius
         is below 1. `None` in continuous time.
     - `iterations`: the number of doublings, or of steps of the sign iteration.
-    - `result`: success, or the reason of a failure; one of `delucax.RESULTS`.
+    - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
     - `spectral_abscissa`: in continuous time, a close upper bound on the largest real
         part of an eigenvalue of `closed_loop`. The loop is stable if the spectral
         abscissa is below 0. `None` in discrete time.

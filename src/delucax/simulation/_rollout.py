@@ -123,12 +123,18 @@ def rollout(
         check `trajectory.result` yourself.
 
     **Returns:** a [`delucax.Trajectory`][]. The `result` of the trajectory is the first
-    of these that applies: the first failure of a step; `diverged`; `update_refused`, if
-    the update of a learning controller was not finite; `plan_failed`, `estimate_failed`
-    or `filter_failed`, if a plan, an estimate or a safety filter of the controller did
-    not succeed; success. `throw` does not raise an error for `plan_failed`,
-    `estimate_failed` and `filter_failed`, because the controller handles them (see
-    `throw=` of [`delucax.controllers.MPC`][]).
+    of these that applies:
+
+    - the first failure of a step;
+    - `diverged`;
+    - `update_refused`: the update of a learning controller was not finite;
+    - `plan_failed`, `estimate_failed` or `filter_failed`: a plan, an estimate or a
+        safety filter of the controller did not succeed;
+    - success.
+
+    `throw` does not raise an error for `plan_failed`, `estimate_failed` and
+    `filter_failed`, because the controller handles them (see `throw=` of
+    [`delucax.controllers.MPC`][]).
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape. An error is
     raised at run time if the rollout fails and `throw` is true.

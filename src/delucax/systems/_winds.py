@@ -34,7 +34,7 @@ class DissipativeWind(_AbstractWind):
     $$F = s\, (x, y)$$
 
     A positive strength destabilises the plant, because the force points away from the
-    origin. The name comes from the paper.
+    origin. The Deluca paper uses this name.
 
     **Arguments:**
 

@@ -128,11 +128,12 @@ def fit(
         are drawn without replacement. Each pass over the data is in a new random order,
         and skips the last rows if they do not fill a batch.
     - `trainable`: which leaves to train; the fields marked [`delucax.weight`][] by
-        default. Or pass one of these. A path such as `"dynamics.system.length"`, or
-        several paths. A dictionary from paths to constraints: [`delucax.positive`][],
-        [`delucax.bounded`][], or `None` for the constraint of the field. A function of
-        a leaf, such as `equinox.is_inexact_array`. Booleans in the structure of the
-        model.
+        default. It may also be one of these:
+        - a path such as `"dynamics.system.length"`, or several paths;
+        - a dictionary from paths to constraints: [`delucax.positive`][],
+            [`delucax.bounded`][], or `None` for the constraint of the field;
+        - a function of a leaf, such as `equinox.is_inexact_array`;
+        - booleans in the structure of the model.
     - `gradient`: the gradient estimator, [`delucax.training.analytic`][] by default.
         Other estimators are [`delucax.training.EvolutionStrategies`][],
         [`delucax.training.LikelihoodRatio`][], or any function

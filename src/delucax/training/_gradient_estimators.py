@@ -92,7 +92,7 @@ class ClippedSamples(eqx.Module):
 
     Use `ClippedSamples` if the plant diverges in a few episodes. The gradient of a
     diverging episode can be larger than all other gradients together without a useful
-    direction. Or it is not finite and would end the training. Call the estimator like
+    direction. If it is not finite, it would end the training. Call the estimator like
     every gradient estimator, see [`delucax.training.analytic`][], with the loss of a
     single episode.
 
