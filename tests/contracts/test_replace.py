@@ -203,7 +203,7 @@ def part(name):
         ("sampling MPC", {"dynamics": dynamics(3)}, "MPC: cost must fit"),
         ("sampling MPC", {"planner.scale": -1.0}, "CEM: scale must be positive"),
         ("LQR that follows", {"feed_forward.signals.dynamics": dynamics(3)},
-            "feed_forward must fit K, for 2 states"),
+            "feed_forward must fit K, for 2 states.*got feed_forward.M"),
         ("LQR that follows", {"feed_forward.signals.reference": lambda t: np.ones(3)},
             "LQR: reference must be a vector of size 2"),
         ("LQI", {"reference": lambda t: np.ones(2)}, "LQI: reference must be a vector"),
