@@ -125,11 +125,11 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for (task, name), group in pd.DataFrame(_above_best(rows)).groupby(
         ["task", "without"]
     ):
-        above = group["above"]
+        above = group["above"].to_list()
         row = made.setdefault(str(task), {"task": task})
-        row[str(name)] = float(above.median())
+        row[str(name)] = float(np.median(above))
         if len(above) >= SEVERAL:
-            row |= {f"{name}, least": above.min(), f"{name}, most": above.max()}
+            row |= {f"{name}, least": min(above), f"{name}, most": max(above)}
     return list(made.values())
 
 

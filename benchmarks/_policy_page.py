@@ -16,6 +16,8 @@ LAWS = {
     "LQR": "nominal LQR",
     "LQR of each plant": "LQR of each plant",
     "MPC of each plant": "MPC of each plant",
+    "MPC of each plant, 80 steps": "MPC of each plant, 80 steps",
+    "plan of each plant": "plan of each plant",
     "synthesise": "`synthesise`",
     "network": "nominal LQR + network",
     "memory": "nominal LQR + memory",
@@ -64,7 +66,9 @@ def family(rows: list[dict[str, Any]]) -> str:
     head = ["law", "fails, %", "worst seed, %", "above MPC, points", "median cost"]
     body = []
     for law, name in LAWS.items():
-        row = by_law[law]
+        row = by_law.get(law)
+        if row is None:
+            continue
         more = f"{number(row['above MPC'])} ± {number(row['+-'])}"
         more = "-" if law == "MPC of each plant" else more
         numbers = [number(row[k]) for k in ("fails, %", "worst seed")]

@@ -3,6 +3,7 @@
 import importlib
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -92,16 +93,16 @@ def test_a_case_of_the_ablation_has_its_budget(module, tmp_path, monkeypatch):
     assert [case["budget"] for case in seen] == [1.0] * count + [2.0] * count
 
 
-def row_of(task, seed=0, **costs):
+def row_of(task, seed=0, **costs) -> dict[str, Any]:
     """A row of the part `tasks`, on two starts."""
-    costs = {name: [float(cost)] * 2 for name, cost in costs.items()}
+    each = {name: [float(cost)] * 2 for name, cost in costs.items()}
     about = {"structure": "network", "seconds": 1.0}
-    return {"task": task, "seed": seed, "costs": costs} | about
+    return {"task": task, "seed": seed, "costs": each} | about
 
 
 def test_regret_is_to_the_best_of_each_start(module):
     regret = module("_synthesis").regret
-    row = row_of("pendulum", policy=3.0, zero=8.0) | {"task": "pendulum"}
+    row = row_of("pendulum", policy=3.0, zero=8.0)
     row["costs"]["plan"] = [2.0, 4.0]
     assert regret(row) == pytest.approx(6 / 5 - 1)
     assert regret(row, "zero") == pytest.approx(16 / 5 - 1)
@@ -253,3 +254,31 @@ def test_the_best_of_a_task_has_the_range_of_its_trainings(module):
     )
     assert board.trainings("pendulum", "MLP") == 3 and board.best("pendulum") == 1
     assert board.excess("pendulum", "LQR") is None
+
+
+def test_laws_that_know_the_plant_of_the_family(module, monkeypatch):
+    """Other settings are other cases, and a plan costs no more than LQR."""
+    family = module("_family")
+    monkeypatch.setattr(family, "PAIRS", 3)
+    monkeypatch.setattr(family, "TOGETHER", 3)
+    laws = "LQR of each plant", family.MPC, family.PLAN
+    settings = {"lookahead": 3, "iterations": 2}, {"iterations": 200}
+    monkeypatch.setattr(family, "LAWS", laws)
+    monkeypatch.setattr(family, "SETTINGS", dict(zip(laws[1:], settings, strict=True)))
+    asked = []
+
+    def run(name, store, cases, said, **how):
+        asked.extend(cases)
+        return [case | family.case(**case) for case in cases if case["seed"] == 0]
+
+    monkeypatch.setattr(family, "TRAINED", ())
+    monkeypatch.setattr(family._cases, "run", run)
+    rows = family.family(seeds=1)["rows"]
+    assert [row["law"] for row in rows] == [*laws]
+    assert {"law": family.PLAN, "seed": 0, "iterations": 200} in asked
+    cost = {row["law"]: row["median cost"] for row in rows}
+    assert cost[family.PLAN] <= cost["LQR of each plant"]
+    page = module("_policy_page").family(rows)
+    assert page.count("\n") == 2 + len(laws)
+    # What was stored before a law was added has no row of it.
+    assert module("_policy_page").family(rows[:-1]).count("\n") == page.count("\n") - 1
