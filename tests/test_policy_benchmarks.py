@@ -148,6 +148,7 @@ def test_the_ablation_shows_the_range_of_several_seeds(module):
     assert page.parts([row]).endswith("| `pendulum` | 0.0 | 30.0 |\n")
 
 
+@pytest.mark.filterwarnings("ignore:synthesise. a budget of 0 s is too small")
 @pytest.mark.parametrize(
     "without, is_clipped, is_chosen",
     [
