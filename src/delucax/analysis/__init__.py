@@ -25,7 +25,6 @@ from ._modes import (
     modal_observability as modal_observability,
     ModalTest as ModalTest,
     poles as poles,
-    zeros as zeros,
 )
 from ._orbits import (
     periodic_orbit as periodic_orbit,
@@ -33,3 +32,4 @@ from ._orbits import (
     poincare_map as poincare_map,
     Return as Return,
 )
+from ._zeros import zeros as zeros

@@ -42,17 +42,17 @@ class _Itself:
         return id(self.value)
 
 
-def _content(value: Any, seen: dict[int, int]) -> Any:
+def _content(value: Any, numbers: dict[int, int]) -> Any:
     """What to compare of `value`: the contents of a function or container, else the
-    object itself. `seen` numbers the functions and containers by their identity."""
+    object itself. `numbers` numbers the functions and containers by their identity."""
     # The type is part of it, because 1 equals True and 1.0.
     kind = type(value)
     if issubclass(kind, FunctionType | tuple | list | dict):
         # Functions may call themselves and each other.
-        if id(value) in seen:
-            return kind, seen[id(value)]
-        seen[id(value)] = len(seen)
-    parts = lambda values: tuple(_content(one, seen) for one in values)
+        if id(value) in numbers:
+            return kind, numbers[id(value)]
+        numbers[id(value)] = len(numbers)
+    parts = lambda values: tuple(_content(one, numbers) for one in values)
     if kind is FunctionType:
         cells = parts(map(_held, value.__closure__ or ()))
         read = parts(_globals(value.__code__, value.__globals__))
