@@ -33,7 +33,10 @@ def test_a_case_has_the_cores_that_its_benchmark_began_with(
 ):
     cases = module("_cases")
     (tmp_path / "tiny.py").write_text(
-        "from benchmarks import _cases\n_cases.answer(lambda seed: {'seconds': 0.5})\n"
+        "import os\n"
+        "from benchmarks import _cases\n"
+        "_cases.describe = lambda: {'cores_used': len(os.sched_getaffinity(0))}\n"
+        "_cases.answer(lambda seed: {'seconds': 0.5})\n"
     )
     path = [str(tmp_path), str(ROOT), str(ROOT / "src")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
