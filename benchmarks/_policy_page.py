@@ -15,6 +15,7 @@ LAWS = {
     "zero": "no control",
     "LQR": "nominal LQR",
     "LQR of each plant": "LQR of each plant",
+    "LQR of each plant, cart let run": "LQR of each plant, weights of the cart / 100",
     "MPC of each plant": "MPC of each plant",
     "MPC of each plant, 80 steps": "MPC of each plant, 80 steps",
     "plan of each plant": "plan of each plant",

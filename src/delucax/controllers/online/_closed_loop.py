@@ -185,7 +185,7 @@ class ClosedLoop(eqx.Module):
         base = self.base.init(key=key)
         q = n + _vector(base)[0].shape[0]
         zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
-        varies = self.tangents is None and (horizon > 0 or self.nature)
+        varies = self.tangents is None
         now = Tangents(zeros(q, q), zeros(q, m), zeros(p + m, q))
         return ClosedLoopState(
             base,
@@ -252,11 +252,13 @@ class ClosedLoop(eqx.Module):
         predicted, impulses, forced = state.predicted, state.impulses, state.forced
         terms = state.terms
         if predicted is not None:
-            step = lambda x, u: self.dynamics.advance(state.t, x, u, None)[0]
-            predicted, slopes = value_and_jacobians(step, state.y, u)
-            pairs = zip(slopes, (state.y, u), strict=True)
-            sizes = [matvec(jnp.abs(slope), jnp.abs(z)) for slope, z in pairs]
-            terms = lax.stop_gradient(jnp.abs(predicted) + sum(sizes))
+            predicted, _ = self.dynamics.advance(state.t, state.y, u, None)
+            n = predicted.shape[0]
+            # The derivatives of the plant alone: of the closed loop, less the base.
+            B = tangents.input[:n]
+            A = tangents.transition[:n, :n] - B @ tangents.output[n:, :n]
+            sizes = matvec(jnp.abs(A), jnp.abs(state.y)) + matvec(jnp.abs(B), jnp.abs(u))
+            terms = lax.stop_gradient(jnp.abs(predicted) + sizes)
         if impulses is not None:
             # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}. Each
             # product is updated by one factor.
