@@ -283,6 +283,25 @@ def test_a_long_round_ends_with_its_time(monkeypatch, began, blocks):
     assert len(heard) == blocks
 
 
+def test_without_time_for_a_comparison_there_is_more_for_the_training(monkeypatch):
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    line = known("network", dlx.controllers.Zero(1), 1.0)
+    monkeypatch.setattr(PolicySearch, "trained", lambda *_: line.policy)
+    search.attempt(line, "gradient")
+    monkeypatch.setattr(PolicySearch, "seconds", 8.0)
+    search.longest = 1.0
+    assert not search.may_train
+    assert not search.may_begin(line, "gradient")
+    # A plan would take until 12 s.
+    search.longest = 3.0
+    assert search.may_train
+    assert search.may_begin(line, "gradient")
+    # This one would have to be compiled.
+    assert not search.may_begin(line, "evolution")
+    monkeypatch.setattr(PolicySearch, "seconds", 9.1)
+    assert not search.may_train
+
+
 def test_a_comparison_ends_with_the_time(monkeypatch):
     module = sys.modules[PolicySearch.__module__]
     ran = []

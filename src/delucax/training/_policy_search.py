@@ -40,9 +40,10 @@ CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
 # The final choice is among this number of policies, on at most `_ROUNDS` times as many
 # initial states.
 _LAST, _ROUNDS = 4, 8
-# Training ends at the first share of the budget, the final choice at the second. The
-# rest is for the comparison.
-_TRAINING, _CHOOSING = 0.7, 0.75
+# Training ends at the first share of the budget, because the rest is for the
+# comparison. If there will be no time for a comparison, it ends at the second. The
+# final choice may take the third.
+_TRAINING, _ALONE, _CHOOSING = 0.7, 0.9, 0.05
 # A comparison starts only if it is likely to end within `_OVERRUN` times the budget. It
 # is expected to take so many times as long as the longest step so far.
 _OVERRUN, _LONGER = 1.1, {"MPC": 2.0, "plan": 1.5}
@@ -83,6 +84,11 @@ def _distinct(lines: list[Line]) -> list[Line]:
     return list({id(line.policy): line for line in lines}.values())
 
 
+def _program(line: Line, method: str) -> tuple[str, bool]:
+    """What a training compiles: the gradients of all dampings share a program."""
+    return line.structure, method == _EVOLUTION
+
+
 class PolicySearch:
     """A search for a policy within a time budget."""
 
@@ -120,6 +126,8 @@ class PolicySearch:
         self.least, self.usual = np.inf, _ANY
         # The longest step so far: a first round, which compiles, or a comparison.
         self.longest = 0.0
+        # The structures and kinds of training that are compiled.
+        self.compiled: set[tuple[str, bool]] = set()
 
     @property
     def seconds(self) -> float:
@@ -127,15 +135,29 @@ class PolicySearch:
         return time.perf_counter() - self.began
 
     @property
+    def training_ends(self) -> float:
+        """The time at which the training ends."""
+        ends = _TRAINING * self.budget
+        compares = any(self.may_compare(name, ends) for name in _LONGER)
+        return ends if compares else _ALONE * self.budget
+
+    @property
     def may_train(self) -> bool:
         """Whether there is time to train."""
-        return self.seconds < _TRAINING * self.budget
+        return self.seconds < self.training_ends
 
-    def may_compare(self, name: str) -> bool:
-        """Whether there is time for a comparison with this controller."""
+    def may_begin(self, line: Line, method: str) -> bool:
+        """Whether there is time to train a line with a method. The first round with
+        a kind of training compiles, so it has to begin earlier."""
+        compiles = _program(line, method) not in self.compiled
+        ends = _TRAINING * self.budget if compiles else self.training_ends
+        return self.seconds < ends
+
+    def may_compare(self, name: str, seconds: float) -> bool:
+        """Whether there is time for a comparison with this controller from then on."""
         # Plans, and MPC even more, take longer to compile than a training.
         likely = self.longest * _LONGER[name]
-        return self.seconds + likely < _OVERRUN * self.budget
+        return seconds + likely < _OVERRUN * self.budget
 
     def keys(self, count: int) -> Array:
         """Keys for `count` episodes. Another count gives other keys."""
@@ -179,7 +201,7 @@ class PolicySearch:
             line = Line(name, "none", made[name], self.costs(made[name]))
             for method in methods:
                 # However short the budget is, one policy is trained.
-                if self.may_train or len(self.tried) == untrained:
+                if self.may_begin(line, method) or len(self.tried) == untrained:
                     line = self.attempt(line, method)
             lines.append(line)
             if len(lines) == _FIRST and self.is_settled():
@@ -188,7 +210,7 @@ class PolicySearch:
                 return
         self.refine(lines)
         self.ended = "no training lowered the cost any more"
-        if not self.may_train:
+        if self.seconds > _TRAINING * self.budget:
             self.ended = "the time was over"
 
     def refine(self, lines: list[Line]) -> None:
@@ -310,6 +332,7 @@ class PolicySearch:
         gains = dict.fromkeys(names, np.inf)
         while self.may_train and self.seconds < ends:
             left = [n for n in names if line.rates.get(n, _RATE) > _LEAST_RATE]
+            left = [name for name in left if self.may_begin(line, name)]
             if not left:
                 break
             method = max(left, key=lambda name: gains[name])
@@ -333,6 +356,7 @@ class PolicySearch:
             if not ends:
                 # The first round compiles.
                 self.longest = max(self.longest, self.seconds - began)
+                self.compiled.add(_program(line, method))
                 ends = self.seconds + _ATTEMPT * self.budget
             least = min(least, self.mean(after))
             # If a round changes nothing, it diverged at its first step.
@@ -391,8 +415,9 @@ class PolicySearch:
         """
         floor = [self.best[name] for name in self.floor if name in self.best]
         lines = _distinct([*self.last, *floor])
+        ends = self.training_ends + _CHOOSING * self.budget
         for k in range(1, _ROUNDS):
-            if self.seconds > _CHOOSING * self.budget:
+            if self.seconds > ends:
                 break
             keys = jr.split(jr.fold_in(jr.fold_in(self.key, CHOICE), k), CHOICE)
             more = [self.costs(line.policy, keys) for line in lines]
@@ -444,7 +469,7 @@ class PolicySearch:
             yield name, self.costs(law, self.comparison)[: self.count]
         observed = self.environment.dynamics.observes_state
         for name in ("MPC", "plan") if observed else ("plan",):
-            if self.may_compare(name):
+            if self.may_compare(name, self.seconds):
                 keys = self.comparison[: self.count]
                 try:
                     costs = self.costs_of_rival(name, policy, keys)

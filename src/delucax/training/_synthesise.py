@@ -179,11 +179,12 @@ def synthesise(
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
         default, at least 10. Training may take 70% of it, and the rest is for the
-        choice and the comparison. A comparison may take a tenth more than the budget,
-        and a program that compiles when the time is over finishes first. If the budget
-        ends before the first training, you get a warning, and a single policy is
-        trained. The number of trials depends on the speed of the machine, so the
-        result depends on the machine too.
+        choice and the comparison. If a comparison is likely to take longer than that,
+        there is none, and training may take 90%. A comparison may take a tenth more
+        than the budget, and a program that compiles when the time is over finishes
+        first. If the budget ends before the first training, you get a warning, and a
+        single policy is trained. The number of trials depends on the speed of the
+        machine, so the result depends on the machine too.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
         works on a family of plants: each episode draws a plant. The LQR is designed for
         the nominal plant; MPC and the plan know each plant. None by default: one plant.
