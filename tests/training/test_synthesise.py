@@ -296,8 +296,11 @@ def test_without_time_for_a_comparison_there_is_more_for_the_training(monkeypatc
     search.longest = 3.0
     assert search.may_train
     assert search.may_begin(line, "gradient")
-    # This one would have to be compiled.
+    # This one compiles first.
     assert not search.may_begin(line, "evolution")
+    monkeypatch.setattr(PolicySearch, "seconds", 7.2)
+    search.longest = 2.7
+    assert search.may_begin(line, "evolution")
     monkeypatch.setattr(PolicySearch, "seconds", 9.1)
     assert not search.may_train
 

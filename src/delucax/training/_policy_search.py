@@ -137,8 +137,8 @@ class PolicySearch:
     @property
     def training_ends(self) -> float:
         """The time at which the training ends."""
-        ends = _TRAINING * self.budget
-        compares = any(self.may_compare(name, ends) for name in _LONGER)
+        ends, choice = _TRAINING * self.budget, _CHOOSING * self.budget
+        compares = any(self.may_compare(name, ends + choice) for name in _LONGER)
         return ends if compares else _ALONE * self.budget
 
     @property
@@ -147,11 +147,11 @@ class PolicySearch:
         return self.seconds < self.training_ends
 
     def may_begin(self, line: Line, method: str) -> bool:
-        """Whether there is time to train a line with a method. The first round with
-        a kind of training compiles, so it has to begin earlier."""
-        compiles = _program(line, method) not in self.compiled
-        ends = _TRAINING * self.budget if compiles else self.training_ends
-        return self.seconds < ends
+        """Whether there is time to train a line with a method."""
+        if _program(line, method) in self.compiled:
+            return self.may_train
+        # The first round compiles, for as long as others before.
+        return self.may_train and self.seconds + self.longest < self.budget
 
     def may_compare(self, name: str, seconds: float) -> bool:
         """Whether there is time for a comparison with this controller from then on."""
