@@ -257,8 +257,8 @@ class ClosedLoop(eqx.Module):
             # The derivatives of the plant alone: of the closed loop, less the base.
             B = tangents.input[:n]
             A = tangents.transition[:n, :n] - B @ tangents.output[n:, :n]
-            sizes = matvec(jnp.abs(A), jnp.abs(state.y)) + matvec(jnp.abs(B), jnp.abs(u))
-            terms = lax.stop_gradient(jnp.abs(predicted) + sizes)
+            terms = jnp.abs(predicted) + matvec(jnp.abs(A), jnp.abs(state.y))
+            terms = lax.stop_gradient(terms + matvec(jnp.abs(B), jnp.abs(u)))
         if impulses is not None:
             # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}. Each
             # product is updated by one factor.
