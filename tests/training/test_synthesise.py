@@ -15,7 +15,7 @@ import delucax as dlx
 from delucax.controllers import local_lqg
 from delucax.training import synthesise
 from delucax.training._attempt import Line
-from delucax.training._episode_costs import tamed
+from delucax.training._episode_costs import costs_of, tamed
 from delucax.training._policy_search import PolicySearch
 from delucax.training._structures import structures
 
@@ -303,6 +303,41 @@ def test_without_time_for_a_comparison_there_is_more_for_the_training(monkeypatc
     assert search.may_begin(line, "evolution")
     monkeypatch.setattr(PolicySearch, "seconds", 9.1)
     assert not search.may_train
+
+
+@pytest.mark.parametrize(
+    ("task", "first"), [("stick_slip", "evolution"), ("pendulum", "gradient")]
+)
+def test_evolution_comes_first_if_there_are_events(monkeypatch, task, first):
+    methods = []
+
+    def recorded(self, line, method):
+        methods.append(method)
+        return line
+
+    monkeypatch.setattr(PolicySearch, "attempt", recorded)
+    monkeypatch.setattr(PolicySearch, "regulator", lambda self: None)
+    monkeypatch.setattr(PolicySearch, "costs", lambda *_: np.ones(64))
+    monkeypatch.setattr(PolicySearch, "refine", lambda *_: None)
+    PolicySearch(dlx.make(task), None, KEY, 75.0, progress=False).run(4, 1)
+    assert methods[0].startswith(first)
+    assert len(methods) == 5 and len(set(methods)) == 5
+
+
+def test_a_state_that_diverges_costs_infinity():
+    class Escapes(dlx.AbstractSystem):
+        """The second state escapes, and the cost of the first does not show it."""
+
+        state_names, control_names = ("x", "y"), ("u",)
+
+        def vector_field(self, t, x, u, w):
+            return jnp.stack([u[0] - x[0], jnp.exp(x[1])])
+
+    cost = dlx.costs.Function(lambda t, x, u: x[0] ** 2)
+    dynamics = dlx.Discretized(Escapes(), dt=0.1)
+    task = dlx.Environment(dynamics, cost, initial_state=[1.0, 0.0], horizon=40)
+    costs = costs_of(task, None, dlx.controllers.Zero(1), jax.random.split(KEY, 2))
+    assert not np.isfinite(costs).any()
 
 
 def test_a_comparison_ends_with_the_time(monkeypatch):

@@ -70,8 +70,13 @@ def on_plants(
 
 @eqx.filter_jit
 def costs_of(environment, ranges, policy, keys):
-    """The total cost of a policy in each episode."""
-    of = lambda plant, key: rollout(plant, policy, key=key, **_QUIETLY).total_cost
+    """The total cost of a policy in each episode, or NaN if the state diverges."""
+
+    def of(plant, key):
+        run = rollout(plant, policy, key=key, **_QUIETLY)
+        finite = jnp.all(jnp.isfinite(run.final_state))
+        return jnp.where(finite, run.total_cost, jnp.nan)
+
     return on_plants(environment, ranges, keys, of)
 
 

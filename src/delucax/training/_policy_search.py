@@ -196,6 +196,10 @@ class PolicySearch:
         first, last = list(made)[0], list(made)[-1]
         trials = [(first, gradients), (last, evolution)]
         trials += [(first, evolution), (last, gradients)] if first != last else []
+        if self.environment.dynamics.event_names:
+            # The gradient does not show what another order of events would cost, and
+            # its program compiles for twice as long.
+            trials = [(last, evolution), (first, gradients), *trials[2:]]
         lines, untrained = [], len(self.tried)
         for name, methods in trials:
             line = Line(name, "none", made[name], self.costs(made[name]))

@@ -20,11 +20,11 @@ from .._check import (
 from .._controller import AbstractController
 from .._extras import extra
 from .._typing import PRNGKey
-from ..controllers import Constant
+from ..controllers import Constant, Zero
 from ..environments import Environment
 from ._attempt import Attempt
 from ._costs import expected_cost
-from ._episode_costs import first_steps
+from ._episode_costs import costs_of, first_steps
 from ._policy_search import CHOICE, PolicySearch
 
 
@@ -152,8 +152,9 @@ def synthesise(
         rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]). At first
         it is damped with a time constant of a thirtieth of the rollout, then of a tenth
         and of a quarter, and then it is not damped. The second way is
-        [`delucax.training.evolve`][], which needs no gradient. If neither the first two
-        trials nor a plan is better than the LQR, the search returns the LQR.
+        [`delucax.training.evolve`][], which needs no gradient. It comes first if the
+        plant has events. If neither the first two trials nor a plan is better than the
+        LQR, the search returns the LQR.
     3. Refinement. The better half of the trained policies is trained further, until one
         of them is left, and then the others if time is left. The method that lowered
         the cost most comes first. If a method does not lower the cost any more, its
@@ -273,6 +274,10 @@ def _check_environment(
             f"differentiate, got: {reason} If that is not possible, use "
             "delucax.training.evolve."
         ) from error
+    # The search needs this program anyway. That of the first steps, which tells what is
+    # wrong, is compiled only if something is.
+    if np.isfinite(costs_of(env, ranges, Zero(env.control_size), keys)).all():
+        return
     starts, costs, steps = map(np.asarray, first_steps(env, ranges, keys))
     checked = ("initial state", starts), ("cost of an initial state", costs)
     for what, values in checked:
