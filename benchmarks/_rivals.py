@@ -8,9 +8,9 @@ validation is kept, checked 20 times on the way. The settings are those
 that the authors publish for Gym's version of the task (rl-baselines3-zoo,
 `hyperparams/`), or the defaults where there are none. Gym's cart-pole has two actions
 and a reward of one a step; ours has a force, and costs in the thousands. So there both
-also have `VecNormalize` in the training, for observations and rewards; an evaluation
-has the observations by the same statistics, frozen, and the cost as it is. The networks
-are small, so that each training has one thread.
+are trained a second time with `VecNormalize` around the same settings, for observations
+and rewards; an evaluation has the observations by the same statistics, frozen, and the
+cost as it is. The networks are small, so that each training has one thread.
 
 All are compared on the same starts, which none was trained or chosen on. Between the
 seeds of two methods there are no pairs. So beside the mean difference stands its range
@@ -76,7 +76,7 @@ PUBLISHED: dict[tuple[str, str], dict[str, Any]] = {
     ),
 }
 NORMALISED = ("cart-pole",)
-"""The tasks on which `VecNormalize` stands around the published settings."""
+"""The tasks on which `VecNormalize` is tried around the same settings, too."""
 
 
 def task_of(name: str) -> dlx.Environment:
@@ -93,7 +93,7 @@ def case(task: str, method: str, seed: int, seconds: float = 0.0) -> dict[str, A
     """What one policy costs from each start, in this process."""
     env = task_of(task)
     if method not in (OURS, LQR):
-        return theirs(env, task, method.split(", ")[0], seed, seconds)
+        return theirs(env, task, method, seed, seconds)
     began = time.perf_counter()
     if method == LQR:
         structure, policy = LQR, dlx.controllers.local_lqr(env)
@@ -109,7 +109,7 @@ def case(task: str, method: str, seed: int, seconds: float = 0.0) -> dict[str, A
 
 
 def theirs(
-    env: Any, task: str, algorithm: str, seed: int, seconds: float
+    env: Any, task: str, method: str, seed: int, seconds: float
 ) -> dict[str, Any]:
     """PPO or SAC, for so many seconds."""
     import stable_baselines3  # pyright: ignore
@@ -124,9 +124,10 @@ def theirs(
     from delucax.interop.gymnasium import GymnasiumEnv
 
     torch.set_num_threads(1)
+    algorithm, setting = method.split(", ")
     given = dict(PUBLISHED.get((task, algorithm), {}))
     count = given.pop("envs", 1)
-    normalised = given.pop("normalised", task in NORMALISED)
+    normalised = given.pop("normalised", setting == "normalised")
 
     def one():
         plant = GymnasiumEnv(env, discrete=False, backend="c")
@@ -203,13 +204,12 @@ def costs_of(model: Any, venv: Any, one: Any, starts: np.ndarray) -> np.ndarray:
 
 def methods(task: str) -> list[str]:
     """The rivals of a task."""
-
-    def setting(algorithm):
-        if task in NORMALISED:
-            return "normalised"
-        return "published" if (task, algorithm) in PUBLISHED else "defaults"
-
-    return [f"{algorithm}, {setting(algorithm)}" for algorithm in ("PPO", "SAC")]
+    both = "PPO", "SAC"
+    known = {a: "published" if (task, a) in PUBLISHED else "defaults" for a in both}
+    made = [f"{algorithm}, {known[algorithm]}" for algorithm in both]
+    if task in NORMALISED:
+        made += [f"{algorithm}, normalised" for algorithm in both]
+    return made
 
 
 def rivals(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:

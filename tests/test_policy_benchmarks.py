@@ -163,7 +163,7 @@ def test_the_ablation_shows_the_range_of_several_seeds(module):
 def test_what_the_ablation_leaves_out(
     module, monkeypatch, without, is_clipped, is_chosen
 ):
-    from delucax.training import _policy_search, _rounds, ClippedSamples
+    from delucax.training import _budget, _policy_search, _rounds, ClippedSamples
 
     def train(environment, ranges, policy, *_, **__):
         used.append(_rounds.ClippedSamples)
@@ -173,7 +173,7 @@ def test_what_the_ablation_leaves_out(
     monkeypatch.setattr(_policy_search, "by_gradient", train)
     monkeypatch.setattr(_policy_search, "by_evolution", train)
     monkeypatch.setattr(search, "choose", lambda self: chosen.append(self))
-    monkeypatch.setattr(search, "may_compare", lambda *_: False)
+    monkeypatch.setattr(_budget.Budget, "may_compare", lambda *_: False)
     found = module("_ablation").case("double_integrator", without, 0, budget=0.0)
     assert {kind is ClippedSamples for kind in used} == {is_clipped}
     assert bool(chosen) == is_chosen
@@ -235,12 +235,17 @@ def test_rivals_are_told_apart_by_all_pairs_of_seeds(module, capsys):
 def test_rivals_of_a_task(module, monkeypatch):
     rivals = module("_rivals")
     assert rivals.methods("pendulum") == ["PPO, published", "SAC, published"]
-    assert rivals.methods("cart-pole") == ["PPO, normalised", "SAC, normalised"]
+    assert rivals.methods("cart-pole") == [
+        "PPO, published",
+        "SAC, defaults",
+        "PPO, normalised",
+        "SAC, normalised",
+    ]
     monkeypatch.setattr(rivals, "STARTS", 3)
     asked = []
     monkeypatch.setattr(rivals, "theirs", lambda *given: asked.append(given[1:]))
     rivals.case("cart-pole", "PPO, normalised", 0, seconds=1.0)
-    assert asked == [("cart-pole", "PPO", 0, 1.0)]
+    assert asked == [("cart-pole", "PPO, normalised", 0, 1.0)]
     lqr = rivals.case("cart-pole", "LQR", 0)
     assert lqr["structure"] == "LQR" and len(lqr["costs"]) == 3
     assert np.all(np.isfinite(lqr["costs"]))

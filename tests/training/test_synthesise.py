@@ -15,6 +15,7 @@ import delucax as dlx
 from delucax.controllers import local_lqg
 from delucax.training import synthesise
 from delucax.training._attempt import Line
+from delucax.training._budget import Budget
 from delucax.training._episode_costs import costs_of, tamed
 from delucax.training._policy_search import PolicySearch
 from delucax.training._structures import structures
@@ -270,13 +271,13 @@ def test_a_long_round_ends_with_its_time(monkeypatch, began, blocks):
 
     def endless(*given, callbacks, **options):
         while not callbacks[0](len(heard), {}):
-            heard.append(search.seconds)
+            heard.append(search.budget.spent)
         return given[2]
 
     monkeypatch.setattr(module, "by_gradient", endless)
     # A block takes 0.1 s.
-    clock = lambda search: began + 0.1 * len(heard)
-    monkeypatch.setattr(PolicySearch, "seconds", property(clock))
+    clock = lambda budget: began + 0.1 * len(heard)
+    monkeypatch.setattr(Budget, "spent", property(clock))
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     line = known("network", dlx.controllers.Zero(1), 1.0)
     assert search.trained(line, "gradient") is line.policy
@@ -288,21 +289,21 @@ def test_without_time_for_a_comparison_there_is_more_for_the_training(monkeypatc
     line = known("network", dlx.controllers.Zero(1), 1.0)
     monkeypatch.setattr(PolicySearch, "trained", lambda *_: line.policy)
     search.attempt(line, "gradient")
-    monkeypatch.setattr(PolicySearch, "seconds", 8.0)
-    search.longest = 1.0
-    assert not search.may_train
+    monkeypatch.setattr(Budget, "spent", 8.0)
+    search.budget.longest = 1.0
+    assert not search.budget.may_train
     assert not search.may_begin(line, "gradient")
     # A plan would take until 12 s.
-    search.longest = 3.0
-    assert search.may_train
+    search.budget.longest = 3.0
+    assert search.budget.may_train
     assert search.may_begin(line, "gradient")
     # This one compiles first.
     assert not search.may_begin(line, "evolution")
-    monkeypatch.setattr(PolicySearch, "seconds", 7.2)
-    search.longest = 2.7
+    monkeypatch.setattr(Budget, "spent", 7.2)
+    search.budget.longest = 2.7
     assert search.may_begin(line, "evolution")
-    monkeypatch.setattr(PolicySearch, "seconds", 9.1)
-    assert not search.may_train
+    monkeypatch.setattr(Budget, "spent", 9.1)
+    assert not search.budget.may_train
 
 
 @pytest.mark.parametrize(
@@ -348,7 +349,7 @@ def test_a_comparison_ends_with_the_time(monkeypatch):
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     keys = search.comparison[: search.count]
     assert len(search.costs_of_rival("plan", None, keys)) == len(keys) == 16
-    search.began -= 12
+    search.budget.began -= 12
     assert search.costs_of_rival("plan", None, keys) is None
     assert len(ran) == 4
 
@@ -501,7 +502,7 @@ def test_each_plant_of_a_family_is_checked():
 
 
 def test_a_budget_that_is_over_before_the_training(monkeypatch):
-    monkeypatch.setattr(PolicySearch, "seconds", 8.0)
+    monkeypatch.setattr(Budget, "spent", 8.0)
     monkeypatch.setattr(PolicySearch, "attempt", lambda _, line, method: line)
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     with pytest.warns(UserWarning, match="a budget of 10 s is too small .* took 8 s"):

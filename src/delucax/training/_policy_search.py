@@ -1,6 +1,5 @@
 """The search behind `synthesise`: trials, refinement, choice and comparison."""
 
-import time
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -18,6 +17,7 @@ from ..controllers import local_lqg, local_lqr, LQG, LQR, Zero
 from ..disturbances import Zero as NoDisturbance
 from ..environments import Environment
 from ._attempt import Attempt, Line
+from ._budget import Budget
 from ._episode_costs import (
     costs_of,
     costs_of_mpc,
@@ -40,13 +40,6 @@ CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
 # The final choice is among this number of policies, on at most `_ROUNDS` times as many
 # initial states.
 _LAST, _ROUNDS = 4, 8
-# Training ends at the first share of the budget, because the rest is for the
-# comparison. If there will be no time for a comparison, it ends at the second. The
-# final choice may take the third.
-_TRAINING, _ALONE, _CHOOSING = 0.7, 0.9, 0.05
-# A comparison starts only if it is likely to end within `_OVERRUN` times the budget. It
-# is expected to take so many times as long as the longest step so far.
-_OVERRUN, _LONGER = 1.1, {"MPC": 2.0, "plan": 1.5}
 # Episodes of a comparison with MPC or plans that run together.
 _TOGETHER = 4
 # A round of training ends early if it has taken this share of the budget since its
@@ -101,8 +94,7 @@ class PolicySearch:
         progress: bool,
     ):
         self.environment, self.ranges = environment, ranges
-        self.key, self.draws, self.budget = key, 0, budget
-        self.began = time.perf_counter()
+        self.key, self.draws, self.budget = key, 0, Budget(budget)
         layout = "{desc}: {bar}| {n:.0f}/{total:.0f} s{postfix}"
         options: Any = dict(desc="synthesise", bar_format=layout, disable=not progress)
         self.bar = tqdm(total=round(budget), **options)
@@ -124,40 +116,14 @@ class PolicySearch:
         self.methods = damped | {"gradient": jnp.inf, _EVOLUTION: None}
         # The least median cost so far, and its absolute value.
         self.least, self.usual = np.inf, _ANY
-        # The longest step so far: a first round, which compiles, or a comparison.
-        self.longest = 0.0
         # The structures and kinds of training that are compiled.
         self.compiled: set[tuple[str, bool]] = set()
-
-    @property
-    def seconds(self) -> float:
-        """The time since the search began."""
-        return time.perf_counter() - self.began
-
-    @property
-    def training_ends(self) -> float:
-        """The time at which the training ends."""
-        ends, choice = _TRAINING * self.budget, _CHOOSING * self.budget
-        compares = any(self.may_compare(name, ends + choice) for name in _LONGER)
-        return ends if compares else _ALONE * self.budget
-
-    @property
-    def may_train(self) -> bool:
-        """Whether there is time to train."""
-        return self.seconds < self.training_ends
 
     def may_begin(self, line: Line, method: str) -> bool:
         """Whether there is time to train a line with a method."""
         if _program(line, method) in self.compiled:
-            return self.may_train
-        # The first round compiles, for as long as others before.
-        return self.may_train and self.seconds + self.longest < self.budget
-
-    def may_compare(self, name: str, seconds: float) -> bool:
-        """Whether there is time for a comparison with this controller from then on."""
-        # Plans, and MPC even more, take longer to compile than a training.
-        likely = self.longest * _LONGER[name]
-        return seconds + likely < _OVERRUN * self.budget
+            return self.budget.may_train
+        return self.budget.may_compile
 
     def keys(self, count: int) -> Array:
         """Keys for `count` episodes. Another count gives other keys."""
@@ -174,17 +140,17 @@ class PolicySearch:
         floor = self.best["zero"].policy, self.law
         for name, law in zip(self.floor, floor, strict=True):
             if law is not None:
-                began = self.seconds
+                began = self.budget.spent
                 line = Line(name, "none", law, self.costs(law))
                 self.enter(line)
-                took = self.seconds - began
+                took = self.budget.spent - began
                 self.tried.append(Attempt(name, "none", self.mean(line), took))
         self.warn_of_lost_starts()
-        if not self.may_train:
+        if not self.budget.may_train:
             warnings.warn(
-                f"synthesise: a budget of {self.budget:g} s is too small for this "
-                f"plant, because its first programs took {self.seconds:.0f} s to "
-                "compile. Only one policy is trained.",
+                f"synthesise: a budget of {self.budget.total:g} s is too small for "
+                "this plant, because its first programs took "
+                f"{self.budget.spent:.0f} s to compile. Only one policy is trained.",
                 stacklevel=3,
             )
         family, key = self.ranges is not None, self.fresh_key()
@@ -214,12 +180,12 @@ class PolicySearch:
                 return
         self.refine(lines)
         self.ended = "no training lowered the cost any more"
-        if self.seconds > _TRAINING * self.budget:
+        if not self.budget.may_compile:
             self.ended = "the time was over"
 
     def refine(self, lines: list[Line]) -> None:
         """Train the best of the lines, and the others if time is left."""
-        share, dropped = _SHARE * self.budget, []
+        share, dropped = _SHARE * self.budget.total, []
         while len(lines) > 1:
             lines = sorted(lines, key=self.score)
             least = self.score(lines[0])
@@ -288,10 +254,10 @@ class PolicySearch:
     def costs_of_rival(self, name: str, policy: Any, keys: Array) -> np.ndarray | None:
         """The costs of MPC, or of a plan that starts from the controls of `policy`;
         `None` if the time does not suffice."""
-        began, parts = self.seconds, []
+        began, parts = self.budget.spent, []
         given = self.environment, self.ranges
         for start in range(0, len(keys), _TOGETHER):
-            if self.seconds > _OVERRUN * self.budget:
+            if self.budget.is_over:
                 return None
             some = keys[start : start + _TOGETHER]
             costs = (
@@ -301,7 +267,7 @@ class PolicySearch:
             )
             parts.append(np.asarray(costs, float))
         # The next comparison may take as long.
-        self.longest = max(self.longest, self.seconds - began)
+        self.budget.add_step(self.budget.spent - began)
         return np.concatenate(parts)
 
     def trained(self, line: Line, method: str) -> AbstractController:
@@ -312,8 +278,9 @@ class PolicySearch:
             nonlocal ends
             self.show()
             # The first block compiles.
-            ends = self.seconds + _ROUND * self.budget if ends is None else ends
-            return not self.may_train or self.seconds > ends
+            now = self.budget.spent
+            ends = now + _ROUND * self.budget.total if ends is None else ends
+            return not self.budget.may_train or now > ends
 
         given = self.environment, self.ranges, line.policy
         options: Any = dict(key=self.fresh_key(), callbacks=(is_over,))
@@ -330,11 +297,11 @@ class PolicySearch:
         Each attempt uses the method with the largest gain in its last attempt at this
         rate. A method that was not tried at its rate comes before.
         """
-        ends = self.seconds + seconds
+        ends = self.budget.spent + seconds
         # The method of the last gain comes first, then those with less damping.
         names = sorted(reversed(self.methods), key=lambda name: name != line.method)
         gains = dict.fromkeys(names, np.inf)
-        while self.may_train and self.seconds < ends:
+        while self.budget.may_train and self.budget.spent < ends:
             left = [n for n in names if line.rates.get(n, _RATE) > _LEAST_RATE]
             left = [name for name in left if self.may_begin(line, name)]
             if not left:
@@ -352,23 +319,24 @@ class PolicySearch:
 
     def attempt(self, line: Line, method: str) -> Line:
         """The line after some rounds of a method, or as it was if none is better."""
-        began, best, ends, least = self.seconds, line, 0.0, np.inf
-        while not ends or self.seconds < ends:
+        began, best, ends, least = self.budget.spent, line, 0.0, np.inf
+        while not ends or self.budget.spent < ends:
             policy = self.trained(best, method)
             costs = self.costs(policy)
             after = best._replace(method=method, policy=policy, costs=costs)
             if not ends:
                 # The first round compiles.
-                self.longest = max(self.longest, self.seconds - began)
+                self.budget.add_step(self.budget.spent - began)
                 self.compiled.add(_program(line, method))
-                ends = self.seconds + _ATTEMPT * self.budget
+                ends = self.budget.spent + _ATTEMPT * self.budget.total
             least = min(least, self.mean(after))
             # If a round changes nothing, it diverged at its first step.
             stays = self.score(after) == self.score(best)
             best = min(after, best, key=self.score)
-            if stays or not self.may_train:
+            if stays or not self.budget.may_train:
                 break
-        self.tried.append(Attempt(line.structure, method, least, self.seconds - began))
+        took = self.budget.spent - began
+        self.tried.append(Attempt(line.structure, method, least, took))
         self.enter(best)
         self.show()
         if self.gain(line, best) <= _GAIN:
@@ -378,11 +346,10 @@ class PolicySearch:
 
     def show(self) -> None:
         """Update the bar."""
-        least = min(self.best.values(), key=self.mean)
-        left = max(0, self.budget - self.seconds)
+        least, left = min(self.best.values(), key=self.mean), self.budget.left
         shown = f"{left:.0f} s left, cost {self.mean(least):.5g}, {least.structure}"
         self.bar.set_postfix_str(shown, refresh=False)
-        self.bar.update(min(self.seconds, self.bar.total) - self.bar.n)
+        self.bar.update(min(self.budget.spent, self.bar.total) - self.bar.n)
 
     def costs(self, policy: AbstractController, keys: Any = None) -> np.ndarray:
         """The costs of a policy, by default in the episodes for choosing a policy."""
@@ -419,9 +386,9 @@ class PolicySearch:
         """
         floor = [self.best[name] for name in self.floor if name in self.best]
         lines = _distinct([*self.last, *floor])
-        ends = self.training_ends + _CHOOSING * self.budget
+        ends = self.budget.choice_ends
         for k in range(1, _ROUNDS):
-            if self.seconds > ends:
+            if self.budget.spent > ends:
                 break
             keys = jr.split(jr.fold_in(jr.fold_in(self.key, CHOICE), k), CHOICE)
             more = [self.costs(line.policy, keys) for line in lines]
@@ -473,7 +440,7 @@ class PolicySearch:
             yield name, self.costs(law, self.comparison)[: self.count]
         observed = self.environment.dynamics.observes_state
         for name in ("MPC", "plan") if observed else ("plan",):
-            if self.may_compare(name, self.seconds):
+            if self.budget.may_compare(name, self.budget.spent):
                 keys = self.comparison[: self.count]
                 try:
                     costs = self.costs_of_rival(name, policy, keys)

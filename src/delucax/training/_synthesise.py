@@ -255,7 +255,7 @@ def synthesise(
             f"from {lost} of {len(own)} initial states.",
             stacklevel=2,
         )
-    about = search.seconds, search.plants(), search.ended
+    about = search.budget.spent, search.plants(), search.ended
     return Synthesis(policy, structure, costs, search.tried, *about)
 
 
