@@ -1,15 +1,17 @@
 """What each part of `training.synthesise` brings: the part `ablation` of
 `benchmarks.policies`.
 
-The same search in its default time, without one of its parts, on tasks of each kind.
-MPC and a plan are compared with the whole search alone. `gradient
-alone` is what one writes without it: a network, trained by the gradient of the rollout.
-`no LQR` is without the LQR altogether: in the policies, among what may be returned, in
-the final cost of MPC, and in the scale of the controls. `no clipping` takes the mean
-gradient of a batch. `no last choice` returns the best on the starts of the training.
+The same search without one of its parts, on tasks of each kind. `gradient alone` is
+what one writes without it: a network, trained by the gradient of the rollout. `no LQR`
+is without the LQR altogether: in the policies, among what may be returned, and in the
+scale of the controls. `no clipping` takes the mean gradient of a batch. `no last
+choice` returns the best on the starts of the training. No search ends because the LQR
+is as good as a plan.
+
+How much of a budget compilation takes depends on the machine. So the seeds of a search
+share a process, whose first search only compiles, and each has its time after that.
 """
 
-import time
 from itertools import islice
 from typing import Any
 from unittest import mock
@@ -24,7 +26,9 @@ from benchmarks._synthesis import regret
 
 
 STORE = _cases.RESULTS / "ablation.jsonl"
-SEEDS, BUDGET = 2, 75.0
+SEEDS, BUDGET = 3, 30.0
+_ENOUGH = 600.0
+"""The budget of the search that only compiles."""
 TASKS = (
     "acrobot",
     "cartpole_swing_up",
@@ -45,7 +49,7 @@ WITHOUT = (
     "no last choice",
     "gradient alone",
 )
-SEVERAL = 2
+SEVERAL = 3
 """Seeds from which on their range is shown."""
 
 
@@ -62,11 +66,22 @@ class MeanGradient(eqx.Module):
         return jax.tree.map(lambda leaf: jax.numpy.mean(leaf, axis=0), each)
 
 
-def case(task: str, without: str, seed: int, budget: float) -> dict[str, Any]:
-    """The policy of one task and seed without a part of the search."""
-    began = time.perf_counter()
+def case(task: str, without: str, seeds: int, budget: float) -> dict[str, Any]:
+    """The policies of one task, from searches without a part."""
     from delucax.studies._scoreboard import task_of
     from delucax.training import _rounds
+
+    environment = task_of(task)
+    unclipped = without == "no clipping"
+    estimator = MeanGradient if unclipped else _rounds.ClippedSamples
+    with mock.patch.object(_rounds, "ClippedSamples", estimator):
+        compile_all(environment, without)
+        made = [searched(environment, without, seed, budget) for seed in range(seeds)]
+    return {"searches": made}
+
+
+def reduced(environment: Any, without: str, seed: int, budget: float) -> Any:
+    """The search without a part."""
     from delucax.training._policy_search import PolicySearch
 
     alone = without == "gradient alone"
@@ -75,28 +90,45 @@ def case(task: str, without: str, seed: int, budget: float) -> dict[str, Any]:
         def regulator(self):
             return None if alone or without == "no LQR" else super().regulator()
 
+        def is_settled(self):
+            return False
+
     key = jax.random.key(seed)
-    search = Reduced(task_of(task), None, key, budget=budget, progress=False)
+    search = Reduced(environment, None, key, budget=budget, progress=False)
     dropped = {
         "no damping": lambda name: name.startswith("gradient,"),
         "no evolution": lambda name: name == "evolution",
         "gradient alone": lambda name: name != "gradient",
     }.get(without, lambda name: False)
     search.methods = {n: m for n, m in search.methods.items() if not dropped(n)}
-    unclipped = without == "no clipping"
-    estimator = MeanGradient if unclipped else _rounds.ClippedSamples
-    with mock.patch.object(_rounds, "ClippedSamples", estimator):
+    return search
+
+
+def compile_all(environment: Any, without: str) -> None:
+    """One block of each training, so that the programs are compiled."""
+    from delucax.training import _policy_search as module
+
+    search = reduced(environment, without, 2**20, _ENOUGH)
+    search.refine = lambda lines: None
+    with mock.patch.multiple(module, _ROUND=0.0, _ATTEMPT=0.0):
         search.run(width=32, depth=1)
+
+
+def searched(
+    environment: Any, without: str, seed: int, budget: float
+) -> dict[str, Any]:
+    """What one search finds."""
+    search = reduced(environment, without, seed, budget)
+    search.run(width=32, depth=1)
     if without != "no last choice":
         search.choose()
     structure, policy = search.chosen()
     # After the policy and the laws without a training come MPC and the plan.
-    first = 1 + sum(name in search.best for name in search.floor)
-    compared = islice(search.compared(policy), None if without == ALL else first)
+    first = 1 + sum(name in search.best for name in search.baselines)
+    compared = islice(search.compared(policy), first)
     costs = {n: cost.tolist() for n, cost in compared}
-    seconds = time.perf_counter() - began
     tried = [attempt._asdict() for attempt in search.tried]
-    about = {"structure": structure, "seconds": seconds}
+    about = {"seed": seed, "structure": structure, "seconds": search.budget.spent}
     return about | {"costs": costs, "tried": tried}
 
 
@@ -104,14 +136,14 @@ def ablation(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
     """Run what is missing; a row for each task, a column for each part left out, and
     with several seeds their range beside it."""
     cases = [
-        {"task": task, "without": without, "seed": seed, "budget": BUDGET}
-        for seed in range(seeds)
+        {"task": task, "without": without, "seeds": seeds, "budget": BUDGET}
         for task in only or TASKS
         for without in WITHOUT
     ]
 
     def said(row):
-        return f"{row['structure']}, {np.mean(row['costs']['policy']):.5g}"
+        each = [np.mean(made["costs"]["policy"]) for made in row["searches"]]
+        return ", ".join(f"{cost:.5g}" for cost in each)
 
     rows = _cases.run("benchmarks._ablation", STORE, cases, said, **how)
     made = summary(rows)
@@ -148,6 +180,7 @@ def cell(row: dict[str, Any], name: str, show: Any = "{:+.1%}".format) -> str:
 
 def _above_best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """How far each is above the best of all searches with its seed."""
+    rows = [row | made for row in rows for made in row["searches"]]
     made = []
     for row in rows:
         same = [r for r in rows if (r["task"], r["seed"]) == (row["task"], row["seed"])]

@@ -87,7 +87,9 @@ def test_a_case_of_the_ablation_has_its_budget(module, tmp_path, monkeypatch):
     monkeypatch.setattr(
         ablation._cases,
         "_row",
-        lambda _, case: seen.append(case) or case | {"structure": "", "costs": costs},
+        lambda _, case: (
+            seen.append(case) or case | {"searches": [{"seed": 0, "costs": costs}]}
+        ),
     )
     for budget in (1.0, 1.0, 2.0):
         monkeypatch.setattr(ablation, "BUDGET", budget)
@@ -136,10 +138,17 @@ def test_tasks_that_need_no_training_are_counted(module, monkeypatch):
 
 def test_the_ablation_shows_the_range_of_several_seeds(module):
     ablation, page = module("_ablation"), module("_policy_page")
+    each = {ablation.ALL: (0, 0, 0), "no LQR": (0.3, 0.1, 0.2)}
     rows = [
-        row_of("pendulum", seed, policy=1 + above) | {"without": name}
-        for name, of in {ablation.ALL: (0, 0, 0), "no LQR": (0.3, 0.1, 0.2)}.items()
-        for seed, above in enumerate(of)
+        {
+            "task": "pendulum",
+            "without": name,
+            "searches": [
+                row_of("pendulum", seed, policy=1 + above)
+                for seed, above in enumerate(of)
+            ],
+        }
+        for name, of in each.items()
     ]
     (row,) = ablation.summary(rows)
     assert ablation.cell(row, "no LQR") == "+20.0% (+10.0% to +30.0%)"
@@ -147,7 +156,8 @@ def test_the_ablation_shows_the_range_of_several_seeds(module):
         [row]
     )
     # Of one seed there is no range.
-    (row,) = ablation.summary(rows[::3])
+    first = [row | {"searches": row["searches"][:1]} for row in rows]
+    (row,) = ablation.summary(first)
     assert page.parts([row]).endswith("| `pendulum` | 0.0 | 30.0 |\n")
 
 
@@ -174,7 +184,8 @@ def test_what_the_ablation_leaves_out(
     monkeypatch.setattr(_policy_search, "by_evolution", train)
     monkeypatch.setattr(search, "choose", lambda self: chosen.append(self))
     monkeypatch.setattr(_budget.Budget, "may_compare", lambda *_: False)
-    found = module("_ablation").case("double_integrator", without, 0, budget=0.0)
+    case = module("_ablation").case("double_integrator", without, 1, budget=0.0)
+    (found,) = case["searches"]
     assert {kind is ClippedSamples for kind in used} == {is_clipped}
     assert bool(chosen) == is_chosen
     assert ("LQR" in found["costs"]) == (without != "no LQR")

@@ -193,7 +193,7 @@ def test_the_last_choice_is_among_different_policies():
     for _ in range(5):
         search.enter(known("network", good, 1.0))
     search.enter(known("network", other, 2.0))
-    assert [line.policy for line in search.last] == [good, other]
+    assert [line.policy for line in search.finalists] == [good, other]
 
 
 def test_a_reward_is_a_large_usual_cost():

@@ -14,6 +14,7 @@ from ..controllers import local_mpc, OpenLoop
 from ..environments import Environment, randomise
 from ..planning import ILQR
 from ..simulation import rollout
+from ._costs import nan_if_failed
 
 
 # Costs grow like their logarithm above this multiple of the usual cost.
@@ -70,12 +71,11 @@ def on_plants(
 
 @eqx.filter_jit
 def costs_of(environment, ranges, policy, keys):
-    """The total cost of a policy in each episode, or NaN if the state diverges."""
+    """The total cost of a policy in each episode, or NaN if the rollout fails."""
 
     def of(plant, key):
         run = rollout(plant, policy, key=key, **_QUIETLY)
-        finite = jnp.all(jnp.isfinite(run.final_state))
-        return jnp.where(finite, run.total_cost, jnp.nan)
+        return nan_if_failed(run, run.total_cost)
 
     return on_plants(environment, ranges, keys, of)
 
@@ -86,7 +86,8 @@ def costs_of_mpc(environment, ranges, lqr, keys):
 
     def of(plant, key):
         mpc = local_mpc(plant, lqr, throw=False)
-        return rollout(plant, mpc, key=key, **_QUIETLY).total_cost
+        run = rollout(plant, mpc, key=key, **_QUIETLY)
+        return nan_if_failed(run, run.total_cost)
 
     return on_plants(environment, ranges, keys, of)
 
@@ -108,15 +109,16 @@ def costs_of_plan(environment, ranges, policy, keys):
         x0, planner = run.states[0], ILQR(max_iterations=100)
         plan = planner(plant.dynamics, plant.cost, x0, start, **given)
         planned = rollout(plant, OpenLoop(plan.controls), key=key, **_QUIETLY)
-        return jnp.fmin(planned.total_cost, run.total_cost)
+        costs = (nan_if_failed(each, each.total_cost) for each in (planned, run))
+        return jnp.fmin(*costs)
 
     return on_plants(environment, ranges, keys, of)
 
 
 @eqx.filter_jit
 def first_steps(environment, ranges, keys):
-    """Initial states, the costs of a step and of an end there, and the next states
-    under several controls."""
+    """Initial states, and under several controls the cost of a step and of an end
+    there, and the next state."""
     m, bounds = environment.control_size, environment.control_bounds
     controls = jnp.concatenate([jnp.zeros((1, m)), jr.normal(keys[0], (15, m))])
     if bounds is not None:
@@ -127,6 +129,6 @@ def first_steps(environment, ranges, keys):
         x0 = plant.reset(plant.split_key(key)[0])
         steps = jax.vmap(lambda u: plant.step(jnp.zeros(()), x0, u))(controls)
         end = plant.cost.final(plant.horizon * plant.dt, x0)
-        return x0, steps.cost[0] + end, steps.state
+        return x0, steps.cost + end, steps.state
 
     return on_plants(environment, ranges, keys, of)

@@ -33,7 +33,7 @@ from ._structures import structures
 # After this number of trials the search checks whether the LQR is enough.
 _FIRST = 2
 # Time constants of the damped gradients, as shares of the episode.
-_MEMORIES = (1 / 30, 1 / 10, 1 / 4)
+_TIME_CONSTANTS = (1 / 30, 1 / 10, 1 / 4)
 # The numbers of initial states: to choose a policy, to compare it, and to compare it on
 # a family of plants.
 CHOICE, _COMPARISON, _PLANTS = 64, 16, 48
@@ -77,9 +77,11 @@ def _distinct(lines: list[Line]) -> list[Line]:
     return list({id(line.policy): line for line in lines}.values())
 
 
-def _program(line: Line, method: str) -> tuple[str, bool]:
-    """What a training compiles: the gradients of all dampings share a program."""
-    return line.structure, method == _EVOLUTION
+def _program(line: Line, method: str) -> tuple[str, float]:
+    """What a training compiles: the gradients of all dampings share a program, and so
+    do evolutions of all standard deviations."""
+    rate = 0.0 if method == _EVOLUTION else line.rates.get(method, _RATE)
+    return line.structure, rate
 
 
 class PolicySearch:
@@ -102,22 +104,23 @@ class PolicySearch:
         zero = Zero(environment.control_size)
         unknown = np.full(CHOICE, np.inf)
         self.best = {"zero": Line("zero", "none", zero, unknown)}
-        self.last: list[Line] = []
+        self.finalists: list[Line] = []
         self.tried: list[Attempt] = []
         self.ended = "interrupted"
         self.law: LQR | LQG | None = None
         name = "LQG" if is_hidden(environment) else "LQR"
-        # The structures that need no training.
-        self.floor = "zero", name
+        # The names of the policies that need no training.
+        self.baselines = "zero", name
         lasting = min(environment.horizon, LONGEST) * float(environment.dt)
-        unit, times = environment.dynamics.time_unit, [lasting * m for m in _MEMORIES]
+        unit = environment.dynamics.time_unit
+        times = [lasting * share for share in _TIME_CONSTANTS]
         # From the name of a method to the time constant of its damped gradient.
         damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
         self.methods = damped | {"gradient": jnp.inf, _EVOLUTION: None}
         # The least median cost so far, and its absolute value.
         self.least, self.usual = np.inf, _ANY
         # The structures and kinds of training that are compiled.
-        self.compiled: set[tuple[str, bool]] = set()
+        self.compiled: set[tuple[str, float]] = set()
 
     def may_begin(self, line: Line, method: str) -> bool:
         """Whether there is time to train a line with a method."""
@@ -138,7 +141,7 @@ class PolicySearch:
         """Train until the time is up or no method gains."""
         self.law = self.regulator()
         floor = self.best["zero"].policy, self.law
-        for name, law in zip(self.floor, floor, strict=True):
+        for name, law in zip(self.baselines, floor, strict=True):
             if law is not None:
                 began = self.budget.spent
                 line = Line(name, "none", law, self.costs(law))
@@ -205,7 +208,7 @@ class PolicySearch:
         known = [line.costs for line in self.best.values()]
         lost = np.all(~np.isfinite(known), axis=0)
         if np.any(lost):
-            laws = " and the ".join(["zero control", self.floor[1]][: len(known)])
+            laws = " and the ".join(["zero control", self.baselines[1]][: len(known)])
             warnings.warn(
                 f"synthesise: the cost is not finite from {np.sum(lost)} of "
                 f"{len(lost)} initial states under {laws}: the plant runs away, or the "
@@ -223,7 +226,7 @@ class PolicySearch:
                 return local_lqg(self.environment, key=key)
             return local_lqr(self.environment)
         except (ValueError, RuntimeError) as error:
-            name = self.floor[1]
+            name = self.baselines[1]
             warnings.warn(
                 f"synthesise: no {name} and no network around one is tried, because "
                 f"there is no {name}: {error} If the plant can rest somewhere, define "
@@ -245,6 +248,8 @@ class PolicySearch:
         keys = self.keys(CHOICE)[: self.count]
         own = np.mean(self.best["LQR"].costs[: self.count])
         rival = "plan" if self.is_known else "MPC"
+        if not self.budget.may_compare(rival, self.budget.spent):
+            return False
         other = self.costs_of_rival(rival, self.law, keys)
         # A rival that fails proves nothing.
         if other is None or not np.all(np.isfinite([own, *other])):
@@ -253,19 +258,26 @@ class PolicySearch:
 
     def costs_of_rival(self, name: str, policy: Any, keys: Array) -> np.ndarray | None:
         """The costs of MPC, or of a plan that starts from the controls of `policy`;
-        `None` if the time does not suffice."""
+        `None` if the time does not suffice, or with a warning if it fails."""
         began, parts = self.budget.spent, []
         given = self.environment, self.ranges
         for start in range(0, len(keys), _TOGETHER):
             if self.budget.is_over:
                 return None
             some = keys[start : start + _TOGETHER]
-            costs = (
-                costs_of_mpc(*given, self.law, some)
-                if name == "MPC"
-                else costs_of_plan(*given, policy, some)
-            )
+            try:
+                costs = (
+                    costs_of_mpc(*given, self.law, some)
+                    if name == "MPC"
+                    else costs_of_plan(*given, policy, some)
+                )
+            except (ValueError, RuntimeError) as error:
+                # What is trained must not be lost for a comparison.
+                text = f"synthesise: there is no comparison with {name}: {error}"
+                warnings.warn(text, stacklevel=4)
+                return None
             parts.append(np.asarray(costs, float))
+            self.show()
         # The next comparison may take as long.
         self.budget.add_step(self.budget.spent - began)
         return np.concatenate(parts)
@@ -288,7 +300,7 @@ class PolicySearch:
         if method != _EVOLUTION:
             return by_gradient(*given, self.methods[method], rate, **options)
         width = _WIDE if line.structure == "network" else _NARROW
-        sigma = width if line.method == "none" else _NEAR * rate / _RATE
+        sigma = (width if line.method == "none" else _NEAR) * rate / _RATE
         return by_evolution(*given, sigma, self.usual, **options)
 
     def improve(self, line: Line, seconds: float = np.inf) -> Line:
@@ -298,7 +310,8 @@ class PolicySearch:
         rate. A method that was not tried at its rate comes before.
         """
         ends = self.budget.spent + seconds
-        # The method of the last gain comes first, then those with less damping.
+        # The method of the last gain comes first, then evolution, then the gradients,
+        # those with less damping before the others.
         names = sorted(reversed(self.methods), key=lambda name: name != line.method)
         gains = dict.fromkeys(names, np.inf)
         while self.budget.may_train and self.budget.spent < ends:
@@ -360,14 +373,19 @@ class PolicySearch:
         """Keep the line if it is the best of its structure, and update the usual
         cost."""
         name = line.structure
-        self.last = sorted(_distinct([*self.last, line]), key=self.score)[:_LAST]
+        if name not in self.baselines:
+            lines = _distinct([*self.finalists, line])
+            self.finalists = sorted(lines, key=self.score)[:_LAST]
         self.best[name] = min(self.best.get(name, line), line, key=self.score)
         costs = self.best[name].costs
-        middle = float(np.median(np.where(np.isfinite(costs), costs, np.inf)))
+        known = np.where(np.isfinite(costs), costs, np.inf)
+        low, middle, high = np.quantile(known, [0.25, 0.5, 0.75], method="lower")
         # The least is taken with its sign, so a large reward, which is a negative cost,
-        # gives a large usual cost.
-        if middle != 0 and middle < self.least:
-            self.least, self.usual = middle, abs(middle)
+        # gives a large usual cost. If the median is near zero, which is arbitrary if
+        # the cost has a constant, the spread of the costs counts.
+        usual = max(abs(middle), high - low if np.isfinite(high) else 0.0)
+        if usual != 0 and middle < self.least:
+            self.least, self.usual = float(middle), float(usual)
 
     def score(self, line: Line) -> float:
         """The mean tamed cost, the criterion for choosing policies."""
@@ -384,14 +402,15 @@ class PolicySearch:
         Good policies often differ only in a rare episode in which the plant runs away,
         and the first 64 initial states may have none.
         """
-        floor = [self.best[name] for name in self.floor if name in self.best]
-        lines = _distinct([*self.last, *floor])
+        floor = [self.best[name] for name in self.baselines if name in self.best]
+        lines = _distinct([*self.finalists, *floor])
         ends = self.budget.choice_ends
         for k in range(1, _ROUNDS):
             if self.budget.spent > ends:
                 break
             keys = jr.split(jr.fold_in(jr.fold_in(self.key, CHOICE), k), CHOICE)
             more = [self.costs(line.policy, keys) for line in lines]
+            self.show()
             lines = [
                 line._replace(costs=np.concatenate([line.costs, costs]))
                 for line, costs in zip(lines, more, strict=True)
@@ -406,7 +425,7 @@ class PolicySearch:
         """The best policy, or zero control or the LQR if they are about as good."""
         best = min(self.best.values(), key=self.score)
         least = self.score(best)
-        for name in self.floor:
+        for name in self.baselines:
             simple = self.best.get(name, best)
             if self.score(simple) - least <= _WORTH * abs(least):
                 best = simple
@@ -434,20 +453,14 @@ class PolicySearch:
     def compared(self, policy: AbstractController) -> Iterator[tuple[str, np.ndarray]]:
         """The costs of the policy and of other controllers, one after the other, in
         episodes that were used for nothing else."""
-        floor = {n: self.best[n].policy for n in self.floor if n in self.best}
+        floor = {n: self.best[n].policy for n in self.baselines if n in self.best}
         laws = {"policy": policy, **floor}
         for name, law in laws.items():
             yield name, self.costs(law, self.comparison)[: self.count]
-        observed = self.environment.dynamics.observes_state
-        for name in ("MPC", "plan") if observed else ("plan",):
+        # MPC plans from the state.
+        for name in ("plan",) if is_hidden(self.environment) else ("MPC", "plan"):
             if self.budget.may_compare(name, self.budget.spent):
                 keys = self.comparison[: self.count]
-                try:
-                    costs = self.costs_of_rival(name, policy, keys)
-                except (ValueError, RuntimeError) as error:
-                    # The policy is trained, and must not be lost for a comparison.
-                    text = f"synthesise: there is no comparison with {name}: {error}"
-                    warnings.warn(text, stacklevel=3)
-                    continue
+                costs = self.costs_of_rival(name, policy, keys)
                 if costs is not None:
                     yield name, costs

@@ -59,11 +59,11 @@ def structures(
     )
     features = _standardised(environment, seen)
     # A control without bounds gets a range from the controls of the law, or [-2, 2].
-    reach = np.ones(m) if law is None else _spread(np.asarray(applied), 1e-3)
+    centre, reach = (np.zeros(m), np.ones(m)) if law is None else _range(applied)
     half = jnp.where(bounded, (high - low) / 2, 2 * reach)
     # With a bound on one side only, the range begins at that bound.
-    below = jnp.where(jnp.isfinite(high), high - 2 * half, -half)
-    above = jnp.where(jnp.isfinite(low), low + 2 * half, half)
+    below = jnp.where(jnp.isfinite(high), high - 2 * half, centre - half)
+    above = jnp.where(jnp.isfinite(low), low + 2 * half, centre + half)
     ends = (
         jnp.where(jnp.isfinite(low), low, below),
         jnp.where(jnp.isfinite(high), high, above),
@@ -127,6 +127,16 @@ def _standardised(environment: Environment, observations: Array) -> Standardise:
     centre = np.median(z[np.all(np.isfinite(z), axis=1)], axis=0)
     std = _spread(z, 1e-3)
     return Standardise(jnp.asarray(centre), jnp.asarray(std), environment.encode)
+
+
+def _range(applied: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The median and the spread of the controls of a law. Where these hardly vary, they
+    do not tell how large a control may be, and the spread is 1."""
+    u, least = np.asarray(applied), 1e-3
+    u = u[np.all(np.isfinite(u), axis=1)]
+    centre, spread = np.median(u, axis=0), _spread(u, least)
+    is_known = spread > 2 * least * (1 + np.abs(centre))
+    return centre, np.where(is_known, spread, 1.0)
 
 
 def _spread(rows: np.ndarray, least: float) -> np.ndarray:

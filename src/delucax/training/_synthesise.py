@@ -168,15 +168,18 @@ def synthesise(
     5. Comparison. The baselines, MPC and the best plan run the episodes of the policy,
         if time is left for them. MPC needs an observed state.
 
-    An interrupt (`KeyboardInterrupt`) ends the training, and the best policy so far is
-    returned.
+    An interrupt (`KeyboardInterrupt`) ends the training. Then the choice and the
+    comparison follow; a further interrupt ends each of them. In any case the best
+    policy so far is returned.
 
     **Arguments:**
 
     - `environment`: the environment. The dynamics and the cost must be differentiable.
-        If a control has no bounds, the range of a network is plus and minus two
-        standard deviations of the LQR's control, or -2 to 2 if there is no LQR. If the
-        control has one bound, the range has the same width and begins at the bound.
+        If a control has no bounds, the range of a network is the median of the LQR's
+        control plus and minus two standard deviations. If the LQR's control hardly
+        varies, two takes the place of two deviations, and without an LQR the range is
+        -2 to 2. If the control has one bound, the range has the same width and begins
+        at the bound.
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
         default, at least 10. Training may take 70% of it, and the rest is for the
@@ -190,17 +193,16 @@ def synthesise(
         works on a family of plants: each episode draws a plant. The LQR is designed for
         the nominal plant; MPC and the plan know each plant. None by default: one plant.
     - `width`, `depth`: the units in a hidden layer, and the number of hidden layers of
-        the networks; 32 and 1 by default.
+        the networks; 32 and 1 by default. A recurrent network has one layer.
     - `progress`: whether to show a bar with the seconds and the cost so far; true by
         default.
 
     **Returns:** a [`delucax.training.Synthesis`][].
 
     **Raises:** `ValueError`, before any training, if an argument has the wrong type,
-    the cost of an initial state is not finite, none of about 16 controls keeps the
-    first step finite,
-    or the dynamics or the cost are not differentiable. Warns if the cost of the policy
-    is not finite in some episodes of the comparison.
+    if the dynamics or the cost are not differentiable, if an initial state or its cost
+    is not finite, or if none of about 16 controls keeps the first step finite. Warns if
+    the cost of the policy is not finite in some episodes of the comparison.
 
     !!! example
 
@@ -238,7 +240,7 @@ def synthesise(
     with search.bar:
         _check_environment(environment, ranges, search.keys(CHOICE))
         # An interrupt ends each of the three parts, and the next one goes on with what
-        # is known. So two in a row return the best policy at once.
+        # is known.
         with contextlib.suppress(KeyboardInterrupt):
             search.run(width, depth)
         with contextlib.suppress(KeyboardInterrupt):
@@ -279,9 +281,12 @@ def _check_environment(
     if np.isfinite(costs_of(env, ranges, Zero(env.control_size), keys)).all():
         return
     starts, costs, steps = map(np.asarray, first_steps(env, ranges, keys))
-    checked = ("initial state", starts), ("cost of an initial state", costs)
-    for what, values in checked:
-        finite = np.isfinite(values.reshape(len(keys), -1)).all(axis=1)
+    checked = (
+        ("initial state", np.isfinite(starts).all(axis=1)),
+        # Of several controls, because a cost may be infinite at zero control.
+        ("cost of an initial state", np.isfinite(costs).any(axis=1)),
+    )
+    for what, finite in checked:
         if not finite.all():
             x = starts[finite.argmin()]
             raise ValueError(
