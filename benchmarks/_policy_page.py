@@ -39,7 +39,13 @@ def write(results: Path) -> None:
 
 def tasks(rows: list[dict[str, Any]]) -> str:
     """A row for each task: the usual ones, the harder ones, those with events."""
-    head = ["task", "policy", "above the best, %", "worst seed, %", "beside all, %"]
+    head = [
+        "task",
+        "policy",
+        "above the best, %",
+        "worst seed, %",
+        "against the scoreboard, %",
+    ]
     kinds = ["usual", "hard", "events"]
     body = [
         [f"`{row['task']}`", row["policy"]]

@@ -178,11 +178,11 @@ def percent(excess: float | None) -> str:
 
 
 def footer() -> str:
-    """What it was measured with."""
+    """What it was measured with; not all on one machine."""
     machine = describe()
     version = machine["versions"]
     return (
-        f"Float32, {machine['cpu']}, delucax {version['delucax']}, JAX "
+        f"Float32, on CPUs of several machines, delucax {version['delucax']}, JAX "
         f"{version['jax']}."
     )
 

@@ -1,11 +1,12 @@
 """Are our sentences as clear as Diffrax's? A reader judges without knowing the source.
 
     python scripts/sentences.py --seed 0 > reading.txt       # a prompt and 80 sentences
-    python scripts/sentences.py --seed 0 --answers said.txt  # how many are called clear
+    python scripts/sentences.py --reading reading.txt --answers said.txt  # count them
 
 The script draws 40 sentences at random from our pages and docstrings, and 40 from the
 docstrings of the installed Diffrax. Give a reader the first output alone, and keep the
-answer in a file. Its lines are like `17 clear` and `18 unclear`.
+answer in a file. Its lines are like `17 clear` and `18 unclear`. The last reading and
+what three readers said of it are in `scripts/readings/`.
 """
 
 import argparse
@@ -97,28 +98,40 @@ def theirs() -> list[str]:
     return sorted({s for text in docstrings(diffrax) for s in sentences(text)})
 
 
-def drawn(seed: int) -> list[tuple[str, str]]:
-    """`(whose, sentence)`, mixed."""
+def drawn(seed: int) -> list[str]:
+    """Sentences of both, mixed."""
     rng = random.Random(seed)
-    pairs = [("ours", s) for s in rng.sample(ours(), COUNT)]
-    pairs += [("theirs", s) for s in rng.sample(theirs(), COUNT)]
-    rng.shuffle(pairs)
-    return pairs
+    mixed = rng.sample(ours(), COUNT) + rng.sample(theirs(), COUNT)
+    rng.shuffle(mixed)
+    return mixed
+
+
+def hidden(sentence: str) -> str:
+    """The sentence without the name of its library."""
+    return re.sub(r"(?i)delucax|diffrax", "library", sentence)
+
+
+def read(reading: str) -> list[tuple[str, str]]:
+    """`(whose, sentence)` for each sentence of a reading."""
+    known = set(map(hidden, theirs()))
+    each = re.findall(r"^\d+\. (.*)$", reading, re.M)
+    return [("theirs" if s in known else "ours", s) for s in each]
 
 
 def main() -> None:
     """Print what a reader gets, or count what a reader said."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0, help="of the draw")
-    parser.add_argument("--answers", type=Path, help="what a reader said")
+    parser.add_argument("--reading", type=Path, help="what a reader got")
+    parser.add_argument("--answers", type=Path, help="what the reader said of it")
     options = parser.parse_args()
-    pairs = drawn(options.seed)
+    if (options.reading is None) != (options.answers is None):
+        parser.error("--reading and --answers go together")
     if options.answers is None:
-        # Neither library is to be known by its name.
-        hidden = [re.sub(r"(?i)delucax|diffrax", "library", s) for _, s in pairs]
-        lines = [f"{i}. {s}" for i, s in enumerate(hidden, 1)]
+        lines = [f"{i}. {hidden(s)}" for i, s in enumerate(drawn(options.seed), 1)]
         print("\n".join([PROMPT, *lines]))
         return
+    pairs = read(options.reading.read_text())
     said = dict(
         re.findall(r"^(\d+)\W+(clear|unclear)", options.answers.read_text(), re.M)
     )

@@ -19,6 +19,7 @@ from delucax.training._budget import Budget
 from delucax.training._episode_costs import costs_of, tamed
 from delucax.training._policy_search import PolicySearch
 from delucax.training._structures import structures
+from delucax.training._synthesise import _check_environment
 
 
 KEY = jax.random.key(0)
@@ -206,6 +207,27 @@ def test_a_reward_is_a_large_usual_cost():
     assert np.isfinite(tamed(jnp.array([1.0, jnp.inf]), 1e-3)).all()
 
 
+def test_a_constant_in_the_cost_does_not_hide_what_is_usual():
+    """The median is zero by chance, and the spread of the costs is not."""
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    costs = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    search.enter(known("zero", dlx.controllers.Zero(1), *costs))
+    assert search.usual == 2.0
+    good, poor = (known("network", None, *(costs + more)) for more in (-0.5, 0.5))
+    assert search.score(good) < search.score(poor)
+
+
+def test_another_rate_is_another_program(monkeypatch):
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    line = known("network", dlx.controllers.Zero(1), 1.0)
+    monkeypatch.setattr(PolicySearch, "trained", lambda *_: line.policy)
+    slower = search.attempt(search.attempt(line, "gradient"), "evolution")
+    monkeypatch.setattr(Budget, "spent", 6.0)
+    search.budget.longest = 5.0
+    assert search.may_begin(line, "gradient") and search.may_begin(slower, "evolution")
+    assert not search.may_begin(slower, "gradient")
+
+
 def test_each_kind_of_plant_gets_its_structures():
     lqr = dlx.controllers.local_lqr(env())
     names = lambda env, *given: set(structures(env, *given, 4, 1, KEY))
@@ -354,6 +376,20 @@ def test_a_comparison_ends_with_the_time(monkeypatch):
     assert len(ran) == 4
 
 
+def test_a_range_is_about_the_controls_of_the_law():
+    law = dlx.controllers.local_lqr(env())
+    free = dataclasses.replace(env(), control_bounds=None)
+    about = lambda law: structures(free, law, False, 4, 1, KEY)["network"].bounds
+    low, high = about(law)
+    moved = dataclasses.replace(law, u_ref=jnp.array([50.0]))
+    assert_allclose = np.testing.assert_allclose
+    assert_allclose(jnp.array(about(moved)), jnp.array([low, high]) + 50.0, atol=5.0)
+    # A law whose controls hardly vary does not tell how large they may be.
+    still = dataclasses.replace(law, K=1e-6 * law.K)
+    low, high = about(still)
+    assert_allclose(jnp.array([low, high]).ravel(), [-2.0, 2.0], atol=1e-2)
+
+
 def test_a_range_reaches_from_a_bound_on_one_side():
     task = dataclasses.replace(env(), control_bounds=(jnp.array(5.0), jnp.inf))
     low, high = structures(task, None, False, 4, 1, KEY)["network"].bounds
@@ -485,6 +521,12 @@ def test_bad_tasks(change, match):
     task = dataclasses.replace(env(), **change)
     with pytest.raises(ValueError, match=f"synthesise: the {match}"):
         synthesise(task, key=KEY)
+
+
+def test_a_cost_may_be_infinite_at_zero_control():
+    cost = dlx.costs.Function(lambda t, x, u: x[0] ** 2 - jnp.log(jnp.abs(u[0])))
+    task = dataclasses.replace(env(), cost=cost, horizon=5)
+    _check_environment(task, None, jax.random.split(KEY, 4))
 
 
 def test_each_plant_of_a_family_is_checked():

@@ -189,7 +189,7 @@ def single_compartment(
 def double_compartment(
     system: DoubleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Ventilate a lung of a fast and a slow compartment, with a late, noisy sensor.
+    """Ventilate a lung with a fast and a slow part. Its sensor is late and noisy.
 
     This is the plant of the ventilator study: the task `lung/single_compartment` with
     another lung and a realistic sensor.
