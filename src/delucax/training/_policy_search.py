@@ -117,7 +117,7 @@ class PolicySearch:
         # From the name of a method to the time constant of its damped gradient.
         damped: dict[str, Any] = {f"gradient, {at:.2g} {unit}": at for at in times}
         self.methods = damped | {"gradient": jnp.inf, _EVOLUTION: None}
-        # The least median cost so far, and its absolute value.
+        # The least median cost so far, and the usual cost that belongs to it.
         self.least, self.usual = np.inf, _ANY
         # The structures and kinds of training that are compiled.
         self.compiled: set[tuple[str, float]] = set()
