@@ -381,11 +381,11 @@ def test_a_range_is_about_the_controls_of_the_law():
     free = dataclasses.replace(env(), control_bounds=None)
     about = lambda law: structures(free, law, False, 4, 1, KEY)["network"].bounds
     low, high = about(law)
-    moved = dataclasses.replace(law, u_ref=jnp.array([50.0]))
+    moved = dlx.replace(law, {"u_ref": jnp.array([50.0])})
     assert_allclose = np.testing.assert_allclose
     assert_allclose(jnp.array(about(moved)), jnp.array([low, high]) + 50.0, atol=5.0)
     # A law whose controls hardly vary does not tell how large they may be.
-    still = dataclasses.replace(law, K=1e-6 * law.K)
+    still = dlx.replace(law, {"K": 1e-6 * law.K})
     low, high = about(still)
     assert_allclose(jnp.array([low, high]).ravel(), [-2.0, 2.0], atol=1e-2)
 

@@ -164,7 +164,8 @@ class PolicySearch:
         evolution = [name for name in self.methods if name == _EVOLUTION]
         first, last = list(made)[0], list(made)[-1]
         trials = [(first, gradients), (last, evolution)]
-        trials += [(first, evolution), (last, gradients)] if first != last else []
+        # Evolution around the LQR is seldom the best, so the time may end before it.
+        trials += [(last, gradients), (first, evolution)] if first != last else []
         if self.environment.dynamics.event_names:
             # The gradient does not show what another order of events would cost, and
             # its program compiles for twice as long.
