@@ -91,9 +91,9 @@ def rivals(rows: list[dict[str, Any]]) -> str:
         ends = f"[{number(row['low'])}, {number(row['high'])}]"
         less = f"{number(row['ours less theirs'])} {ends}"
         is_ours = row["method"] == "synthesise"
-        costs = [number(row["cost"]), number(row["worst seed"])]
+        costs = [str(row["seeds"]), number(row["cost"]), number(row["worst seed"])]
         body.append([row["task"], row["method"], *costs, "-" if is_ours else less])
-    return markdown(["task", "method", "cost", "worst seed", apart], body, 2)
+    return markdown(["task", "method", "seeds", "cost", "worst seed", apart], body, 2)
 
 
 def percent(share: float | None) -> str:
