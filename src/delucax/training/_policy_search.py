@@ -176,7 +176,11 @@ class PolicySearch:
             for method in methods:
                 # However short the budget is, one policy is trained.
                 if self.may_begin(line, method) or len(self.tried) == untrained:
+                    own = self.mean(line)
                     line = self.attempt(line, method)
+                    # If the gradient is zero, it is zero with less damping too.
+                    if np.isfinite(own) and self.tried[-1].cost == own:
+                        break
             lines.append(line)
             if len(lines) == _FIRST and self.is_settled():
                 rival = "a plan" if self.is_known else "MPC"
