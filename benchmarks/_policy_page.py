@@ -1,4 +1,4 @@
-"""The tables of `docs/policies.md` that come from `results/policies.json`."""
+"""The tables of `docs/policy_results.md` that come from `results/policies.json`."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from benchmarks._page import DOCS, markdown, write_page
 from benchmarks._synthesis import hard
 
 
-PAGE = DOCS / "policies.md"
+PAGE = DOCS / "policy_results.md"
 LAWS = {
     "zero": "no control",
     "LQR": "nominal LQR",

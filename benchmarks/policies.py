@@ -22,7 +22,7 @@ given):
   `sb3`);
 - `export`: the policies in C.
 
-`--page` puts the tables of these into `docs/policies.md`, and draws the figure.
+`--page` puts the tables of these into `docs/policy_results.md`, and draws the figure.
 
 With `--at-once 2` two cases share the cores, each with the same seconds.
 
