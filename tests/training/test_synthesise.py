@@ -565,6 +565,20 @@ def test_a_comparison_that_fails_does_not_lose_the_policy(monkeypatch):
     assert set(costs) == {"policy", "zero", "plan"}
 
 
+def test_mpc_is_no_rival_without_the_state(monkeypatch):
+    module = sys.modules[PolicySearch.__module__]
+    for name in "costs_of_mpc", "costs_of_plan":
+        monkeypatch.setattr(module, name, lambda *given: np.ones(4))
+    noise = dlx.disturbances.Gaussian(0.01, size=2)
+    noisy = dataclasses.replace(env(), sensor_noise=noise)
+    rivals = {}
+    for task in env(), noisy:
+        search = PolicySearch(task, None, KEY, 10.0, progress=False)
+        monkeypatch.setattr(search, "costs", lambda *_: np.ones(64))
+        rivals[task is noisy] = set(dict(search.compared(dlx.controllers.Zero(1))))
+    assert rivals[False] - rivals[True] == {"MPC"}
+
+
 def test_starts_that_are_lost_are_named_before_the_training(monkeypatch):
     class Cubic(dlx.AbstractSystem):
         state_names, control_names = ("x",), ("u",)
