@@ -69,7 +69,7 @@ def task_of(name: str) -> dlx.Environment:
 
 def policies(env: Any, task: str) -> dict[str, Any]:
     """One of each structure, trained."""
-    from delucax.training._structures import structures
+    from delucax.training._structures import simplified, structures
 
     key = jr.key(0)
     found = dlx.training.synthesise(env, key=key, budget=BUDGET, progress=False)
@@ -98,7 +98,7 @@ def policies(env: Any, task: str) -> dict[str, Any]:
             trained = dlx.training.evolve(loss, policy, STEPS, **how)
         else:
             trained = dlx.training.fit(loss, policy, optimiser, STEPS, **how)
-        made[name] = trained.model
+        made[name] = simplified(name, trained.model)
     return made
 
 

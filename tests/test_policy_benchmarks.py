@@ -182,6 +182,9 @@ def test_what_the_ablation_leaves_out(
     search, used, chosen = _policy_search.PolicySearch, [], []
     monkeypatch.setattr(_policy_search, "by_gradient", train)
     monkeypatch.setattr(_policy_search, "by_evolution", train)
+    monkeypatch.setattr(
+        _policy_search, "costs_of", lambda *given: np.ones(len(given[-1]))
+    )
     monkeypatch.setattr(search, "choose", lambda self: chosen.append(self))
     monkeypatch.setattr(_budget.Budget, "may_compare", lambda *_: False)
     case = module("_ablation").case("double_integrator", without, 1, budget=0.0)

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 from delucax.controllers import local_lqg
@@ -39,6 +39,7 @@ def test_it_brings_a_hidden_state_to_rest():
     assert lqg.estimator.V[0, 0] == pytest.approx(1e-4, rel=0.2)
 
 
+@once
 @pytest.mark.parametrize("changes", [{}, dict(initial_state=[1.0, 0.0])])
 def test_without_noise_there_is_a_filter_too(changes):
     """Even from one initial state, which has no covariance."""
@@ -48,6 +49,7 @@ def test_without_noise_there_is_a_filter_too(changes):
     assert jnp.all(jnp.abs(run.states[-1]) < 0.2)
 
 
+@once
 def test_it_is_the_lqg_of_a_linear_task():
     A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
     C, W, V = jnp.eye(2)[:1], 0.01 * jnp.eye(2), 0.25 * jnp.eye(1)
@@ -60,6 +62,7 @@ def test_it_is_the_lqg_of_a_linear_task():
     assert_close(lqg.estimator.L, exact.estimator.L, atol=0.05)
 
 
+@once
 def test_where_the_state_is_observed_its_readings_wrap():
     noise = dlx.disturbances.Gaussian(0.1, size=2)
     task = dataclasses.replace(dlx.make("pendulum"), sensor_noise=noise)
@@ -69,6 +72,7 @@ def test_where_the_state_is_observed_its_readings_wrap():
     assert_close(act(0.1 + 2 * jnp.pi), act(0.1), atol=1e-4)
 
 
+@once
 def test_a_state_that_no_sensor_shows_has_no_filter():
     class Velocity(Position):
         def observe(self, t, x):
@@ -80,6 +84,7 @@ def test_a_state_that_no_sensor_shows_has_no_filter():
         local_lqg(task, key=KEY)
 
 
+@once
 def test_bad_input():
     task = hidden()
     for call, match in (

@@ -136,6 +136,7 @@ def batch_solution(kalman, ys, us):
     return mean.reshape(T, n), np.stack(blocks), density
 
 
+@needs_x64
 @pytest.mark.parametrize("known_start", [False, True])
 def test_smoother_solves_the_whole_record_at_once(known_start):
     kalman, ys, us = problem(3, 2, k=1, T=6)
@@ -162,6 +163,7 @@ def test_smoother_of_many_states_with_one_noise():
     assert_close(smoothed.covariance, covariance, atol=tolerance(1e-2, 1e-9))
 
 
+@needs_x64
 def test_steady_state():
     transient, ys, us = problem(3, 2, k=3, T=60)
     dynamics, W, V = transient.dynamics, transient.W, transient.V

@@ -223,6 +223,7 @@ def swinging(length):
     return dlx.Discretized(dlx.systems.Pendulum(length=length), dt=0.05)
 
 
+@needs_x64
 def test_a_parameter_that_drifts_is_followed():
     rng = np.random.default_rng(0)
     T = 240
@@ -257,6 +258,7 @@ def test_a_parameter_that_drifts_is_followed():
     assert np.mean(np.abs(fixed.mean[60:, 0] - lengths[60:])) > 3 * np.mean(off[60:])
 
 
+@needs_x64
 def test_outliers():
     """Every tenth reading is wrong by 30 standard deviations."""
     dynamics = dlx.LinearDynamics(

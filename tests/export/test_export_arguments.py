@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from c_programs import exported, STRICT
-from helpers import needs_compiler
+from helpers import needs_compiler, needs_x64, once
 from jax import lax
 
 import delucax as dlx
@@ -73,6 +73,7 @@ REFUSED = [
 ]
 
 
+@once
 @pytest.mark.parametrize(("name", "function", "why"), REFUSED)
 def test_refusal_names_the_operation_and_the_line(tmp_path, name, function, why):
     with pytest.raises(ValueError, match=why) as error:
@@ -86,6 +87,7 @@ PLANT = dlx.LinearDynamics([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], dt=0.1)
 LAW = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
 
 
+@once
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -144,6 +146,7 @@ def test_wrong_arguments(tmp_path, given, words):
     assert not any(tmp_path.iterdir())
 
 
+@once
 def test_a_plant_gives_the_size_of_an_observation(tmp_path):
     total = dlx.controllers.Constant([1.0])
     export.c(total, tmp_path, name="held", plant=PLANT)
@@ -151,6 +154,7 @@ def test_a_plant_gives_the_size_of_an_observation(tmp_path):
     assert f"HELD_OBSERVATION_SIZE {PLANT.observation_size}" in header
 
 
+@once
 def test_no_half_written_files(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="directory must be one that can be written"):
@@ -161,6 +165,7 @@ def test_no_half_written_files(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "law.c"]
 
 
+@once
 def test_report_and_header(tmp_path):
     plant = dlx.Discretized(dlx.systems.CartPole(), dt=0.02)
     export.c(plant, tmp_path, name="plant", dtype="float32")
@@ -196,6 +201,7 @@ def chained(x, k):
     return y, rows, inverse, x[k], jnp.sort(x), wrapped
 
 
+@needs_x64
 @needs_compiler
 def test_sanitizers_find_nothing(tmp_path):
     x = np.random.default_rng(0).normal(size=(4, 6))
@@ -240,6 +246,7 @@ def exported_type(folder):
     return "int64_t" if "int64_t *" in (folder / "chained.h").read_text() else "int32_t"
 
 
+@once
 @needs_compiler
 def test_parts_of_a_pytree_are_arguments(tmp_path):
     env = dlx.make("pendulum", dt=0.05)

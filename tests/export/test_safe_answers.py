@@ -4,14 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import needs_compiler
+from helpers import needs_compiler, once
 from jax import lax
 
 import delucax as dlx
 from delucax import export
 
 
-pytestmark = needs_compiler
+pytestmark = [needs_compiler, once]
 PID = dlx.controllers.PID(10.0, 5.0, 1.0, dt=0.05)
 
 

@@ -59,6 +59,7 @@ def test_they_are_sensitivities_of_the_cost(planner):
         assert_close(multipliers.costates[0], -by_start, rtol=1e-6)
 
 
+@needs_x64
 def test_those_of_bounds():
     plan = planned(SQP())
     lower, upper = plan.multipliers.controls
@@ -89,6 +90,7 @@ def test_a_plan_gives_its_multipliers_to_the_next(planner):
         assert 3 * warm.iterations < cold.iterations
 
 
+@needs_x64
 def test_those_of_other_constraints_start_from_zero():
     plan = planned(SQP())
     other = lambda t, x, u: jnp.stack([-x[1] - 1.0, x[1] - 5.0])
@@ -102,6 +104,7 @@ def test_a_name_stands_for_one_constraint():
         dlx.planning.Constraints(slow, slow)
 
 
+@needs_x64
 def test_weights_fit_their_constraint():
     soft = dlx.planning.SoftConstraint(Slow(), linear=jnp.ones(3))
     with user_error(

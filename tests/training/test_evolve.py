@@ -6,11 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, once
 
 import delucax as dlx
 from delucax.training import evolve
 
+
+pytestmark = once
 
 KEY = jax.random.key(0)
 

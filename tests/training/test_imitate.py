@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close
+from helpers import assert_close, once
 
 import delucax as dlx
 from delucax.controllers import local_lqr, Residual
 from delucax.training import imitate
 
+
+pytestmark = once
 
 KEY = jax.random.key(0)
 

@@ -18,7 +18,11 @@ from delucax.training._attempt import Attempt, Line
 from delucax.training._budget import Budget
 from delucax.training._episode_costs import costs_of, tamed
 from delucax.training._policy_search import PolicySearch
-from delucax.training._structures import _range as controls_of_a_law, structures
+from delucax.training._structures import (
+    _range as controls_of_a_law,
+    simplified,
+    structures,
+)
 from delucax.training._synthesise import _check_environment
 
 
@@ -284,6 +288,38 @@ def test_a_policy_starts_with_the_costs_of_its_regulator(monkeypatch):
     assert search.tried[-1].cost > search.mean(before)
 
 
+def test_both_policies_run_in_the_same_programs():
+    lqr = dlx.controllers.local_lqr(env())
+    first, second = structures(env(), lqr, False, 4, 1, KEY).values()
+    assert jax.tree.structure(first) == jax.tree.structure(second)
+    for one, other in zip(*map(jax.tree.leaves, (first, second)), strict=True):
+        assert jax.typeof(one) == jax.typeof(other)
+    network = simplified("network", second)
+    assert isinstance(network, dlx.controllers.MLP)
+    cost = lambda policy: dlx.rollout(env(), policy, key=KEY).total_cost
+    np.testing.assert_allclose(cost(network), cost(second), rtol=1e-5)
+    assert simplified("LQR", first) is first.base
+    assert simplified("LQR + network", first) is first
+
+
+def test_an_interrupt_keeps_the_rounds_so_far(monkeypatch):
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    better, rounds = dlx.controllers.Constant([1.0]), []
+
+    def trained(self, line, method):
+        rounds.append(line)
+        if len(rounds) > 1:
+            raise KeyboardInterrupt
+        return better
+
+    monkeypatch.setattr(PolicySearch, "trained", trained)
+    monkeypatch.setattr(PolicySearch, "costs", lambda *_: np.array([1.0]))
+    worse = known("network", dlx.controllers.Zero(1), 2.0)
+    with pytest.raises(KeyboardInterrupt):
+        search.attempt(worse, "gradient")
+    assert search.best["network"].policy is better
+
+
 @pytest.mark.parametrize(("began", "blocks"), [(0.0, 6), (6.8, 2)])
 def test_a_long_round_ends_with_its_time(monkeypatch, began, blocks):
     """After its first block a round takes 5% of the budget, or ends with the
@@ -393,7 +429,7 @@ def test_a_range_is_about_the_controls_of_the_law():
 
 def test_a_range_reaches_from_a_bound_on_one_side():
     task = dataclasses.replace(env(), control_bounds=(jnp.array(5.0), jnp.inf))
-    low, high = structures(task, None, False, 4, 1, KEY)["network"].bounds
+    low, high = structures(task, None, False, 4, 1, KEY)["network"].correction.bounds
     assert low == 5 and 5 < high < jnp.inf
 
 
@@ -415,6 +451,15 @@ def test_it_ends_where_the_regulator_is_enough(monkeypatch, better):
     assert not search.is_settled()
 
 
+@pytest.fixture
+def any_rivals(monkeypatch):
+    """MPC and plans that cost one, so that neither is compiled."""
+    module = sys.modules[PolicySearch.__module__]
+    for name in ("costs_of_mpc", "costs_of_plan"):
+        monkeypatch.setattr(module, name, lambda *given: np.ones(len(given[-1])))
+
+
+@pytest.mark.usefixtures("any_rivals")
 def test_it_stops_where_the_user_does(monkeypatch):
     def interrupted(self, *_):
         raise KeyboardInterrupt
@@ -425,6 +470,7 @@ def test_it_stops_where_the_user_does(monkeypatch):
     assert {attempt.method for attempt in stopped.tried} == {"none"}
 
 
+@pytest.mark.usefixtures("any_rivals")
 def test_an_interrupt_before_anything_is_known(monkeypatch):
     def interrupted(self, *_):
         raise KeyboardInterrupt
@@ -434,6 +480,7 @@ def test_an_interrupt_before_anything_is_known(monkeypatch):
     assert stopped.structure == "zero" and np.all(np.isfinite(stopped.costs["zero"]))
 
 
+@pytest.mark.usefixtures("any_rivals")
 @pytest.mark.parametrize("part", ["choose", "costs_of_rival"])
 def test_an_interrupt_at_the_end(monkeypatch, part):
     def interrupted(self, *_):

@@ -17,7 +17,7 @@ from ..simulation import rollout
 from ._costs import nan_if_failed
 
 
-# Costs grow like their logarithm above this multiple of the usual cost.
+# Costs far above this multiple of the usual cost grow like their logarithm.
 _FAR = 20.0
 _QUIETLY: Any = dict(keep=(), throw=False)
 

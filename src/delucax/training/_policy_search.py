@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -32,7 +33,7 @@ from ._structures import structures
 
 # After this number of trials the search checks whether the LQR is enough.
 _FIRST = 2
-# Time constants of the damped gradients, as shares of the episode.
+# Time constants of the damped gradients, as shares of the differentiated rollout.
 _TIME_CONSTANTS = (1 / 30, 1 / 10, 1 / 4)
 # The numbers of initial states: to choose a policy, to compare it, and to compare it on
 # a family of plants.
@@ -57,7 +58,7 @@ _ATTEMPT, _SHARE, _FEWER = 0.02, 0.1, 2
 # A policy is dropped if it costs more than the best by this share.
 _CLOSE = 0.5
 # Relative gains. Below the first, a method counts as one that does not gain. Below the
-# second, a gain does not justify a network or an expert.
+# second, a gain does not justify a network.
 _GAIN, _WORTH = 1e-3, 5e-3
 # Initial standard deviations of an evolution: of a network, of other policies, and of a
 # policy that is already trained.
@@ -74,14 +75,14 @@ def _is_better(other: Any, own: Any) -> bool:
 
 def _distinct(lines: list[Line]) -> list[Line]:
     """Each policy once: an attempt without a gain returns the policy it began with."""
-    return list({id(line.policy): line for line in lines}.values())
+    return list({(line.structure, id(line.policy)): line for line in lines}.values())
 
 
-def _program(line: Line, method: str) -> tuple[str, float]:
+def _program(line: Line, method: str) -> tuple[Any, float]:
     """What a training compiles: the gradients of all dampings share a program, and so
-    do evolutions of all standard deviations."""
+    do evolutions of all standard deviations, and policies of one form."""
     rate = 0.0 if method == _EVOLUTION else line.rates.get(method, _RATE)
-    return line.structure, rate
+    return jax.tree.structure(line.policy), rate
 
 
 class PolicySearch:
@@ -119,8 +120,8 @@ class PolicySearch:
         self.methods = damped | {"gradient": jnp.inf, _EVOLUTION: None}
         # The least median cost so far, and the usual cost that belongs to it.
         self.least, self.usual = np.inf, _ANY
-        # The structures and kinds of training that are compiled.
-        self.compiled: set[tuple[str, float]] = set()
+        # The programs of trainings that are compiled.
+        self.compiled: set[tuple[Any, float]] = set()
 
     def may_begin(self, line: Line, method: str) -> bool:
         """Whether there is time to train a line with a method."""
@@ -140,14 +141,18 @@ class PolicySearch:
     def run(self, width: int, depth: int) -> None:
         """Train until the time is up or no method gains."""
         self.law = self.regulator()
-        floor = self.best["zero"].policy, self.law
-        for name, law in zip(self.baselines, floor, strict=True):
-            if law is not None:
-                began = self.budget.spent
-                line = Line(name, "none", law, self.costs(law))
-                self.enter(line)
-                took = self.budget.spent - began
-                self.tried.append(Attempt(name, "none", self.mean(line), took))
+        family, key = self.ranges is not None, self.fresh_key()
+        made = structures(self.environment, self.law, family, width, depth, key)
+        floor = [self.best["zero"].policy]
+        if self.law is not None:
+            # The first policy starts as the LQR.
+            floor.append(next(iter(made.values())))
+        for name, law in zip(self.baselines, floor, strict=False):
+            began = self.budget.spent
+            line = Line(name, "none", law, self.costs(law))
+            self.enter(line)
+            took = self.budget.spent - began
+            self.tried.append(Attempt(name, "none", self.mean(line), took))
         self.warn_of_lost_starts()
         if not self.budget.may_train:
             warnings.warn(
@@ -156,8 +161,6 @@ class PolicySearch:
                 f"{self.budget.spent:.0f} s to compile. Only one policy is trained.",
                 stacklevel=3,
             )
-        family, key = self.ranges is not None, self.fresh_key()
-        made = structures(self.environment, self.law, family, width, depth, key)
         # Each policy is trained from the start by the gradient, with less and less
         # damping, and by evolution.
         gradients = [name for name in self.methods if name != _EVOLUTION]
@@ -255,7 +258,7 @@ class PolicySearch:
         rival = "plan" if self.is_known else "MPC"
         if not self.budget.may_compare(rival, self.budget.spent):
             return False
-        other = self.costs_of_rival(rival, self.law, keys)
+        other = self.costs_of_rival(rival, self.best["LQR"].policy, keys)
         # A rival that fails proves nothing.
         if other is None or not np.all(np.isfinite([own, *other])):
             return False
@@ -351,6 +354,7 @@ class PolicySearch:
             # If a round changes nothing, it diverged at its first step.
             stays = self.score(after) == self.score(best)
             best = min(after, best, key=self.score)
+            self.keep(best)
             if stays or not self.budget.may_train:
                 break
         took = self.budget.spent - began
@@ -374,15 +378,18 @@ class PolicySearch:
         keys = self.keys(CHOICE) if keys is None else keys
         return np.asarray(costs_of(self.environment, self.ranges, policy, keys), float)
 
+    def keep(self, line: Line) -> None:
+        """Keep the line if it is the best of its structure."""
+        other = self.best.get(line.structure, line)
+        self.best[line.structure] = min(other, line, key=self.score)
+
     def enter(self, line: Line) -> None:
-        """Keep the line if it is the best of its structure, and update the usual
-        cost."""
-        name = line.structure
-        if name not in self.baselines:
+        """Keep the line if it is among the best, and update the usual cost."""
+        self.keep(line)
+        if line.structure not in self.baselines:
             lines = _distinct([*self.finalists, line])
             self.finalists = sorted(lines, key=self.score)[:_LAST]
-        self.best[name] = min(self.best.get(name, line), line, key=self.score)
-        costs = self.best[name].costs
+        costs = self.best[line.structure].costs
         known = np.where(np.isfinite(costs), costs, np.inf)
         low, middle, high = np.quantile(known, [0.25, 0.5, 0.75], method="lower")
         # The least is taken with its sign, so a large reward, which is a negative cost,
@@ -407,14 +414,15 @@ class PolicySearch:
         Good policies often differ only in a rare episode in which the plant runs away,
         and the first 64 initial states may have none.
         """
-        floor = [self.best[name] for name in self.baselines if name in self.best]
-        lines = _distinct([*self.finalists, *floor])
+        lines = _distinct([*self.finalists, *self.best.values()])
         ends = self.budget.choice_ends
+        # The first of these are the keys of the choice so far.
+        keys = jr.split(jr.fold_in(self.key, CHOICE), _ROUNDS * CHOICE)
         for k in range(1, _ROUNDS):
             if self.budget.spent > ends:
                 break
-            keys = jr.split(jr.fold_in(jr.fold_in(self.key, CHOICE), k), CHOICE)
-            more = [self.costs(line.policy, keys) for line in lines]
+            some = keys[k * CHOICE : (k + 1) * CHOICE]
+            more = [self.costs(line.policy, some) for line in lines]
             self.show()
             lines = [
                 line._replace(costs=np.concatenate([line.costs, costs]))

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import optax
 
 from .._controller import AbstractController
-from ..controllers import Residual
 from ..environments import Environment
 from ._costs import expected_cost
 from ._episode_costs import TamedCost
@@ -17,6 +16,9 @@ from ._gradient_estimators import ClippedSamples
 
 # Steps of the gradient, and generations of evolution. A round may end after a block.
 _STEPS, _GENERATIONS, _BLOCK = 300, 150, 5
+# The law stays. Of the correction the bounds and the scales of the features are trained
+# too, because with fixed ones much fewer policies of quadrotors hold the plant.
+_OPTIONS: Any = dict(block=_BLOCK, trainable="correction", progress=False, throw=False)
 # Gradients in a batch, and the longest rollout that is differentiated.
 _BATCH, LONGEST = 32, 200
 # Episodes in the cost of each model of a generation.
@@ -38,7 +40,7 @@ def by_gradient(
     decay = jnp.exp(-environment.dt / time_constant)
     shape: Any = dict(batch=1, horizon=min(environment.horizon, LONGEST))
     loss = expected_cost(environment, gradient_decay=decay, ranges=ranges, **shape)
-    options |= _options(policy) | dict(gradient=ClippedSamples(_BATCH))
+    options |= _OPTIONS | dict(gradient=ClippedSamples(_BATCH))
     return fit(loss, policy, optimiser, _STEPS, **options).model
 
 
@@ -53,11 +55,5 @@ def by_evolution(
     """The policy after training by evolution on the tamed cost."""
     episode = expected_cost(environment, batch=1, ranges=ranges)
     loss = TamedCost(episode, jnp.asarray(usual), _EVALUATIONS)
-    options |= _options(policy) | dict(sigma=sigma)
+    options |= _OPTIONS | dict(sigma=sigma)
     return evolve(loss, policy, _GENERATIONS, **options).model
-
-
-def _options(policy: AbstractController) -> dict[str, Any]:
-    # A policy around an LQR keeps the LQR.
-    part = "correction" if isinstance(policy, Residual) else None
-    return dict(block=_BLOCK, trainable=part, progress=False, throw=False)

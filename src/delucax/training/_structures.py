@@ -19,6 +19,7 @@ from ..controllers import (
     MLP,
     Residual,
     Standardise,
+    Zero,
 )
 from ..environments import Environment
 from ..simulation import rollout
@@ -37,13 +38,16 @@ def structures(
     width: int,
     depth: int,
     key: PRNGKey,
-) -> dict[str, AbstractController]:
+) -> dict[str, Residual]:
     """Policies to train, by name: a network that corrects the LQR, if there is one, and
     a network alone.
 
     For a family of plants, the first network is recurrent, and without an LQR it is the
     whole policy. If the state is hidden, both networks are recurrent, and the first one
     corrects the LQG.
+
+    The first policy starts as the LQR. The others have its form, with a gain of zero,
+    so that all run in the same compiled programs. `simplified` undoes this.
     """
     visits_key, plain_key, residual_key = jr.split(key, 3)
     m, bounds = environment.control_size, environment.control_bounds
@@ -70,6 +74,10 @@ def structures(
     )
 
     size = environment.feature_size
+    free: Any = bounds and tuple(
+        jnp.full_like(end, limit)
+        for end, limit in zip(bounds, (-jnp.inf, jnp.inf), strict=True)
+    )
     network = lambda bounds, key: MLP(
         size, m, width, depth, features=features, bounds=bounds, key=key
     )
@@ -78,20 +86,39 @@ def structures(
     )
     hidden = is_hidden(environment)
     recurrent = is_family or hidden
-    made: dict[str, AbstractController] = {}
-    if law is not None:
-        # The last layer starts at zero, so the policy starts as the law.
-        correction = (memory if recurrent else network)((-half, half), residual_key)
-        last: Any = lambda c: c.readout if recurrent else c.network.layers[-1]
-        zero = jax.tree.map(jnp.zeros_like, last(correction))
-        correction = eqx.tree_at(last, correction, zero)
-        name = f"{type(law).__name__} + {'memory' if recurrent else 'network'}"
-        made[name] = Residual(law, correction, bounds)
+    made: dict[str, Any] = {}
     if hidden or is_family and law is None:
         made["memory"] = memory(ends, plain_key)
     if not hidden:
         made["network"] = network(ends, plain_key)
-    return made
+    if law is None:
+        base: Any = Zero(m)
+    else:
+        base = eqx.tree_at(_gains, law, replace_fn=jnp.zeros_like)
+    made = {name: Residual(base, policy, free) for name, policy in made.items()}
+    if law is None:
+        return made
+
+    # The last layer starts at zero, so the policy starts as the law.
+    correction = (memory if recurrent else network)((-half, half), residual_key)
+    last: Any = lambda c: c.readout if recurrent else c.network.layers[-1]
+    zero = jax.tree.map(jnp.zeros_like, last(correction))
+    correction = eqx.tree_at(last, correction, zero)
+    name = f"{type(law).__name__} + {'memory' if recurrent else 'network'}"
+    return {name: Residual(law, correction, bounds)} | made
+
+
+def simplified(structure: str, policy: AbstractController) -> AbstractController:
+    """A policy of this structure, without the part that is zero."""
+    if not isinstance(policy, Residual) or "+" in structure:
+        return policy
+    return policy.base if structure in ("LQR", "LQG") else policy.correction
+
+
+def _gains(law: Any) -> tuple[Any, Any]:
+    """The gain of an LQR or LQG, and the control at its operating point."""
+    regulator = law.regulator if isinstance(law, LQG) else law
+    return regulator.K, regulator.u_ref
 
 
 @eqx.filter_jit
@@ -106,14 +133,22 @@ def _visits(
         run: Any = rollout(environment, driver, key=key, keep=keep, throw=False)
         return run.observations, run.controls
 
+    def each(driver, given):
+        """The rows of a driver for each value given, from all keys."""
+        one = lambda value: jax.vmap(lambda key: rows(driver(value), key))(keys)
+        return jax.vmap(one)(given)
+
     flat = lambda rows: rows.reshape(-1, rows.shape[-1])
-    held = jnp.repeat(constants, len(keys), axis=0)
-    again = jnp.tile(keys, len(constants))
-    y, _ = jax.vmap(lambda u, key: rows(Constant(u), key))(held, again)
     if law is None:
-        return flat(y), None
-    own, u = jax.vmap(lambda key: rows(law, key))(keys)
-    return jnp.concatenate([flat(y), flat(own)]), flat(u)
+        return flat(each(Constant, constants)[0]), None
+    # All are the same law with other gains, so that there is one rollout to compile.
+    K, u_ref = _gains(law)
+    held = jnp.concatenate(
+        [jnp.zeros_like(K, shape=(len(constants), *K.shape)), K[None]]
+    )
+    gains = held, jnp.concatenate([constants, u_ref[None]])
+    y, u = each(lambda gains: eqx.tree_at(_gains, law, gains), gains)
+    return flat(y), flat(u[-1])
 
 
 @eqx.filter_jit

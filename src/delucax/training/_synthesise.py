@@ -26,6 +26,7 @@ from ._attempt import Attempt
 from ._costs import expected_cost
 from ._episode_costs import costs_of, first_steps
 from ._policy_search import CHOICE, PolicySearch
+from ._structures import simplified
 
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def synthesise(
     depth: int = 1,
     progress: bool = True,
 ) -> Synthesis:
-    """Train a policy for an environment within a time budget, without tuning.
+    r"""Train a policy for an environment within a time budget, without tuning.
 
     The search tries several structures and training methods, refines the best of them,
     and compares the result with known controllers:
@@ -153,20 +154,26 @@ def synthesise(
         it is damped with a time constant of a thirtieth of the rollout, then of a tenth
         and of a quarter, and then it is not damped. The second way is
         [`delucax.training.evolve`][], which needs no gradient. It comes first if the
-        plant has events. If neither the first two trials nor a plan is better than the
-        LQR, the search returns the LQR.
+        plant has events. Both train the weights, the bounds and the scales of the
+        features of the network; the LQR stays. If neither the first two trials nor a
+        plan is better than the LQR, the training ends.
     3. Refinement. The better half of the trained policies is trained further, until one
-        of them is left, and then the others if time is left. The method that lowered
-        the cost most comes first. If a method does not lower the cost any more, its
-        learning rate (or, of an evolution, the standard deviation) is reduced to a
-        tenth once, and then it is not used any more for this policy.
-    4. Choice. The candidates are the four best policies and the baselines. The
-        criterion is the mean cost over up to 512 initial states that were not used for
-        training. In this mean, a cost above 20 times the usual cost grows only
-        logarithmically. If the cost of a baseline is at most half a percent higher than
-        the best, the search returns the baseline.
-    5. Comparison. The baselines, MPC and the best plan run the episodes of the policy,
-        if time is left for them. MPC needs an observed state.
+        of them is left, and then the others if time is left. A policy that costs more
+        than one and a half times the best goes to the end of the queue. Each method is
+        tried once for a policy, and then the method that lowered the cost most comes
+        first. If a method lowers the cost by less than 0.1%, its learning rate (or, of
+        an evolution, the standard deviation) is reduced to a tenth once, and then it is
+        not used any more for this policy.
+    4. Choice. The candidates are the four best policies, the best of each structure and
+        the baselines. The criterion is the mean cost over 64 initial states that also
+        chose between the rounds of the training, and up to 448 new ones. Each cost $c$
+        counts as $20 s \log(1 + c / 20 s)$, where $s$ is about the lowest median cost
+        so far, so that a rare episode of a huge cost does not outweigh all others. If
+        the cost of a baseline is at most half a percent higher than the best, the
+        search returns the baseline.
+    5. Comparison. The policy and the baselines run new episodes. If time is left, so do
+        MPC, and a plan for each episode that starts from the controls of the policy.
+        MPC needs an observed state.
 
     An interrupt (`KeyboardInterrupt`) ends the training. Then the choice and the
     comparison follow; a further interrupt ends each of them. In any case the best
@@ -183,12 +190,13 @@ def synthesise(
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
         default, at least 10. Training may take 70% of it, and the rest is for the
-        choice and the comparison. If a comparison is likely to take longer than that,
-        there is none, and training may take 90%. A comparison may take a tenth more
+        choice and the comparison. If MPC and a plan are likely to take longer than
+        that, they are left out, and training may take 90%. They may take a tenth more
         than the budget, and a program that compiles when the time is over finishes
         first. If the budget ends before the first training, you get a warning, and a
         single policy is trained. The number of trials depends on the speed of the
-        machine, so the result depends on the machine too.
+        machine, so the same key can give another policy on another machine, or when
+        the programs are compiled already.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
         works on a family of plants: each episode draws a plant. The LQR is designed for
         the nominal plant; MPC and the plan know each plant. None by default: one plant.
@@ -258,7 +266,8 @@ def synthesise(
             stacklevel=2,
         )
     about = search.budget.spent, search.plants(), search.ended
-    return Synthesis(policy, structure, costs, search.tried, *about)
+    simple = simplified(structure, policy)
+    return Synthesis(simple, structure, costs, search.tried, *about)
 
 
 def _check_environment(
