@@ -1,12 +1,11 @@
 """What each part of `training.synthesise` brings: the part `ablation` of
 `benchmarks.policies`.
 
-The same search without one of its parts, on tasks of each kind. `gradient alone` is
-what one writes without it: a network, trained by the gradient of the rollout. `no LQR`
-is without the LQR altogether: in the policies, among what may be returned, and in the
-scale of the controls. `no clipping` takes the mean gradient of a batch. `no last
-choice` returns the best on the starts of the training. No search ends because the LQR
-is as good as a plan.
+The same search without one of its parts, on tasks of each kind. `gradient alone` is a
+network alone, trained by the undamped gradient of the rollout. `no LQR` is without the
+LQR altogether: in the policies, among what may be returned, and in the scale of the
+controls. `no clipping` takes the mean gradient of a batch. `no last choice` returns the
+best on the starts of the training. No search ends because the LQR is as good as a plan.
 
 How much of the budget compilation takes depends on the machine. So the seeds of a
 search share a process, whose first search only compiles, and of the budget of each
@@ -70,7 +69,7 @@ class MeanGradient(eqx.Module):
 def case(task: str, without: str, seeds: int, budget: float) -> dict[str, Any]:
     """The policies of one task, from searches without a part."""
     from delucax.studies._scoreboard import task_of
-    from delucax.training import _rounds
+    from delucax.training._synthesis import _rounds
 
     environment = task_of(task)
     unclipped = without == "no clipping"
@@ -83,13 +82,17 @@ def case(task: str, without: str, seeds: int, budget: float) -> dict[str, Any]:
 
 def reduced(environment: Any, without: str, seed: int, budget: float) -> Any:
     """The search without a part."""
-    from delucax.training._policy_search import PolicySearch
+    from delucax.training._synthesis._policy_search import PolicySearch
 
     alone = without == "gradient alone"
 
     class Reduced(PolicySearch):
         def regulator(self):
-            return None if alone or without == "no LQR" else super().regulator()
+            if alone or without == "no LQR":
+                # So that the networks start with the same weights.
+                self.fresh_key()
+                return None
+            return super().regulator()
 
         def is_settled(self):
             return False
@@ -107,7 +110,7 @@ def reduced(environment: Any, without: str, seed: int, budget: float) -> Any:
 
 def compile_all(environment: Any, without: str) -> None:
     """One block of each training, so that the programs are compiled."""
-    from delucax.training import _policy_search as module
+    from delucax.training._synthesis import _policy_search as module
 
     search = reduced(environment, without, 2**20, _ENOUGH)
     search.refine = lambda lines: None
@@ -127,7 +130,7 @@ def searched(
     structure, policy = search.chosen()
     # After the policy and the laws without a training come MPC and the plan.
     first = 1 + sum(name in search.best for name in search.baselines)
-    compared = islice(search.compared(policy), first)
+    compared = islice(search.compare(policy), first)
     costs = {n: cost.tolist() for n, cost in compared}
     tried = [attempt._asdict() for attempt in search.tried]
     about = {"seed": seed, "structure": structure, "seconds": search.budget.spent}

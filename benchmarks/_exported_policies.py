@@ -69,7 +69,7 @@ def task_of(name: str) -> dlx.Environment:
 
 def policies(env: Any, task: str) -> dict[str, Any]:
     """One of each structure, trained."""
-    from delucax.training._structures import simplified, structures
+    from delucax.training._synthesis._structures import simplified, structures
 
     key = jr.key(0)
     found = dlx.training.synthesise(env, key=key, budget=BUDGET, progress=False)

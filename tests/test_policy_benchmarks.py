@@ -173,7 +173,8 @@ def test_the_ablation_shows_the_range_of_several_seeds(module):
 def test_what_the_ablation_leaves_out(
     module, monkeypatch, without, is_clipped, is_chosen
 ):
-    from delucax.training import _budget, _policy_search, _rounds, ClippedSamples
+    from delucax.training import ClippedSamples
+    from delucax.training._synthesis import _budget, _policy_search, _rounds
 
     def train(environment, ranges, policy, *_, **__):
         used.append(_rounds.ClippedSamples)

@@ -79,14 +79,14 @@ def compiled_field(name):
 
 @once
 @every
-@settings(max_examples=25, deadline=None, database=None)
+@settings(max_examples=10, deadline=None, database=None)
 @given(seed=st.integers(0, 2**32 - 1), edges=st.sampled_from([0.0, 0.1, 0.5, 1.0]))
 def test_finite_on_many(name, seed, edges):
-    """Values, and gradients with respect to all there is, on four thousand states and
+    """Values, and gradients with respect to all there is, on eight thousand states and
     controls an example, in the precision that overflows first."""
     system = system_of(name)
-    x, u = drawn(name, 4_000, seed, edges)
-    w = disturbed(system, 4_000) if system.disturbance_names else None
+    x, u = drawn(name, 8_000, seed, edges)
+    w = disturbed(system, 8_000) if system.disturbance_names else None
     dx, apart, gradients = compiled_field(name)(system, x, u, w)
     assert dx.shape == apart.shape == x.shape and dx.dtype == x.dtype
     for leaf in jax.tree.leaves((dx, apart, gradients)):

@@ -238,9 +238,13 @@ def test_a_batch_is_a_loop():
             assert_close(a, b[i], **tolerance(dict(atol=2e-4), dict(atol=1e-11)))
 
 
+@eqx.filter_jit
+def _step_of(dynamics, x):
+    return dynamics.advance_with_events(0.0, x, NONE, None)
+
+
 def step_of(system, x, dt=0.1, **options):
-    dynamics = dlx.Discretized(system, dt=dt, **options)
-    return dynamics.advance_with_events(0.0, jnp.array(x), NONE, None)
+    return _step_of(dlx.Discretized(system, dt=dt, **options), jnp.array(x))
 
 
 def test_a_crossing_there_and_back_within_a_step_is_seen():

@@ -22,7 +22,7 @@ def test_no_control_makes_it_fail(name, key):
     """None at all, constants, noise, and switching between the bounds, fast or slow."""
     env, rng = dlx.make(name), np.random.default_rng(0)
     low, high = (float(bound) for bound in env.control_bounds)
-    shape = (6, env.horizon, 1)
+    shape = (3, env.horizon, 1)
     ends = rng.choice([low, high], (2, *shape))
     ends[1] = np.repeat(ends[1][:, ::10], 10, axis=1)
     held = [np.full(shape, value) for value in (0.0, low, high)]
@@ -45,8 +45,8 @@ def test_no_control_makes_it_fail(name, key):
     assert np.all(np.any(np.atleast_3d(gradients) != 0, axis=(1, 2)))
     # Without control a ball comes to rest; the wheel and the walker go on.
     over = np.asarray(length) < env.horizon
-    assert np.all(over[:6] == (name == "bouncing_ball"))
-    assert np.any(over[6:]) == (env.terminated is not None)
+    assert np.all(over[:3] == (name == "bouncing_ball"))
+    assert np.any(over[3:]) == (env.terminated is not None)
 
 
 @needs_x64

@@ -43,10 +43,12 @@ def in_jax(controller):
     return map(np.asarray, run())
 
 
-def test_every_controller(tmp_path):
-    # The same code writes both precisions, and a third of the cases shows their digits.
+# In parts, so that several processes share them.
+@pytest.mark.parametrize("part", range(4))
+def test_every_controller(tmp_path, part):
+    # The same code writes both precisions, and some of the cases show their digits.
     x64 = jax.config.jax_enable_x64  # pyright: ignore
-    for label in list(CASES)[:: 1 if x64 else 3]:
+    for label in list(CASES)[part :: 4 if x64 else 32]:
         case = CASES[label]
         controller, name = case.make(1.0), file_name(label)
         export.c(controller, tmp_path, name=name, example=ONES, key=KEY)

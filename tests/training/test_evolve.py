@@ -56,10 +56,11 @@ def test_what_is_not_trained_stays():
     base = dlx.controllers.Linear(jnp.ones((1, 3)))
     policy = dlx.controllers.Residual(base, linear())
     loss = lambda policy, key: bowl(policy.correction, key)
-    options = dict(key=KEY, population=8, progress=False, trainable="correction")
-    fitted = evolve(loss, policy, 3, **options)
-    assert_close(fitted.model.base.K, base.K)
-    assert not np.allclose(fitted.model.correction.K, 0)
+    for part in ("correction", ["correction.K"]):
+        options = dict(key=KEY, population=8, progress=False, trainable=part)
+        fitted = evolve(loss, policy, 3, **options)
+        assert_close(fitted.model.base.K, base.K)
+        assert not np.allclose(fitted.model.correction.K, 0)
 
 
 def test_all_fail():
@@ -78,7 +79,7 @@ def test_all_fail():
         (dict(population=7), "population must be even, got 7"),
         (dict(population=2), "population must be .* at least 4"),
         (dict(sigma=0.0), "sigma must be positive"),
-        (dict(trainable=len), "trainable must be a path"),
+        (dict(trainable=len), "trainable must be a path or several"),
     ],
 )
 def test_bad_arguments(options, match):

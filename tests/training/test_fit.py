@@ -323,12 +323,13 @@ def test_callbacks_are_told_the_mean_of_the_seeds_that_go_on():
 
 
 @once
-def test_a_callback_stops_the_training(tmp_path):
+@pytest.mark.parametrize("boolean", [bool, np.bool_, jnp.array])
+def test_a_callback_stops_the_training(tmp_path, boolean):
     heard = []
 
     def stop(step, metrics):
         heard.append(step)
-        return step >= 4
+        return boolean(step >= 4)
 
     options = dict(block=2, checkpoint=tmp_path / "run")
     short = train(callbacks=[stop, lambda *_: None], **options)

@@ -100,16 +100,26 @@ def test_a_round_that_diverged_is_not_forgotten(monkeypatch):
     assert fitted.result == dlx.RESULTS.diverged
 
 
+LINEAR = dlx.controllers.Linear(jnp.zeros((1, 2)))
+
+
 @pytest.mark.parametrize(
     ("policy", "options", "match"),
     [
         (dlx.controllers.GRU(2, 1, 4, key=KEY), {}, "policy must have no memory"),
         (None, {}, "policy must be an AbstractController"),
-        (dlx.controllers.Linear(jnp.zeros((1, 2))), dict(rounds=0), "rounds must be"),
-        (dlx.controllers.Linear(jnp.zeros((1, 2))), dict(horizon=0), "horizon must be"),
+        (LINEAR, dict(rounds=0), "rounds must be"),
+        (LINEAR, dict(horizon=0), "horizon must be"),
+        (
+            LINEAR,
+            dict(trainable="gain"),
+            "trainable",
+        ),
     ],
 )
-def test_bad_arguments(policy, options, match):
+def test_bad_arguments(monkeypatch, policy, options, match):
+    # Before the expert runs.
+    monkeypatch.setattr(sys.modules[imitate.__module__], "_watched", None)
     with pytest.raises(ValueError, match=f"imitate: .*{match}"):
         imitate(env(), expert(), policy, key=KEY, **options)
 

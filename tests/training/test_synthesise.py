@@ -14,16 +14,16 @@ from helpers import once
 import delucax as dlx
 from delucax.controllers import local_lqg
 from delucax.training import synthesise
-from delucax.training._attempt import Attempt, Line
-from delucax.training._budget import Budget
-from delucax.training._episode_costs import costs_of, tamed
-from delucax.training._policy_search import PolicySearch
-from delucax.training._structures import (
+from delucax.training._synthesis._attempt import Attempt, Candidate
+from delucax.training._synthesis._budget import Budget
+from delucax.training._synthesis._episode_costs import costs_of, tamed
+from delucax.training._synthesis._policy_search import PolicySearch
+from delucax.training._synthesis._structures import (
     _range as controls_of_a_law,
     simplified,
     structures,
 )
-from delucax.training._synthesise import _check_environment
+from delucax.training._synthesis._synthesise import _check_environment
 
 
 KEY = jax.random.key(0)
@@ -81,13 +81,13 @@ def test_a_family_tells_its_worst_plant():
     search = PolicySearch(env(), ranges, KEY, 0.0, progress=False)
     drawn = search.plants()[path]
     zero = dlx.controllers.Zero(1)
-    costs = dict(search.compared(zero))
+    costs = dict(search.compare(zero))
     assert drawn.shape == costs["policy"].shape and np.ptp(drawn) > 1
     made = dlx.training.Synthesis(zero, "zero", costs, [], 1.0, {path: drawn})
     worst = made.to_pandas().loc["policy"]
     assert worst[f"{path}, worst"] == drawn[costs["policy"].argmax()]
     # The plant is that of the episode.
-    key, plant_key = jax.random.split(search.comparison[3])
+    key, plant_key = jax.random.split(search.comparison_keys[3])
     plant = dlx.randomise(env(), plant_key, ranges)
     assert plant.dynamics.system.mass == pytest.approx(drawn[3])
     alone = dlx.rollout(plant, zero, key=key, keep=()).total_cost
@@ -144,7 +144,7 @@ def test_a_network_where_the_regulator_is_worse():
 
 
 def known(name, policy, *costs):
-    return Line(name, "none", policy, np.array(costs))
+    return Candidate(name, "none", policy, np.array(costs))
 
 
 class Position(dlx.systems.DoubleIntegrator):
@@ -180,7 +180,7 @@ def test_the_last_choice_is_made_on_more_starts(monkeypatch):
     monkeypatch.setattr(module, "costs_of", later)
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     search.best = {}
-    first = search.keys(module.CHOICE)
+    first = search.choice_keys[: module.CHOICE]
     for name, value in ("network", 3.0), ("LQR + network", 2.0), ("LQR", 4.0):
         policy = dlx.controllers.Constant([value])
         search.enter(known(name, policy, *np.full(len(first), 1.0 / value)))
@@ -269,9 +269,10 @@ def test_a_plant_that_cannot_rest_has_no_regulator():
             return jnp.array([x[1] ** 2 + 1.0, u[0]])
 
     dynamics = dlx.Discretized(Drifts(), dt=0.1)
-    task = dataclasses.replace(hidden(), dynamics=dynamics)
+    task = dataclasses.replace(hidden(), dynamics=dynamics, control_bounds=None)
     search = PolicySearch(task, None, KEY, 10.0, progress=False)
-    with pytest.warns(UserWarning, match="no LQG and no network around one"):
+    words = "no LQG and no network around one .* only values from -2 to 2"
+    with pytest.warns(UserWarning, match=words):
         assert search.regulator() is None
 
 
@@ -280,7 +281,7 @@ def test_a_policy_starts_with_the_costs_of_its_regulator(monkeypatch):
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     lqr = dlx.controllers.local_lqr(env())
     policy = structures(env(), lqr, False, 4, 1, KEY)["LQR + network"]
-    before = Line("LQR + network", "none", policy, search.costs(policy))
+    before = Candidate("LQR + network", "none", policy, search.costs(policy))
     np.testing.assert_allclose(before.costs, search.costs(lqr), rtol=1e-4)
     worse = dlx.controllers.Constant([100.0])
     monkeypatch.setattr(PolicySearch, "trained", lambda *_: worse)
@@ -412,7 +413,7 @@ def test_a_comparison_ends_with_the_time(monkeypatch):
     plan = lambda *given: ran.append(1) or jnp.zeros(len(given[-1]))
     monkeypatch.setattr(module, "costs_of_plan", plan)
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
-    keys = search.comparison[: search.count]
+    keys = search.comparison_keys[: search.comparison_size]
     assert len(search.costs_of_rival("plan", None, keys)) == len(keys) == 16
     search.budget.began -= 12
     assert search.costs_of_rival("plan", None, keys) is None
@@ -536,9 +537,13 @@ def test_it_cannot_be_traced():
 
 def test_a_cost_that_stays_infinite(monkeypatch):
     costs = {"policy": np.array([1.0, np.inf])}
-    monkeypatch.setattr(PolicySearch, "run", lambda *_: None)
-    monkeypatch.setattr(PolicySearch, "compared", lambda *_: costs.items())
-    with pytest.warns(UserWarning, match="'zero', which .* from 1 of 2"):
+    zero = known("zero", dlx.controllers.Zero(1), 1.0, 1.0, np.inf)
+    monkeypatch.setattr(PolicySearch, "run", lambda self, *_: self.enter(zero))
+    monkeypatch.setattr(
+        PolicySearch, "choose", lambda self: setattr(self, "best", {"zero": zero})
+    )
+    monkeypatch.setattr(PolicySearch, "compare", lambda *_: costs.items())
+    with pytest.warns(UserWarning, match="'zero', which .* from 2 of the 5"):
         synthesise(env(), key=KEY, progress=False)
 
 
@@ -608,7 +613,7 @@ def test_a_comparison_that_fails_does_not_lose_the_policy(monkeypatch):
     monkeypatch.setattr(module, "costs_of_plan", lambda *given: np.ones(4))
     search = PolicySearch(env(), None, KEY, 10.0, progress=False)
     with pytest.warns(UserWarning, match="no comparison with MPC: out of memory"):
-        costs = dict(search.compared(dlx.controllers.Zero(1)))
+        costs = dict(search.compare(dlx.controllers.Zero(1)))
     assert set(costs) == {"policy", "zero", "plan"}
 
 
@@ -622,7 +627,7 @@ def test_mpc_is_no_rival_without_the_state(monkeypatch):
     for task in env(), noisy:
         search = PolicySearch(task, None, KEY, 10.0, progress=False)
         monkeypatch.setattr(search, "costs", lambda *_: np.ones(64))
-        rivals[task is noisy] = set(dict(search.compared(dlx.controllers.Zero(1))))
+        rivals[task is noisy] = set(dict(search.compare(dlx.controllers.Zero(1))))
     assert rivals[False] - rivals[True] == {"MPC"}
 
 

@@ -48,10 +48,10 @@ def normal(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:
 
 def _pairs(key: PRNGKey, blocks: int) -> tuple[Array, Array]:
     """Random words in pairs, shapes `(blocks, _PAIRS)`: the two words that Threefry
-    makes from a counter. `jax.random.bits` would only keep their sum.
+    makes from a counter. `jax.random.bits` would combine both to a single word.
     """
-    # Each pair has its own counter, so it does not depend on the number of pairs. The
-    # words of `jax.random.bits` do.
+    # Each pair has its own counter, so it does not depend on the number of pairs. With
+    # the option `jax_threefry_partitionable` off, words of `jax.random.bits` do.
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     shape = (blocks, _PAIRS)
     if typed and str(jr.key_impl(key)) not in ("threefry2x32", "fry"):

@@ -1,6 +1,5 @@
 """Fits lungs to breaths, and trains controllers in lungs."""
 
-import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -284,13 +283,6 @@ class _FiniteGradients(eqx.Module):
         return (cost, {"diverged": diverged}), jax.tree.map(kept, slope)
 
 
-@functools.lru_cache
-def _falling_adam(learning_rate: float, steps: int) -> optax.GradientTransformation:
-    """Adam with a falling learning rate. Cached, so that the same training does not
-    compile again."""
-    return optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
-
-
 def train_controllers(
     envs: Environment,
     controllers: Any,
@@ -377,7 +369,7 @@ def train_controllers(
         check_bool(shared, "shared", where),
         check_bool(throw, "throw", where),
     )
-    adam = _falling_adam(float(learning_rate), steps)
+    adam = optax.adam(optax.cosine_decay_schedule(float(learning_rate), steps))
     gradient: Any = analytic if throw else _FiniteGradients(1 if shared else 2)
     options: Any = dict(trainable=trainable, progress=progress, checkpoint=checkpoint)
     options |= dict(checkpoint_every=None if checkpoint is None else 100, throw=throw)

@@ -267,7 +267,7 @@ def _suited(task: str, method: str) -> Any:
 
 @eqx.filter_jit
 def _cost(env: Environment, agent: Any, key: Any) -> Any:
-    return rollout(env, agent, key=key, keep=(), throw=False).total_cost
+    return expected_cost(env, batch=1)(agent, key)
 
 
 @eqx.filter_jit

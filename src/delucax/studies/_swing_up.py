@@ -1,7 +1,5 @@
 """The recipe to swing up Gym's pendulum by differentiating the rollout."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +58,8 @@ def train_swing_up(
     policy = mlp_policy(environment, width=32, depth=1, key=init_key)
     starts = spread_starts(environment)
     loss = expected_cost(starts, batch=BATCH, horizon=HORIZON, gradient_decay=0.92)
-    return fit(loss, policy, _optimiser(steps), steps, key=fit_key, progress=progress)
+    adam = optax.adam(optax.cosine_decay_schedule(0.01, steps))
+    return fit(loss, policy, adam, steps, key=fit_key, progress=progress)
 
 
 def spread_starts(environment: Environment) -> Environment:
@@ -69,12 +68,6 @@ def spread_starts(environment: Environment) -> Environment:
     corner = jnp.asarray(np.array([np.pi, 8.0]))
     starts = {"initial_state.low": -corner, "initial_state.high": corner}
     return replace(environment, starts)
-
-
-@functools.lru_cache
-def _optimiser(steps: int) -> optax.GradientTransformation:
-    """Adam with cosine decay. Cached, because `fit` compiles again for a new one."""
-    return optax.adam(optax.cosine_decay_schedule(0.01, steps))
 
 
 def holds_upright(

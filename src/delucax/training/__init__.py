@@ -2,7 +2,6 @@
 
 from . import sysid as sysid
 from ._actor_critic import actor_critic as actor_critic, ActorCritic as ActorCritic
-from ._attempt import Attempt as Attempt
 from ._costs import (
     expected_cost as expected_cost,
     scored_cost as scored_cost,
@@ -21,4 +20,8 @@ from ._ppo import PPO as PPO
 from ._record import History as History
 from ._shac import SHAC as SHAC
 from ._steps import AbstractSurrogate as AbstractSurrogate
-from ._synthesise import Synthesis as Synthesis, synthesise as synthesise
+from ._synthesis import (
+    Attempt as Attempt,
+    Synthesis as Synthesis,
+    synthesise as synthesise,
+)

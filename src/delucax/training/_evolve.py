@@ -115,8 +115,8 @@ def evolve(
     - `key`: a random key.
     - `population`: models in a generation, an even number of at least 4; 64 by default.
     - `sigma`: the initial $\sigma$, one positive number for all weights; 1 by default.
-    - `trainable`: the path of the part to train, such as `"correction"`; the fields
-        marked [`delucax.weight`][] by default.
+    - `trainable`: the path of the part to train, such as `"correction"`, or several
+        paths; the fields marked [`delucax.weight`][] by default.
     - `block`, `progress`, `callbacks`, `throw`: as in [`delucax.training.fit`][], with
         blocks of 50 generations by default.
 
@@ -146,8 +146,13 @@ def evolve(
     if population % 2:
         raise ValueError(f"{_WHERE}: population must be even, got {population}.")
     check_positive(sigma, "sigma", _WHERE)
-    if trainable is not None and not isinstance(trainable, str):
-        raise ValueError(f"{_WHERE}: trainable must be a path, got {trainable!r}.")
+    paths = (trainable,) if isinstance(trainable, str) else trainable
+    if paths is not None and not (
+        isinstance(paths, tuple | list) and all(isinstance(p, str) for p in paths)
+    ):
+        raise ValueError(
+            f"{_WHERE}: trainable must be a path or several paths, got {trainable!r}."
+        )
     _, values = partition_trainable(model, trainable, _WHERE)
     size = sum(value.size for value in values.values())
     dtype = jnp.result_type(*values.values())
@@ -155,8 +160,8 @@ def evolve(
     options: Any = dict(key=key, block=block, progress=progress, throw=throw)
     estimator = _NaturalGradient(population)
     options |= dict(callbacks=callbacks, gradient=estimator)
-    if trainable is not None:
-        options["trainable"] = (f"mean.{trainable}", _SPREAD)
+    if paths is not None:
+        options["trainable"] = (*(f"mean.{path}" for path in paths), _SPREAD)
     # The estimator returns whole steps, so the learning rate is 1.
     fitted = fit(_OfMean(loss), search, optax.sgd(1.0), steps, **options)
     return Fitted(fitted.model.mean, fitted.history, fitted.result)

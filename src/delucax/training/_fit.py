@@ -135,7 +135,8 @@ def fit(
         - a function of a leaf, such as `equinox.is_inexact_array`;
         - booleans in the structure of the model.
     - `gradient`: the gradient estimator, [`delucax.training.analytic`][] by default.
-        Other estimators are [`delucax.training.EvolutionStrategies`][],
+        Other estimators are [`delucax.training.ClippedSamples`][],
+        [`delucax.training.EvolutionStrategies`][],
         [`delucax.training.LikelihoodRatio`][], or any function
         `gradient(loss, values, key)` to `(value, gradient)`.
     - `block`: steps in one call to the device, at most 1000; 100 by default. The
@@ -279,7 +280,7 @@ def fit(
                 saved.write(state[:3], blocks[0], seconds)
                 written = done
             stops = [callback(done, last) for callback in callbacks]
-            if any(isinstance(stop, bool | np.bool_) and stop for stop in stops):
+            if any(map(_is_true, stops)):
                 if saved is not None and written < done and not np.any(faults):
                     saved.write(state[:3], _joined(blocks), seconds)
                 break
@@ -294,6 +295,13 @@ def fit(
     else:
         outcome = _outcomes(state.fault)
     return Fitted(run.finished(state), history, outcome)
+
+
+def _is_true(answer: Any) -> bool:
+    """Whether a callback returned true, as a boolean of Python, NumPy or JAX."""
+    if isinstance(answer, bool):
+        return answer
+    return getattr(answer, "dtype", None) == np.dtype(bool) and bool(answer)
 
 
 def _mean(values: Any, faults: Any) -> float:

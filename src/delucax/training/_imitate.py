@@ -18,6 +18,7 @@ from ..environments import Environment
 from ..simulation import rollout
 from ._fit import fit, Fitted
 from ._record import COLUMNS, History
+from ._trainable import partition_trainable
 
 
 _WHERE = "imitate"
@@ -112,9 +113,11 @@ def imitate(
     check_controller(expert, "expert", _WHERE)
     check_controller(policy, "policy", _WHERE)
     key = check_key(key, _WHERE)
-    counts = dict(rounds=rounds, episodes=episodes, steps=steps, batch_size=batch_size)
-    for name, count in counts.items():
+    given = dict(rounds=rounds, episodes=episodes, steps=steps, batch_size=batch_size)
+    for name, count in given.items():
         check_count(count, name, _WHERE)
+    # Before the expert runs, because that may take long.
+    partition_trainable(policy, trainable, _WHERE)
     horizon = environment.horizon if horizon is None else horizon
     horizon = check_count(horizon, "horizon", _WHERE)
     if any(map(eqx.is_array, jax.tree.leaves(policy.init(key=key)))):

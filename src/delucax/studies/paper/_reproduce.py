@@ -72,8 +72,8 @@ def reproduce(
             claims = studies.reproduce("wall-clock", folder, small=True)
         ```
     """
-    pd = extra("pandas", "reproduce")
-    extra("matplotlib", "reproduce").use("agg")
+    pd = extra("pandas", "tables")
+    extra("matplotlib", "plot").use("agg")
     chosen = [names] if isinstance(names, str) else list(names)
     for name in chosen:
         check_choice(name, ("all", *STUDIES), "names", "reproduce")

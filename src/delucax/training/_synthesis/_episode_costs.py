@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._controller import AbstractController
-from .._typing import PRNGKey
-from ..controllers import local_mpc, OpenLoop
-from ..environments import Environment, randomise
-from ..planning import ILQR
-from ..simulation import rollout
-from ._costs import nan_if_failed
+from ..._controller import AbstractController
+from ..._typing import PRNGKey
+from ...controllers import local_mpc, OpenLoop
+from ...environments import Environment, randomise
+from ...planning import ILQR
+from ...simulation import rollout
+from .._costs import nan_if_failed
 
 
 # Costs far above this multiple of the usual cost grow like their logarithm.

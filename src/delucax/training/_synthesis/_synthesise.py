@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._check import (
+from ..._check import (
     check_bool,
     check_count,
     check_instance,
@@ -17,13 +17,13 @@ from .._check import (
     check_number,
     is_concrete,
 )
-from .._controller import AbstractController
-from .._extras import extra
-from .._typing import PRNGKey
-from ..controllers import Constant, Zero
-from ..environments import Environment
+from ..._controller import AbstractController
+from ..._extras import extra
+from ..._typing import PRNGKey
+from ...controllers import Constant, Zero
+from ...environments import Environment
+from .._costs import expected_cost
 from ._attempt import Attempt
-from ._costs import expected_cost
 from ._episode_costs import costs_of, first_steps
 from ._policy_search import CHOICE, PolicySearch
 from ._structures import simplified
@@ -154,9 +154,9 @@ def synthesise(
         it is damped with a time constant of a thirtieth of the rollout, then of a tenth
         and of a quarter, and then it is not damped. The second way is
         [`delucax.training.evolve`][], which needs no gradient. It comes first if the
-        plant has events. Both train the weights, the bounds and the scales of the
-        features of the network; the LQR stays. If neither the first two trials nor a
-        plan is better than the LQR, the training ends.
+        plant has events. Evolution trains the weights of the network, and the gradient
+        also its bounds and the scales of its features; the LQR stays. If neither the
+        first two trials nor a plan is better than the LQR, the training ends.
     3. Refinement. The better half of the trained policies is trained further, until one
         of them is left, and then the others if time is left. A policy that costs more
         than one and a half times the best goes to the end of the queue. Each method is
@@ -210,7 +210,8 @@ def synthesise(
     **Raises:** `ValueError`, before any training, if an argument has the wrong type,
     if the dynamics or the cost are not differentiable, if an initial state or its cost
     is not finite, or if none of about 16 controls keeps the first step finite. Warns if
-    the cost of the policy is not finite in some episodes of the comparison.
+    the cost of the policy is not finite in some episodes of the choice or the
+    comparison.
 
     !!! example
 
@@ -246,7 +247,9 @@ def synthesise(
     check_bool(progress, "progress", _WHERE)
     search = PolicySearch(environment, ranges, key, float(budget), progress)
     with search.bar:
-        _check_environment(environment, ranges, search.keys(CHOICE))
+        costs = _check_environment(environment, ranges, search.choice_keys[:CHOICE])
+        # If an interrupt comes before the first trial, this is the result.
+        search.enter(search.best["zero"]._replace(costs=costs))
         # An interrupt ends each of the three parts, and the next one goes on with what
         # is known.
         with contextlib.suppress(KeyboardInterrupt):
@@ -254,26 +257,28 @@ def synthesise(
         with contextlib.suppress(KeyboardInterrupt):
             search.choose()
         structure, policy = search.chosen()
-        costs: dict[str, np.ndarray] = {}
+        compared: dict[str, np.ndarray] = {}
         with contextlib.suppress(KeyboardInterrupt):
-            for name, values in search.compared(policy):
-                costs[name] = values
-    own = costs.get("policy", np.zeros(0))
+            for name, values in search.compare(policy):
+                compared[name] = values
+    own = np.concatenate([search.best[structure].costs, compared.get("policy", [])])
     if lost := np.sum(~np.isfinite(own)):
         warnings.warn(
             f"{_WHERE}: the cost of {structure!r}, which is returned, is not finite "
-            f"from {lost} of {len(own)} initial states.",
+            f"from {lost} of the {len(own)} initial states of the choice and the "
+            "comparison.",
             stacklevel=2,
         )
     about = search.budget.spent, search.plants(), search.ended
     simple = simplified(structure, policy)
-    return Synthesis(simple, structure, costs, search.tried, *about)
+    return Synthesis(simple, structure, compared, search.tried, *about)
 
 
 def _check_environment(
     env: Environment, ranges: dict[str, Any] | None, keys: Any
-) -> None:
-    """Raise if no method could train a policy for the environment."""
+) -> np.ndarray:
+    """The costs of zero control. Raise if no method could train a policy for the
+    environment."""
     loss = expected_cost(env, batch=1, horizon=1, ranges=ranges)
     held = Constant(jnp.zeros(env.control_size))
     try:
@@ -287,8 +292,11 @@ def _check_environment(
         ) from error
     # The search needs this program anyway. That of the first steps, which tells what is
     # wrong, is compiled only if something is.
-    if np.isfinite(costs_of(env, ranges, Zero(env.control_size), keys)).all():
-        return
+    uncontrolled = np.asarray(
+        costs_of(env, ranges, Zero(env.control_size), keys), float
+    )
+    if np.isfinite(uncontrolled).all():
+        return uncontrolled
     starts, costs, steps = map(np.asarray, first_steps(env, ranges, keys))
     checked = (
         ("initial state", np.isfinite(starts).all(axis=1)),
@@ -307,3 +315,4 @@ def _check_environment(
             f"{_WHERE}: none of {steps.shape[1]} controls keeps the first step finite "
             f"from x0 = {starts[kept.argmin()]}."
         )
+    return uncontrolled

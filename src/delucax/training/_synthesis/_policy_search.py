@@ -10,14 +10,14 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array
 
-from .._controller import AbstractController
-from .._module import get_path
-from .._progress import tqdm
-from .._typing import PRNGKey
-from ..controllers import local_lqg, local_lqr, LQG, LQR, Zero
-from ..disturbances import Zero as NoDisturbance
-from ..environments import Environment
-from ._attempt import Attempt, Line
+from ..._controller import AbstractController
+from ..._module import get_path
+from ..._progress import tqdm
+from ..._typing import PRNGKey
+from ...controllers import local_lqg, local_lqr, LQG, LQR, Zero
+from ...disturbances import Zero as NoDisturbance
+from ...environments import Environment
+from ._attempt import Attempt, Candidate
 from ._budget import Budget
 from ._episode_costs import (
     costs_of,
@@ -73,16 +73,21 @@ def _is_better(other: Any, own: Any) -> bool:
     return bool(own - other > _WORTH * abs(own))
 
 
-def _distinct(lines: list[Line]) -> list[Line]:
+def _distinct(candidates: list[Candidate]) -> list[Candidate]:
     """Each policy once: an attempt without a gain returns the policy it began with."""
-    return list({(line.structure, id(line.policy)): line for line in lines}.values())
+    return list(
+        {
+            (candidate.structure, id(candidate.policy)): candidate
+            for candidate in candidates
+        }.values()
+    )
 
 
-def _program(line: Line, method: str) -> tuple[Any, float]:
+def _program(candidate: Candidate, method: str) -> tuple[Any, float]:
     """What a training compiles: the gradients of all dampings share a program, and so
     do evolutions of all standard deviations, and policies of one form."""
-    rate = 0.0 if method == _EVOLUTION else line.rates.get(method, _RATE)
-    return jax.tree.structure(line.policy), rate
+    rate = 0.0 if method == _EVOLUTION else candidate.rates.get(method, _RATE)
+    return jax.tree.structure(candidate.policy), rate
 
 
 class PolicySearch:
@@ -101,11 +106,10 @@ class PolicySearch:
         layout = "{desc}: {bar}| {n:.0f}/{total:.0f} s{postfix}"
         options: Any = dict(desc="synthesise", bar_format=layout, disable=not progress)
         self.bar = tqdm(total=round(budget), **options)
-        # If an interrupt comes before the first trial, this is the result.
         zero = Zero(environment.control_size)
         unknown = np.full(CHOICE, np.inf)
-        self.best = {"zero": Line("zero", "none", zero, unknown)}
-        self.finalists: list[Line] = []
+        self.best = {"zero": Candidate("zero", "none", zero, unknown)}
+        self.finalists: list[Candidate] = []
         self.tried: list[Attempt] = []
         self.ended = "interrupted"
         self.law: LQR | LQG | None = None
@@ -123,15 +127,17 @@ class PolicySearch:
         # The programs of trainings that are compiled.
         self.compiled: set[tuple[Any, float]] = set()
 
-    def may_begin(self, line: Line, method: str) -> bool:
-        """Whether there is time to train a line with a method."""
-        if _program(line, method) in self.compiled:
+    def may_begin(self, candidate: Candidate, method: str) -> bool:
+        """Whether there is time to train a candidate with a method."""
+        if _program(candidate, method) in self.compiled:
             return self.budget.may_train
         return self.budget.may_compile
 
-    def keys(self, count: int) -> Array:
-        """Keys for `count` episodes. Another count gives other keys."""
-        return jr.split(jr.fold_in(self.key, count), count)
+    @property
+    def choice_keys(self) -> Array:
+        """Keys of the episodes for choosing a policy. The first `CHOICE` of them choose
+        between the rounds of the training, too."""
+        return jr.split(jr.fold_in(self.key, CHOICE), _ROUNDS * CHOICE)
 
     def fresh_key(self) -> PRNGKey:
         """A key that was not used before."""
@@ -149,10 +155,10 @@ class PolicySearch:
             floor.append(next(iter(made.values())))
         for name, law in zip(self.baselines, floor, strict=False):
             began = self.budget.spent
-            line = Line(name, "none", law, self.costs(law))
-            self.enter(line)
+            candidate = Candidate(name, "none", law, self.costs(law))
+            self.enter(candidate)
             took = self.budget.spent - began
-            self.tried.append(Attempt(name, "none", self.mean(line), took))
+            self.tried.append(Attempt(name, "none", self.mean(candidate), took))
         self.warn_of_lost_starts()
         if not self.budget.may_train:
             warnings.warn(
@@ -173,47 +179,49 @@ class PolicySearch:
             # The gradient does not show what another order of events would cost, and
             # its program compiles for twice as long.
             trials = [(last, evolution), (first, gradients), *trials[2:]]
-        lines, untrained = [], len(self.tried)
+        candidates, untrained = [], len(self.tried)
         for name, methods in trials:
-            line = Line(name, "none", made[name], self.costs(made[name]))
+            candidate = Candidate(name, "none", made[name], self.costs(made[name]))
             for method in methods:
                 # However short the budget is, one policy is trained.
-                if self.may_begin(line, method) or len(self.tried) == untrained:
-                    own = self.mean(line)
-                    line = self.attempt(line, method)
+                if self.may_begin(candidate, method) or len(self.tried) == untrained:
+                    own = self.mean(candidate)
+                    candidate = self.attempt(candidate, method)
                     # If the gradient is zero, it is zero with less damping too.
                     if np.isfinite(own) and self.tried[-1].cost == own:
                         break
-            lines.append(line)
-            if len(lines) == _FIRST and self.is_settled():
+            candidates.append(candidate)
+            if len(candidates) == _FIRST and self.is_settled():
                 rival = "a plan" if self.is_known else "MPC"
                 self.ended = f"the LQR was as good as {rival}"
                 return
-        self.refine(lines)
+        self.refine(candidates)
         self.ended = "no training lowered the cost any more"
         if not self.budget.may_compile:
             self.ended = "the time was over"
 
-    def refine(self, lines: list[Line]) -> None:
-        """Train the best of the lines, and the others if time is left."""
+    def refine(self, candidates: list[Candidate]) -> None:
+        """Train the best of the candidates, and the others if time is left."""
         share, dropped = _SHARE * self.budget.total, []
-        while len(lines) > 1:
-            lines = sorted(lines, key=self.score)
-            least = self.score(lines[0])
+        while len(candidates) > 1:
+            candidates = sorted(candidates, key=self.score)
+            least = self.score(candidates[0])
             most = least + _CLOSE * abs(least)
-            half = lines[: len(lines) // _FEWER]
-            kept = [line for line in half if self.score(line) <= most]
-            dropped += lines[len(kept) :]
-            lines = kept
-            if len(lines) > 1:
-                lines = [self.improve(line, share) for line in lines]
+            half = candidates[: len(candidates) // _FEWER]
+            kept = [candidate for candidate in half if self.score(candidate) <= most]
+            dropped += candidates[len(kept) :]
+            candidates = kept
+            if len(candidates) > 1:
+                candidates = [
+                    self.improve(candidate, share) for candidate in candidates
+                ]
             share *= _FEWER
-        for line in [*lines, *sorted(dropped, key=self.score)]:
-            self.improve(line)
+        for candidate in [*candidates, *sorted(dropped, key=self.score)]:
+            self.improve(candidate)
 
     def warn_of_lost_starts(self) -> None:
         """Warn before the training if plants run away under all laws so far."""
-        known = [line.costs for line in self.best.values()]
+        known = [candidate.costs for candidate in self.best.values()]
         lost = np.all(~np.isfinite(known), axis=0)
         if np.any(lost):
             laws = " and the ".join(["zero control", self.baselines[1]][: len(known)])
@@ -234,13 +242,18 @@ class PolicySearch:
                 return local_lqg(self.environment, key=key)
             return local_lqr(self.environment)
         except (ValueError, RuntimeError) as error:
-            name = self.baselines[1]
-            warnings.warn(
+            name, bounds = self.baselines[1], self.environment.control_bounds
+            text = (
                 f"synthesise: no {name} and no network around one is tried, because "
                 f"there is no {name}: {error} If the plant can rest somewhere, define "
-                "its `equilibrium`, or give the cost a target.",
-                stacklevel=4,
+                "its `equilibrium`, or give the cost a target."
             )
+            if bounds is None or not all(np.all(np.isfinite(end)) for end in bounds):
+                text += (
+                    f" Without an {name}, networks give a control without bounds only "
+                    "values from -2 to 2 at first: set `control_bounds`."
+                )
+            warnings.warn(text, stacklevel=4)
             return None
 
     @property
@@ -253,8 +266,8 @@ class PolicySearch:
         With disturbances MPC replaces the plan, because a plan would know them."""
         if self.chosen()[0] != "LQR":
             return False
-        keys = self.keys(CHOICE)[: self.count]
-        own = np.mean(self.best["LQR"].costs[: self.count])
+        keys = self.choice_keys[: self.comparison_size]
+        own = np.mean(self.best["LQR"].costs[: self.comparison_size])
         rival = "plan" if self.is_known else "MPC"
         if not self.budget.may_compare(rival, self.budget.spent):
             return False
@@ -290,8 +303,8 @@ class PolicySearch:
         self.budget.add_step(self.budget.spent - began)
         return np.concatenate(parts)
 
-    def trained(self, line: Line, method: str) -> AbstractController:
-        """The policy of a line after one round of training with a method."""
+    def trained(self, candidate: Candidate, method: str) -> AbstractController:
+        """The policy of a candidate after one round of training with a method."""
         ends = None
 
         def is_over(*_: Any) -> bool:
@@ -302,17 +315,17 @@ class PolicySearch:
             ends = now + _ROUND * self.budget.total if ends is None else ends
             return not self.budget.may_train or now > ends
 
-        given = self.environment, self.ranges, line.policy
+        given = self.environment, self.ranges, candidate.policy
         options: Any = dict(key=self.fresh_key(), callbacks=(is_over,))
-        rate = line.rates.get(method, _RATE)
+        rate = candidate.rates.get(method, _RATE)
         if method != _EVOLUTION:
             return by_gradient(*given, self.methods[method], rate, **options)
-        width = _WIDE if line.structure == "network" else _NARROW
-        sigma = (width if line.method == "none" else _NEAR) * rate / _RATE
+        width = _WIDE if candidate.structure == "network" else _NARROW
+        sigma = (width if candidate.method == "none" else _NEAR) * rate / _RATE
         return by_evolution(*given, sigma, self.usual, **options)
 
-    def improve(self, line: Line, seconds: float = np.inf) -> Line:
-        """The line after some seconds of training, or when no method gains.
+    def improve(self, candidate: Candidate, seconds: float = np.inf) -> Candidate:
+        """The candidate after some seconds of training, or when no method gains.
 
         Each attempt uses the method with the largest gain in its last attempt at this
         rate. A method that was not tried at its rate comes before.
@@ -320,27 +333,29 @@ class PolicySearch:
         ends = self.budget.spent + seconds
         # The method of the last gain comes first, then evolution, then the gradients,
         # those with less damping before the others.
-        names = sorted(reversed(self.methods), key=lambda name: name != line.method)
+        names = sorted(
+            reversed(self.methods), key=lambda name: name != candidate.method
+        )
         gains = dict.fromkeys(names, np.inf)
         while self.budget.may_train and self.budget.spent < ends:
-            left = [n for n in names if line.rates.get(n, _RATE) > _LEAST_RATE]
-            left = [name for name in left if self.may_begin(line, name)]
+            left = [n for n in names if candidate.rates.get(n, _RATE) > _LEAST_RATE]
+            left = [name for name in left if self.may_begin(candidate, name)]
             if not left:
                 break
             method = max(left, key=lambda name: gains[name])
-            before, line = line, self.attempt(line, method)
-            gain = self.gain(before, line)
+            before, candidate = candidate, self.attempt(candidate, method)
+            gain = self.gain(before, candidate)
             gains[method] = gain if gain > _GAIN else np.inf
-        return line
+        return candidate
 
-    def gain(self, before: Line, after: Line) -> float:
+    def gain(self, before: Candidate, after: Candidate) -> float:
         """How much the score fell, relative to its size."""
         own = self.score(after)
         return (self.score(before) - own) / max(abs(own), 1e-12)
 
-    def attempt(self, line: Line, method: str) -> Line:
-        """The line after some rounds of a method, or as it was if none is better."""
-        began, best, ends, least = self.budget.spent, line, 0.0, np.inf
+    def attempt(self, candidate: Candidate, method: str) -> Candidate:
+        """The candidate after some rounds of a method, or as it was if none helps."""
+        began, best, ends, least = self.budget.spent, candidate, 0.0, np.inf
         while not ends or self.budget.spent < ends:
             policy = self.trained(best, method)
             costs = self.costs(policy)
@@ -348,7 +363,7 @@ class PolicySearch:
             if not ends:
                 # The first round compiles.
                 self.budget.add_step(self.budget.spent - began)
-                self.compiled.add(_program(line, method))
+                self.compiled.add(_program(candidate, method))
                 ends = self.budget.spent + _ATTEMPT * self.budget.total
             least = min(least, self.mean(after))
             # If a round changes nothing, it diverged at its first step.
@@ -358,12 +373,12 @@ class PolicySearch:
             if stays or not self.budget.may_train:
                 break
         took = self.budget.spent - began
-        self.tried.append(Attempt(line.structure, method, least, took))
+        self.tried.append(Attempt(candidate.structure, method, least, took))
         self.enter(best)
         self.show()
-        if self.gain(line, best) <= _GAIN:
-            slower = line.rates.get(method, _RATE) * _SLOWER
-            best = best._replace(rates=line.rates | {method: slower})
+        if self.gain(candidate, best) <= _GAIN:
+            slower = candidate.rates.get(method, _RATE) * _SLOWER
+            best = best._replace(rates=candidate.rates | {method: slower})
         return best
 
     def show(self) -> None:
@@ -375,21 +390,21 @@ class PolicySearch:
 
     def costs(self, policy: AbstractController, keys: Any = None) -> np.ndarray:
         """The costs of a policy, by default in the episodes for choosing a policy."""
-        keys = self.keys(CHOICE) if keys is None else keys
+        keys = self.choice_keys[:CHOICE] if keys is None else keys
         return np.asarray(costs_of(self.environment, self.ranges, policy, keys), float)
 
-    def keep(self, line: Line) -> None:
-        """Keep the line if it is the best of its structure."""
-        other = self.best.get(line.structure, line)
-        self.best[line.structure] = min(other, line, key=self.score)
+    def keep(self, candidate: Candidate) -> None:
+        """Keep the candidate if it is the best of its structure."""
+        other = self.best.get(candidate.structure, candidate)
+        self.best[candidate.structure] = min(other, candidate, key=self.score)
 
-    def enter(self, line: Line) -> None:
-        """Keep the line if it is among the best, and update the usual cost."""
-        self.keep(line)
-        if line.structure not in self.baselines:
-            lines = _distinct([*self.finalists, line])
-            self.finalists = sorted(lines, key=self.score)[:_LAST]
-        costs = self.best[line.structure].costs
+    def enter(self, candidate: Candidate) -> None:
+        """Keep the candidate if it is among the best, and update the usual cost."""
+        self.keep(candidate)
+        if candidate.structure not in self.baselines:
+            candidates = _distinct([*self.finalists, candidate])
+            self.finalists = sorted(candidates, key=self.score)[:_LAST]
+        costs = self.best[candidate.structure].costs
         known = np.where(np.isfinite(costs), costs, np.inf)
         low, middle, high = np.quantile(known, [0.25, 0.5, 0.75], method="lower")
         # The least is taken with its sign, so a large reward, which is a negative cost,
@@ -399,13 +414,15 @@ class PolicySearch:
         if usual != 0 and middle < self.least:
             self.least, self.usual = float(middle), float(usual)
 
-    def score(self, line: Line) -> float:
+    def score(self, candidate: Candidate) -> float:
         """The mean tamed cost, the criterion for choosing policies."""
-        return float(jnp.mean(tamed(jnp.asarray(line.costs), self.usual)))
+        return float(jnp.mean(tamed(jnp.asarray(candidate.costs), self.usual)))
 
-    def mean(self, line: Line) -> float:
+    def mean(self, candidate: Candidate) -> float:
         """The mean cost, or infinity if the cost of an episode is not finite."""
-        return float(np.mean(np.where(np.isfinite(line.costs), line.costs, np.inf)))
+        return float(
+            np.mean(np.where(np.isfinite(candidate.costs), candidate.costs, np.inf))
+        )
 
     def choose(self) -> None:
         """Prepare the final choice among the best policies, zero control and the LQR:
@@ -414,24 +431,22 @@ class PolicySearch:
         Good policies often differ only in a rare episode in which the plant runs away,
         and the first 64 initial states may have none.
         """
-        lines = _distinct([*self.finalists, *self.best.values()])
+        candidates = _distinct([*self.finalists, *self.best.values()])
         ends = self.budget.choice_ends
-        # The first of these are the keys of the choice so far.
-        keys = jr.split(jr.fold_in(self.key, CHOICE), _ROUNDS * CHOICE)
         for k in range(1, _ROUNDS):
             if self.budget.spent > ends:
                 break
-            some = keys[k * CHOICE : (k + 1) * CHOICE]
-            more = [self.costs(line.policy, some) for line in lines]
+            some = self.choice_keys[k * CHOICE : (k + 1) * CHOICE]
+            more = [self.costs(candidate.policy, some) for candidate in candidates]
             self.show()
-            lines = [
-                line._replace(costs=np.concatenate([line.costs, costs]))
-                for line, costs in zip(lines, more, strict=True)
+            candidates = [
+                candidate._replace(costs=np.concatenate([candidate.costs, costs]))
+                for candidate, costs in zip(candidates, more, strict=True)
             ]
         # Only these were compared on all initial states.
-        best: dict[str, Line] = {}
-        for line in sorted(lines, key=self.score):
-            best.setdefault(line.structure, line)
+        best: dict[str, Candidate] = {}
+        for candidate in sorted(candidates, key=self.score):
+            best.setdefault(candidate.structure, candidate)
         self.best = best
 
     def chosen(self) -> tuple[str, AbstractController]:
@@ -446,34 +461,34 @@ class PolicySearch:
         return best.structure, best.policy
 
     @property
-    def count(self) -> int:
+    def comparison_size(self) -> int:
         """The number of episodes in the comparison."""
         return _COMPARISON if self.ranges is None else _PLANTS
 
     @property
-    def comparison(self) -> Array:
+    def comparison_keys(self) -> Array:
         """The keys of the comparison: as many as for a choice, because policies run
-        them in the same compiled program. Only the first `count` are used."""
-        return jr.split(jr.fold_in(self.key, self.count), CHOICE)
+        them in the same compiled program. Only the first `comparison_size` are used."""
+        return jr.split(jr.fold_in(self.key, self.comparison_size), CHOICE)
 
     def plants(self) -> dict[str, np.ndarray]:
         """The parameters drawn for the plants of the comparison, by path."""
-        ranges, keys = self.ranges or {}, self.comparison[: self.count]
+        ranges, keys = self.ranges or {}, self.comparison_keys[: self.comparison_size]
         of = lambda plant, key: {path: get_path(plant, path) for path in ranges}
         drawn = on_plants(self.environment, ranges, keys, of)
         return {path: np.asarray(values) for path, values in drawn.items()}
 
-    def compared(self, policy: AbstractController) -> Iterator[tuple[str, np.ndarray]]:
+    def compare(self, policy: AbstractController) -> Iterator[tuple[str, np.ndarray]]:
         """The costs of the policy and of other controllers, one after the other, in
         episodes that were used for nothing else."""
         floor = {n: self.best[n].policy for n in self.baselines if n in self.best}
         laws = {"policy": policy, **floor}
         for name, law in laws.items():
-            yield name, self.costs(law, self.comparison)[: self.count]
+            yield name, self.costs(law, self.comparison_keys)[: self.comparison_size]
         # MPC plans from the state.
         for name in ("plan",) if is_hidden(self.environment) else ("MPC", "plan"):
             if self.budget.may_compare(name, self.budget.spent):
-                keys = self.comparison[: self.count]
+                keys = self.comparison_keys[: self.comparison_size]
                 costs = self.costs_of_rival(name, policy, keys)
                 if costs is not None:
                     yield name, costs

@@ -1,10 +1,8 @@
 """The trainings that `synthesise` tries."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-
-from .._controller import AbstractController
 
 
 class Attempt(NamedTuple):
@@ -40,12 +38,12 @@ class Attempt(NamedTuple):
     seconds: float
 
 
-class Line(NamedTuple):
+class Candidate(NamedTuple):
     """A policy in training: the method of its last gain (`"none"` before training), its
     costs, and the learning rates of the methods that did not gain at the first rate."""
 
     structure: str
     method: str
-    policy: AbstractController
+    policy: Any
     costs: np.ndarray
     rates: dict[str, float] = {}

@@ -9,9 +9,9 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array
 
-from .._controller import AbstractController
-from .._typing import PRNGKey
-from ..controllers import (
+from ..._controller import AbstractController
+from ..._typing import PRNGKey
+from ...controllers import (
     Constant,
     GRU,
     LQG,
@@ -21,8 +21,8 @@ from ..controllers import (
     Standardise,
     Zero,
 )
-from ..environments import Environment
-from ..simulation import rollout
+from ...environments import Environment
+from ...simulation import rollout
 from ._episode_costs import is_hidden
 
 

@@ -46,7 +46,8 @@ class Budget:
     def training_ends(self) -> float:
         """The time at which the training ends."""
         ends, choice = _TRAINING * self.total, _CHOOSING * self.total
-        compares = any(self.may_compare(name, ends + choice) for name in _LONGER)
+        # MPC takes longer, so if there is no time for plans, there is none for MPC.
+        compares = self.may_compare("plan", ends + choice)
         return ends if compares else _ALONE * self.total
 
     @property
