@@ -367,6 +367,7 @@ def test_bounds_become_arrays():
             "paths must not overlap, got 'dynamics' and 'dynamics.A'",
         ),
         ({3: 1.0}, "a path must be a string.*got 3"),
+        ({"": 1.0}, "a path must not be empty"),
         ({None: 1.0}, "a path must be a string.*got None"),
     ],
 )

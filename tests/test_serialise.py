@@ -561,3 +561,15 @@ def test_double_precision_is_narrowed_with_a_warning(tmp_path):
 def test_wrong_kinds_of_argument(call, match):
     with user_error(match=match):
         call()
+
+
+@once
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
+def test_a_link_and_the_mode_of_a_file_stay(tmp_path):
+    path, link = tmp_path / "real.dlx", tmp_path / "link.dlx"
+    path.write_bytes(b"")
+    path.chmod(0o600)
+    link.symlink_to(path)
+    dlx.save(link, PENDULUM)
+    assert link.is_symlink() and path.stat().st_mode & 0o777 == 0o600
+    assert dlx.load(path).length == PENDULUM.length

@@ -129,3 +129,13 @@ def test_wrong_arguments(key):
 def test_depth_is_a_whole_number(key, depth):
     with user_error(match="depth must be a whole number"):
         MLP(1, 1, depth=depth, key=key)
+
+
+@once
+def test_the_mean_has_an_entry_for_each_feature():
+    env = dlx.make("pendulum")
+    scaled = dlx.controllers.Standardise(jnp.zeros(1), 1.0, env.encode)
+    with user_error(
+        match=r"mean must have an entry for each .*\(3,\), got shape \(1,\)"
+    ):
+        scaled(jnp.zeros(2))

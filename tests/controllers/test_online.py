@@ -129,11 +129,19 @@ class Filtering(dlx.AbstractController):
         return u + 0.1 * state, 0.5 * state + 0.1 * u
 
 
-@pytest.mark.parametrize("along", [False, True], ids=["once", "along the way"])
-def test_loss_is_what_the_step_would_have_cost(along):
+@pytest.mark.parametrize(
+    ("kind", "along"),
+    [("once", 0), ("integral", 0), ("along the way", 1), ("over a horizon", 1)],
+)
+def test_loss_is_what_the_step_would_have_cost(kind, along):
     """With a roll-out as long as the run, exactly so where the loop is linear."""
     gain = dlx.riccati.dare(A, B, Q, R).K
-    base = Filtering(gain) if along else c.Linear(gain)
+    base = {
+        "once": lambda: c.Linear(gain),
+        "integral": lambda: c.LQI(PLANT, np.eye(3), R, output=np.eye(2)[:1]),
+        "along the way": lambda: Filtering(gain),
+        "over a horizon": lambda: c.HInfinity(PLANT, Q, R, gamma=50.0, horizon=12),
+    }[kind]()
     learner = c.gpc(PLANT, COST, base=base, memory=3, horizon=12)
     assert (learner.loop.tangents is None) == along
     env = dlx.Environment(PLANT, COST)
@@ -557,3 +565,38 @@ def test_a_design_compiles_little(caplog):
         c.gpc(plant, dlx.costs.Quadratic(2 * Q, R))
     compiled = [r for r in caplog.records if r.getMessage().startswith("Compiling")]
     assert len(compiled) <= 6
+
+
+def test_a_pid_with_a_derivative_stabilises():
+    """Its first step has no derivative of the error."""
+    plant = dlx.LinearDynamics([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], dt=0.1)
+    law = c.PID(1.0, 0.0, 2.0, dt=0.1, output=0)
+    assert c.gpc(plant, COST, base=law, horizon=50).loop.horizon == 50
+
+
+def test_hindsight_from_a_controller_that_diverges():
+    plant = dlx.LinearDynamics(2 * np.eye(1), np.eye(1))
+    cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
+    env, lqr = dlx.Environment(plant, cost), c.LQR(plant, np.eye(1), np.eye(1))
+    w = np.ones((2000, 1))
+    played = dlx.rollout(env, lqr, key=KEY, w=w, horizon=2000)
+    found = c.best_in_hindsight(env, c.Linear(np.zeros((1, 1))), played)
+    assert found.result == dlx.RESULTS.diverged
+
+
+def test_an_expert_outside_of_the_domain_of_the_cost():
+    cost = dlx.costs.Function(lambda t, x, u: x @ x - jnp.log(1 - u[0] ** 2))
+    env = dlx.Environment(PLANT, cost, control_bounds=(-0.9, 0.9))
+    learner = c.Adaptive(c.gpc(PLANT, cost, base=c.Linear([[0.4, 1.2]])))
+    options = dict(key=KEY, x0=[5.0, 0.0], horizon=50, throw=False)
+    run = dlx.rollout(env, learner, **options)
+    assert run.result == dlx.RESULTS.successful
+
+
+def test_a_cost_that_is_not_finite_does_not_end_the_learning():
+    learner = c.BPC(PLANT, c.LQR(PLANT, Q, R))
+    state = learner.init(key=KEY)
+    for cost in (1.0, np.inf, 1.0, 3.0):
+        u, state = learner(0.0, jnp.ones(2), state)
+        state = learner.applied(u, jnp.asarray(cost), state)
+    assert state.refused.count == 1 and np.isfinite(state.level) and state.steps == 3

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from helpers import assert_close, needs_x64, once, tolerance, user_error
 
 import delucax as dlx
@@ -135,3 +136,24 @@ def test_wrong_use():
         controller(fallback=3.0)
     with user_error(match="max_qp_steps"):
         controller(max_qp_steps=0)
+
+
+@once
+def test_it_starts_from_the_multipliers_of_a_plan():
+    plant, limits = pendulum().dynamics, dict(bounds=(-8.0, 8.0), constraints=SLOW)
+    plan = SQP()(plant, COST, jnp.array([1.0, 0.0]), 20, throw=False, **limits)
+    assert jnp.max(jnp.stack(plan.multipliers.states)) > 0
+    mpc = controller(start=plan)
+    for name in "states", "controls", "costates":
+        given, kept = (
+            getattr(m, name) for m in (plan.multipliers, mpc.init().last.multipliers)
+        )
+        jax.tree.map(assert_close, kept, given)
+    # Those of another planner do not fit.
+    slow = dlx.planning.Constraints({"slow": lambda t, x, u: x[1] - 1.0})
+    other = dlx.planning.ILQR()(plant, COST, X0, 20, constraints=slow, throw=False)
+    first = controller(start=other).init().last.multipliers
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(first))
+    own = MPC(plant, COST, 20, constraints=slow, start=other, throw=False)
+    u, _ = own(0.0, X0, own.init())
+    assert np.all(np.isfinite(u))

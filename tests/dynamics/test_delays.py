@@ -266,6 +266,7 @@ def test_what_does_not_fit_is_named():
         (lambda: delay(plant, sensor=np.nan), "sensor must be finite"),
         (lambda: delay(plant, 0.3, control_memory=2), "must be at most 2 steps of"),
         (lambda: delay(dlx.LinearDynamics(A, B)), "dynamics must be an Abstr"),
+        (lambda: steps(Lag(), dt=0.0), "dt must be positive"),
         (lambda: steps(Lag(delays=[0.0]), H), "delays must be positive"),
         (lambda: steps(Lag(delays=[]), H), "delays must be positive"),
         (lambda: steps(Lag(), H, memory=3), "at most memory = 3 substeps"),
@@ -275,3 +276,17 @@ def test_what_does_not_fit_is_named():
     ):
         with user_error(match=words):
             make()
+
+
+@once
+def test_a_delay_of_whole_steps_needs_no_more_memory():
+    """In single precision a tenth is more than five times a fiftieth."""
+    plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.02)
+    assert dlx.dynamics.TransportDelay(plant, controls=0.1).control_memory == 5
+    dlx.dynamics.TransportDelay(plant, controls=0.1, control_memory=5)
+    late = dlx.dynamics.TransportDelay(plant, controls=0.28, control_memory=15)
+    late = eqx.tree_at(lambda d: d.controls, late, jnp.asarray(0.3))
+    _, result = late.advance(
+        0.0, late.filled(jnp.array([0.1, 0.0])), jnp.zeros(1), None
+    )
+    assert result == dlx.RESULTS.successful

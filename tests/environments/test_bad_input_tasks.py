@@ -166,7 +166,7 @@ def test_a_goal_is_one_number():
         (lambda: dlx.make("lds", A=jnp.eye(2)), "lds: B must be given together with A"),
         (
             lambda: dlx.make("lds", A=jnp.eye(2), B=jnp.ones((2, 1)), observations=1),
-            "lds: observations applies only if the matrices are random. Pass C",
+            "lds: observations applies only if the matrices are random.",
         ),
         (
             lambda: dlx.make(

@@ -72,7 +72,8 @@ def test_randomise_is_domain_randomisation_without_compiling(key):
             return jnp.zeros(1, y.dtype), state
 
     def cost(k):
-        plant = dlx.randomise(env, k, ranges)
+        plant_key, k = jax.random.split(k)
+        plant = dlx.randomise(env, plant_key, ranges)
         run = dlx.rollout(plant, Traced(), key=k, horizon=5)
         return plant.dynamics.system.length, plant.dynamics.system.mass, run.total_cost
 
@@ -208,3 +209,21 @@ def test_replace_checks_and_converts():
         dlx.replace(env, {"horizon": 100})
     with user_error(match="pendulum: max_speed"):
         dlx.environments.pendulum(solver=dlx.dynamics.RK4(), max_speed=1.0)
+
+
+@once
+@pytest.mark.parametrize("u", [1.0, jnp.ones(1), jnp.ones(3)])
+def test_a_control_of_another_size_is_not_broadcast(u):
+    env = dlx.make("kinematic_bicycle")
+    for call in (lambda: env.step(0.0, jnp.zeros(4), u), lambda: env.saturate(u)):
+        with user_error(match=r"u \(the control\) must have shape \(2,\)"):
+            call()
+
+
+@once
+def test_sizes_of_matrices_that_are_given():
+    model = dlx.linearize(dlx.systems.Pendulum())
+    for given in (dict(A=jnp.eye(2), B=jnp.ones((2, 1))), dict(system=model, dt=0.05)):
+        for size in (dict(states=5), dict(observations=1), dict(spectral_radius=0.5)):
+            with user_error(match=f"lds: {next(iter(size))} applies only if"):
+                dlx.make("lds", **given, **size)

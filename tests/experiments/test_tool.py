@@ -19,6 +19,7 @@ from delucax import experiments
 from delucax.experiments import experiment, Results
 from delucax.experiments._fingerprint import fingerprint
 from delucax.experiments._results import TIMES
+from delucax.experiments._statistics import quantile
 from delucax.experiments._store import Store
 
 
@@ -691,3 +692,21 @@ def test_paired_comparison():
     assert experiments.compare(both, by="method", baseline="a").equals(table)
     ratio = experiments.compare(quiet(cost), by="method", baseline="a", ratio=True)
     assert abs(ratio.loc["b", "ratio"] - 1.01) < 0.005
+
+
+def test_a_list_is_a_value_of_each_seed():
+    @experiment.seeds(2)
+    def both(key):
+        return [jax.random.normal(key), jax.random.uniform(key)]
+
+    rows = experiments.run(both, progress=False).rows
+    for seed, row in enumerate(rows):
+        key = jax.random.key(seed)
+        expected = [jax.random.normal(key), jax.random.uniform(key)]
+        np.testing.assert_allclose(row["value"], expected, rtol=1e-6)
+
+
+def test_quantiles_beside_infinity():
+    assert list(quantile([0, 1, 2, 3, np.inf], [0.25, 0.75, 0.8])) == [1, 3, np.inf]
+    assert quantile([np.inf, np.inf], 0.5) == np.inf
+    assert np.isnan(quantile([np.nan, 1.0], 0.5))

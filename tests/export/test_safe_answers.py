@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from c_programs import exported
 from helpers import needs_compiler, once
 from jax import lax
 
@@ -101,3 +102,43 @@ def test_names_that_only_look_like_ours(tmp_path, name):
     f = lambda sinf, f_real, v2: sinf + f_real * v2
     export.c(f, tmp_path, name="f", example=(1.0, 2.0, 3.0))
     assert export.load(tmp_path, name="f")(1.0, 2.0, 3.0) == 7
+
+
+def test_types_beside_that_of_the_export(tmp_path):
+    K, rows = np.arange(1, 6, dtype=np.float32), np.arange(300.0)
+    x, bits = np.arange(20.0), np.array([7, 3, 2**31 + 1], np.uint32)
+    given = {
+        "gains": (lambda x: (x[:5] @ K, jnp.asarray(K)), (x,)),
+        "sums": (lambda x: jnp.cumsum(x) + jnp.cumsum(x.astype(jnp.float32)), (x,)),
+        "entry": (lambda a, i: lax.dynamic_slice(a, (i,), (2,)), (rows, np.uint8(7))),
+        "common": (lambda b: lax.reduce_and(b, axes=(0,)), (bits,)),
+    }
+    calls = exported(tmp_path, given, dtype="float64")
+    found = {name: call(*given[name][1]) for name, call in calls.items()}
+    assert {flag for flag, _ in found.values()} == {0}
+    (total, gains), (sums,), (entry,), (common,) = (out for _, out in found.values())
+    assert total == 40 and np.all(gains == K) and gains.dtype == float
+    np.testing.assert_allclose(sums, 2 * np.cumsum(x))
+    assert list(entry) == [7, 8] and common == 1
+
+
+@pytest.mark.parametrize("limit", [1.0, 20.0])
+def test_a_counter_that_is_rounded_bounds_its_loop(tmp_path, limit):
+    """With thousandths in single precision the number of sums is not the quotient."""
+
+    def count(x):
+        turn = lambda c: (c[0] + jnp.float32(0.001), c[1] + x)
+        start = jnp.float32(0), jnp.float32(0)
+        return lax.while_loop(lambda c: c[0] < jnp.float32(limit), turn, start)[1]
+
+    one = np.float32(1)
+    given = {"count": (count, (one,))}
+    flag, (found,) = exported(tmp_path, given, dtype="float32")["count"](one)
+    assert (flag, found) == (0, count(one))
+
+
+def test_a_counter_that_may_step_over_its_end_has_no_bound(tmp_path):
+    turn = lambda c: (c[0] + jnp.float32(0.1), c[1] + 1)
+    ends = lambda x: lax.while_loop(lambda c: c[0] != 1, turn, (jnp.float32(0), x))[1]
+    with pytest.raises(ValueError, match="give max_iterations"):
+        export.c(ends, tmp_path, name="ends", dtype="float32", example=(np.float32(1),))

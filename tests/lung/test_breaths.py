@@ -96,6 +96,14 @@ def test_file_comes_back(breaths, lines, tmp_path):
     assert_close(half.u_in[:, 1::2], again.u_in[:, :28], atol=1e-4)
 
 
+def test_rounded_times_hold_the_control_of_their_step(tmp_path):
+    u = jnp.tile(jnp.arange(29.0), (2, 1))
+    lungs = dict(resistance=jnp.full(2, 5.0), compliance=jnp.full(2, 10.0))
+    path = tmp_path / "train.csv"
+    lung.write_breaths(path, lung.Breaths(u, 0 * u, 5 + u, dt=1 / 30, **lungs))
+    assert_close(lung.read_breaths(path).u_in, u)
+
+
 def test_lungs_of_other_values(lines, tmp_path):
     path = tmp_path / "train.csv"
     header, *rows = lines

@@ -239,3 +239,13 @@ def test_those_that_diverge_harm_no_other(shared):
     assert_close(found.model.gain[~bad], expected.model.gain[~bad])
     assert np.all(expected.model.gain != 1)
     assert found.history["diverged"].tolist() == [2, 2]
+
+
+@once
+def test_the_error_of_a_run_that_failed_is_nan():
+    class Late(dlx.AbstractController):
+        def __call__(self, t, y, state):
+            return jnp.where(t > 0.83, jnp.nan, 30.0) * jnp.ones(1, y.dtype), state
+
+    env = dlx.make("lung/single_compartment")
+    assert np.isnan(lung.breath_error(env, Late(), key=KEY, pips=[20.0])).all()

@@ -153,3 +153,15 @@ def test_wrong_numbers_are_named():
         lung.Breaths.from_recording(zeros, u_out, zeros, dt=0.03)
     with user_error(match="dt must be positive"):
         lung.Breaths(zeros[None], zeros[None], zeros[None], dt=-1.0)
+
+
+class Gain(eqx.Module):
+    k: float
+    a: np.ndarray
+
+
+def test_stacks_are_of_arrays():
+    both = stack([Gain(1.0, np.zeros(2)), Gain(1.0, np.ones(2))])
+    assert both.k == 1.0 and both.a.shape == (2, 2)
+    with user_error(match="stack: trees must be the same but for .*, got 1.0, 2.0"):
+        stack([Gain(1.0, np.zeros(2)), Gain(2.0, np.zeros(2))])

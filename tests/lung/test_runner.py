@@ -1,5 +1,7 @@
 """A controller at a ventilator: what a machine needs, proved on a simulated one."""
 
+import dataclasses
+
 import diffrax
 import equinox as eqx
 import jax
@@ -192,3 +194,33 @@ def test_another_controller_of_the_expiratory_valve():
     assert_close(run.controls[0, 0], own.controls[0, 0])
     with user_error(match="valve must be an AbstractController"):
         lung.Breathing(pid, WAVEFORM, valve=1.0)
+
+
+class Dithering(dlx.AbstractController):
+    """Draws at each step, and fails in the first breath."""
+
+    def init(self, *, key=None):
+        return check_key(key, "Dithering"), dlx.controllers.Tally("failed_plan")
+
+    def __call__(self, t, y, state):
+        key, tally = state
+        key, now = jax.random.split(key)
+        u = 50 + jax.random.uniform(now, (1,), y.dtype)
+        return u, (key, tally.add(jnp.asarray(t < 0.3)))
+
+
+def test_keys_and_tallies_go_on_from_breath_to_breath():
+    run = closed_loop(lung.Breathing(Dithering(), WAVEFORM))
+    drawn = np.concatenate([run.controls[:34, 0], run.controls[100:, 0]])
+    assert len(np.unique(drawn)) == len(drawn) == 68
+    assert run.result == dlx.RESULTS.plan_failed
+
+
+def test_the_noise_of_a_simulated_sensor_is_that_of_an_episode():
+    noise = dlx.disturbances.FromArray(0.1 * jnp.arange(200.0)[:, None])
+    runner = lung.SimulatedRunner(dataclasses.replace(ENV, sensor_noise=noise), key=KEY)
+    quiet = lung.SimulatedRunner(ENV, key=KEY)
+    for k in range(3):
+        assert_close(runner.observe() - quiet.observe(), 0.1 * k, atol=1e-4)
+        runner.wait()
+        quiet.wait()

@@ -215,5 +215,6 @@ def test_bounds_disturbances_and_what_diverges(learner):
         learner(plant, sim, cost, plan, w=push[:3])
     with user_error(match="indices must be"):
         igpc(plant, sim, cost, plan, indices="late")
-    with user_error(match="learning_rate must be positive"):
+    with user_error(match="learning_rate must be at least 0"):
         igpc(plant, sim, cost, plan, learning_rate=-1.0)
+    igpc(plant, sim, cost, plan, learning_rate=np.float32(0), iterations=1)

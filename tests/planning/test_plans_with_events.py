@@ -101,3 +101,15 @@ def test_a_plan_names_the_event_that_fails():
     with pytest.raises(RuntimeError, match=r"beyond.*the event bounce at t = 0\."):
         options = dict(key=jax.random.key(0), x0=[-0.1, 0.0])
         dlx.rollout(env, dlx.controllers.Zero(1), **options)
+
+
+@once
+@pytest.mark.parametrize("planner", [dlx.planning.ILQR(), dlx.planning.SQP()])
+def test_a_plan_whose_steps_fail_has_their_status(planner):
+    ball = dlx.Discretized(dlx.systems.BouncingBall(), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 1.0], [1.0])
+    below = jnp.array([-0.1, 0.0])
+    plan = planner(ball, cost, below, jnp.zeros((3, 1)), throw=False)
+    assert plan.result != dlx.RESULTS.successful
+    if isinstance(planner, dlx.planning.SQP):
+        assert plan.result == dlx.RESULTS.beyond_guard

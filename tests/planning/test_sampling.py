@@ -133,3 +133,22 @@ def test_bad_arguments_are_named():
     limit = dlx.planning.Constraints(lambda t, x, u: x[0])
     with user_error(match="CEM: constraints must be None"):
         CEM()(*problem, key=KEY, constraints=limit)
+
+
+@once
+def test_samples_that_diverge_leave_the_gradient_finite():
+    def field(t, x, u, w):
+        return x**3 + u
+
+    plant = dlx.Discretized(dlx.system(field, states=("x",), controls=("u",)), dt=0.5)
+    cost = dlx.costs.Quadratic([1.0], [1.0])
+    planner = dlx.planning.MPPI(scale=3.0)
+
+    def optimum(x0):
+        given = plant, cost, x0, jnp.zeros((12, 1))
+        return planner(*given, key=jax.random.key(0)).cost
+
+    x0 = jnp.array([0.1])
+    backward, forward = (jax.jit(d(optimum))(x0) for d in (jax.grad, jax.jacfwd))
+    assert np.all(np.isfinite(backward))
+    assert_close(backward, forward, rtol=1e-3)

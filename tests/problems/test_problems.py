@@ -50,6 +50,19 @@ def test_violation_of_every_kind():
         constraints = dlx.planning.Constraints(**given)
         narrow = dataclasses.replace(problem, constraints=constraints)
         assert narrow.simulate(plan).violation >= least - 1e-6
+    # What may be violated, and the bounds of the given start, do not count.
+    first = jnp.full((len(plan.states), 4), -jnp.inf).at[0].set(1e3)
+    always = dlx.planning.SoftConstraint(lambda t, x, u: 1.0, linear=1.0)
+    for limits in (
+        dict(states=dlx.qp.Soft(-jnp.inf, 0.0, linear=1.0)),
+        dict(states=(first, jnp.inf)),
+        dict(inequality=always),
+    ):
+        loose = dlx.planning.Constraints(**limits)
+        simulated = dataclasses.replace(problem, constraints=loose).simulate(plan)
+        assert simulated.violation <= 1e-5
+    listed = dataclasses.replace(problem, bounds=([-10.0], [10.0])).simulate(plan)
+    assert listed.violation <= 1e-5
 
 
 class Driven(dlx.systems.Pendulum):

@@ -137,3 +137,12 @@ def test_a_bound_without_weights_is_no_bound():
     found, expected = (dlx.qp.solve(program, throw=False) for program in programs)
     assert found.result == expected.result == dlx.RESULTS.successful
     assert_close(found.x, expected.x, atol=tolerance(1e-3, 1e-7))
+
+
+@pytest.mark.parametrize("far", [1e6, 1e10])
+def test_a_far_bound_does_not_excuse_another(far):
+    box = np.array([0.0, -far], dtype()), np.array([1.0, far], dtype())
+    q = np.array([-50.0, 0.0], dtype())
+    s = dlx.qp.solve(dlx.qp.Dense(np.eye(2, dtype=dtype()), q, bounds=box))
+    assert s.result == dlx.RESULTS.successful
+    assert_close(s.x, [1.0, 0.0], atol=tolerance(1e-3, 1e-6))

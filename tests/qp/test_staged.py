@@ -213,3 +213,25 @@ def test_a_solution_starts_the_next_problem_warm(soft):
         problem(given["start"]), start=eqx.tree_at(lambda s: s.x, cold, lost)
     )
     assert_close(ignored.u, cold.u, atol=tolerance(1e-2, 1e-6))
+
+
+def test_rounding_of_a_semidefinite_weight_is_no_negative_eigenvalue():
+    c = jnp.array([[1.0, 1 / 3]])
+    A, B = jnp.array([[1.0, 0.1], [0.0, 1.0]]), jnp.array([[0.0], [0.1]])
+    given = A, B, c.T @ c, jnp.eye(1)
+    problem = dlx.qp.Staged(*given, start=jnp.ones(2), horizon=5)
+    assert dlx.qp.solve(problem).result == dlx.RESULTS.successful
+
+
+@once
+@pytest.mark.parametrize(
+    "limits",
+    [
+        dict(rows=dlx.qp.Rows(np.eye(2), upper=np.ones((5, 2)))),
+        dict(controls=([[-1.0]] * 5, [[1.0]] * 5)),
+        dict(states=([[-1.0, -1.0]] * 6, 1.0)),
+    ],
+)
+def test_bounds_that_vary_tell_the_horizon(limits):
+    A, B = jnp.array([[1.0, 0.1], [0.0, 1.0]]), jnp.array([[0.0], [0.1]])
+    assert dlx.qp.Staged(A, B, jnp.eye(2), jnp.eye(1), **limits).horizon == 5

@@ -282,3 +282,24 @@ def test_a_random_key_in_the_state_is_kept_and_saved(key, tmp_path):
     again = dlx.load(tmp_path / "run.dlx")
     data = [jax.random.key_data(r.controller_state.key) for r in (run, again)]
     np.testing.assert_array_equal(*data)
+
+
+@once
+def test_a_slice_has_the_result_of_its_own_incidents():
+    class Unlucky(dlx.AbstractController):
+        def init(self, *, key=None):
+            return dlx.controllers.Tally("failed_plan"), dlx.controllers.Tally(
+                "failed_estimate"
+            )
+
+        def __call__(self, t, y, state):
+            plan, estimate = state
+            state = plan.add(t < 0.01), estimate.add(t > 0.2)
+            return jnp.zeros(1, y.dtype), state
+
+    env = dlx.make("pendulum")
+    options = dict(key=jax.random.key(0), x0=[0.1, 0.0], horizon=10)
+    run = dlx.rollout(env, Unlucky(), **options)
+    assert run.result == dlx.RESULTS.plan_failed
+    assert run[3:].result == dlx.RESULTS.estimate_failed
+    assert run[1:3].result == dlx.RESULTS.successful

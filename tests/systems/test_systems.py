@@ -130,3 +130,56 @@ def test_linear_system():
             dlx.systems.LinearSystem(*arguments)
     with user_error(match=r"x_ref must have shape \(2,\)"):
         dlx.systems.LinearSystem(A, B, x_ref=jnp.ones(3))
+
+
+class Shaken(dlx.AbstractSystem):
+    """Noise that is proportional to the control."""
+
+    state_names, control_names = ("x",), ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return u - x
+
+    def equilibrium(self):
+        return jnp.ones(1), jnp.ones(1)
+
+    def diffusion(self, t, x, u):
+        return u
+
+
+@once
+def test_a_calibrated_actuator_shakes_and_rests():
+    scaled = dlx.systems.Calibrated(Shaken(), control_scale=2.0, control_offset=0.5)
+    assert_close(scaled.diffusion(0.0, jnp.zeros(1), jnp.ones(1)), [2.5])
+    x, u = scaled.equilibrium()
+    assert_close(u, [0.25])
+    assert_close(scaled.vector_field(0.0, x, u, None), [0.0])
+
+
+@once
+def test_a_wrapper_may_override_each_hook():
+    class Wrapper(dlx.systems.AbstractSystemWrapper):
+        system: dlx.AbstractSystem
+
+        def vector_field(self, t, x, u, w):
+            return self.system.vector_field(t, x, u, None)
+
+    class Noisy(Wrapper):
+        def diffusion(self, t, x, u):
+            return 0.5 * jnp.ones(2)
+
+    class Gusty(Wrapper):
+        disturbance_names = ("gust",)
+
+    class Turned(Wrapper):
+        def project(self, x):
+            return x % 1
+
+    inner = dlx.systems.Pendulum()
+    plain, noisy, gusty, turned = (c(inner) for c in (Wrapper, Noisy, Gusty, Turned))
+    assert (plain.noise, plain.disturbance_size) == ("additive", 2)
+    assert (noisy.noise, noisy.disturbance_size) == ("brownian", 2)
+    assert (gusty.noise, gusty.disturbance_size) == (None, 1)
+    assert turned.projects_state and not plain.projects_state
+    assert Wrapper(noisy).noise == "brownian" and Wrapper(turned).projects_state
+    assert dlx.Discretized(noisy, 0.05).increments == 1

@@ -219,6 +219,11 @@ def test_bootstrap():
     short = sysid.physical(plant, record, "system.gain", window=2)
     again = sysid.bootstrap(short, record, draws=200, key=jax.random.key(1))
     assert_close(again.std, short.std, rtol=0.2)
+    # A block as long as a record is one of the two records.
+    two = [sysid.Record(sign * y, sign * u, dt=0.1) for sign in (1.0, -1.0)]
+    both = sysid.physical(plant, two, "system.gain", window=None)
+    again = sysid.bootstrap(both, two, block=120, draws=20, key=jax.random.key(2))
+    assert len(np.unique(np.round(again.estimates, 9))) <= 4
     with user_error(match="block must be at most the 120 samples of the shortest"):
         drawn(block=121, key=jax.random.key(0))
     linear = sysid.linear(record)

@@ -18,6 +18,7 @@ from delucax.training._synthesis._attempt import Attempt, Candidate
 from delucax.training._synthesis._budget import Budget
 from delucax.training._synthesis._episode_costs import costs_of, tamed
 from delucax.training._synthesis._policy_search import PolicySearch
+from delucax.training._synthesis._rounds import by_evolution, by_gradient
 from delucax.training._synthesis._structures import (
     _range as controls_of_a_law,
     simplified,
@@ -301,6 +302,20 @@ def test_both_policies_run_in_the_same_programs():
     np.testing.assert_allclose(cost(network), cost(second), rtol=1e-5)
     assert simplified("LQR", first) is first.base
     assert simplified("LQR + network", first) is first
+
+
+def test_evolution_trains_weights_and_the_gradient_also_scales():
+    policy = structures(env(), dlx.controllers.local_lqr(env()), False, 4, 1, KEY)
+    policy = policy["LQR + network"]
+    once_only = dict(key=KEY, callbacks=(lambda *_: True,))
+    evolved = by_evolution(env(), None, policy, 0.3, 1.0, **once_only)
+    trained = by_gradient(env(), None, policy, 0.5, 0.02, **once_only)
+    scales = lambda made: (made.correction.bounds, made.correction.features.std)
+    same = lambda a, b: all(map(np.array_equal, *map(jax.tree.leaves, (a, b))))
+    for made, keeps_scales in (evolved, True), (trained, False):
+        assert same(made.base, policy.base)
+        assert not same(made.correction.network, policy.correction.network)
+        assert same(scales(made), scales(policy)) == keeps_scales
 
 
 def test_an_interrupt_keeps_the_rounds_so_far(monkeypatch):

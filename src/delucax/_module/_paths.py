@@ -152,6 +152,8 @@ def check_paths(changes: Mapping[Any, Any], where: str) -> None:
                 f"{where}: a path must be a string such as 'dynamics.system.length', "
                 f"got {shortened(path)}."
             )
+        if not path:
+            raise ValueError(f"{where}: a path must not be empty.")
         parts = path.split(".")
         for end in range(1, len(parts)):
             above = ".".join(parts[:end])

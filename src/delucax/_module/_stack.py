@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from .._message import shortened
+
 
 def stack(trees: Iterable[Any]) -> Any:
     """Stack modules of the same structure into one. Each array gets a leading axis over
@@ -20,7 +22,8 @@ def stack(trees: Iterable[Any]) -> Any:
 
     **Returns:** the stacked module.
 
-    **Raises:** `ValueError` if `trees` is empty, or their structures differ.
+    **Raises:** `ValueError` if `trees` is empty, or if they differ in their structures
+    or in a number that is no array.
 
     !!! example
 
@@ -38,7 +41,13 @@ def stack(trees: Iterable[Any]) -> Any:
         raise ValueError("stack: trees must have the same structure.")
 
     def together(*leaves):
-        if not eqx.is_array(leaves[0]):
+        if not isinstance(leaves[0], np.ndarray | jax.Array):
+            known = isinstance(leaves[0], int | float | complex | str)
+            if known and any(leaf != leaves[0] for leaf in leaves):
+                raise ValueError(
+                    "stack: trees must be the same but for their arrays, got "
+                    f"{', '.join(map(shortened, leaves))}."
+                )
             return leaves[0]
         if all(_is_plain(leaf) for leaf in leaves):
             return jnp.asarray(np.stack(leaves))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Float, PyTree
@@ -328,9 +329,11 @@ class LQI(AbstractController):
         # Ki is tall if there are fewer outputs than controls: least squares.
         solver = lx.AutoLinearSolver(well_posed=None)
         change = lx.linear_solve(gain, excess, solver, throw=False).value
-        limited = jnp.any(excess != 0)
-        integral = jnp.where(limited, state.integral + change, state.integral)
-        return state._replace(integral=integral)
+        # Without an excess the change is zero, but its derivative is not.
+        still = change - lax.stop_gradient(change)
+        still = jnp.where(jnp.isfinite(change), still, 0)
+        change = jnp.where(jnp.any(excess != 0), change, still)
+        return state._replace(integral=state.integral + change)
 
 
 @host_unless_traced

@@ -136,7 +136,8 @@ class MPC(AbstractController):
         default the second and third trajectory above. If you give controls of shape
         `(T, m)`, they replace the control of the third trajectory. A
         [`delucax.planning.Start`][] replaces both trajectories, for example by another
-        stabilising feedback.
+        stabilising feedback, and so does a [`delucax.planning.Plan`][]. The first plan
+        also starts from their multipliers.
     - `throw`: whether to raise an error at run time if there is no usable plan; true by
         default. If false, the controller uses the last plan for one more step, under
         the gains of the plan, and then discards the plan. If there is no usable plan in
@@ -229,6 +230,9 @@ class MPC(AbstractController):
         horizon = check_count(horizon, "horizon", where)
         m = dynamics.control_size
         self.bounds = check_control_bounds(bounds, m, where)
+        if isinstance(start, Plan):
+            trajectory = start.controls, start.states, start.gains
+            start = Start(*trajectory, multipliers=start.multipliers)
         if isinstance(start, Start):
             start = start.checked(dynamics.state_size, m, "start", where)
             if start.horizon != horizon:
@@ -301,11 +305,19 @@ class MPC(AbstractController):
         )
 
     def _first(self) -> Start:
-        """The first trajectory of `start`, with multipliers of zero."""
-        first, n = _first(self.start), self.dynamics.state_size
+        """The first trajectory of `start`, and its multipliers if they fit, else
+        zero."""
+        first, n = _first(self.start.trajectories), self.dynamics.state_size
         x0: Any = np.zeros(n, first.controls.dtype)
         problem = self._problem(0.0, x0, x0.dtype)
         y = self.planner.first_multipliers(problem, first.horizon)
+        given = self.start.multipliers
+        sizes = lambda tree: (
+            jax.tree.structure(tree),
+            [*map(np.shape, jax.tree.leaves(tree))],
+        )
+        if sizes(given) == sizes(y):
+            y = jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), given, y)
         return dataclasses.replace(first, multipliers=y)
 
     def _problem(self, t: RealScalar, y: Observation, dtype: Any) -> Problem:

@@ -373,6 +373,14 @@ class Standardise(eqx.Module):
         **Arguments:** `y`: an observation.
 
         **Returns:** a vector.
+
+        **Raises:** `ValueError` if `mean` has another size than the features.
         """
+        features = self.of(y)
+        if features.shape != self.mean.shape:
+            raise ValueError(
+                f"Standardise: mean must have an entry for each of the features, shape "
+                f"{features.shape}, got shape {self.mean.shape}."
+            )
         # Clipped at ten deviations as in OpenAI's Baselines, because of outliers.
-        return jnp.clip((self.of(y) - self.mean) / self.std, -10, 10)
+        return jnp.clip((features - self.mean) / self.std, -10, 10)

@@ -144,7 +144,9 @@ class LQG(AbstractController):
     - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by
         default.
     - `difference`: a function `(x, x_ref) -> deviation` that replaces subtraction of
-        states, for example to wrap angles.
+        states in the regulator, for example to wrap angles. The filter predicts with
+        the linear model, which does not wrap them, so the state should begin within
+        the turn of the operating point.
     - `observation_difference`: the same for observations.
 
     **Attributes:** `regulator`, a [`delucax.controllers.LQR`][], with `K` and `P`;

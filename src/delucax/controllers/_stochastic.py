@@ -213,7 +213,7 @@ class Gaussian(_AroundBase):
             mean, state = self.base(t, y, state)
             return self._log_prob(mean, u), state
 
-        scores = replay(self.base, self.base.init(), record, act)
+        scores = replay(self.base, initial_state(self.base, None), record, act)
         # Steps after termination are padding.
         alive = jnp.arange(trajectory.steps) < trajectory.length
         return jnp.sum(jnp.where(alive, scores, 0))

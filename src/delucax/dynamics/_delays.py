@@ -20,6 +20,11 @@ _SLACK = 8
 """The relative error of a delay that counts as rounding, in units of eps."""
 
 
+def _eps(value: Any) -> float:
+    """The relative distance of numbers in the precision of `value`."""
+    return float(jnp.finfo(jnp.result_type(value, float)).eps)
+
+
 class _AbstractDelay(AbstractWrapper):
     """Dynamics whose state ends with the pending controls and observations,
     `(x, u[k - 1], ..., u[k - c], y[k - 1], ..., y[k - s])`, the newest first.
@@ -261,7 +266,7 @@ class TransportDelay(_AbstractDelay):
             steps = float(delay) / float(self.dynamics.dt) if known else 0.0
             if steps < 0:
                 raise ValueError(f"{where}: {name} must be at least 0, got {delay}.")
-            slack = 1 - _SLACK * float(jnp.finfo(float).eps)
+            slack = 1 - _SLACK * _eps(self.dynamics.dt)
             if memory is None:
                 if not known:
                     raise ValueError(
@@ -294,7 +299,7 @@ class TransportDelay(_AbstractDelay):
         """The whole steps of a delay, and the rest as a fraction of a step."""
         steps = delay / self.dynamics.dt
         # The slack absorbs the rounding of a quotient that should be whole.
-        slack = _SLACK * float(jnp.finfo(float).eps) * steps
+        slack = _SLACK * _eps(steps) * steps
         whole = jnp.floor(steps + slack)
         rest = steps - whole
         # A rest of zero keeps the derivative of the delay.

@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_entries, as_vector, check_count, check_instance, is_concrete
+from .._check import (
+    as_entries,
+    as_vector,
+    check_count,
+    check_instance,
+    check_step,
+    is_concrete,
+)
 from .._integration import check_method, RK4, runge_kutta_step, tableau_of
 from .._module import parameter
 from .._results import choose, Result, RESULTS
@@ -96,6 +103,7 @@ class MethodOfSteps(Forwarding):
     def __post_init__(self):
         where = "MethodOfSteps"
         check_instance(self.system, AbstractDelaySystem, "system", where)
+        check_step(self.dt, where)
         delays = as_entries(self.system.delays, None, "delays", where, "delay")
         known = is_concrete(delays) and is_concrete(self.dt)
         if not known and (self.substeps is None or self.memory is None):

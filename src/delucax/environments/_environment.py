@@ -337,6 +337,10 @@ class Environment(eqx.Module):
                     f"Environment: u must be an action from 0 to {count - 1}, got {u}."
                 )
             control = self.actions[control]
+        # Before the bounds, against which a wrong shape could be broadcast.
+        control = as_vector(
+            control, self.control_size, "u (the control)", "Environment"
+        )
         if self.control_bounds is None:
             return control
         low, high = self.control_bounds
@@ -374,8 +378,7 @@ class Environment(eqx.Module):
 
     def _applied(self, u: Any) -> Control:
         """The control or integer action `u`, as a control within the bounds."""
-        u = self.saturate(as_float_array(u) if self.actions is None else u)
-        return as_vector(u, self.control_size, "u (the control)", "Environment.step")
+        return self.saturate(as_float_array(u) if self.actions is None else u)
 
     def _advance(self, t: Time, x: State, u: Control, w: Disturbance) -> Step:
         """A step with arguments that are already checked."""

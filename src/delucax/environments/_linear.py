@@ -120,10 +120,10 @@ def lds(
     system: LinearDynamics | LinearSystem | None = None,
     dt: Any = None,
     key: PRNGKey | None = None,
-    states: int = 2,
-    controls: int = 1,
+    states: int | None = None,
+    controls: int | None = None,
     observations: int | None = None,
-    spectral_radius: Any = 0.9,
+    spectral_radius: Any = None,
     horizon: int = 200,
     **others: Any,
 ) -> Environment:
@@ -160,8 +160,9 @@ def lds(
     **Returns:** a [`delucax.Environment`][].
 
     **Raises:** `ValueError` if only one of `A` and `B` is given, if there are neither
-    matrices nor a key nor a system, or more than one of these, if shapes do not fit, if
-    `system` is not linear, or if `dt` does not fit it.
+    matrices nor a key nor a system, or more than one of these, if sizes of random
+    matrices are given with matrices or a system, if shapes do not fit, if `system` is
+    not linear, or if `dt` does not fit it.
 
     !!! example
 
@@ -175,6 +176,13 @@ def lds(
         ```
     """
     check_keywords(others, "lds", lds, Environment)
+    if A is not None or system is not None:
+        drawn = dict(states=states, controls=controls, observations=observations)
+        for name, value in (drawn | dict(spectral_radius=spectral_radius)).items():
+            if value is not None:
+                raise ValueError(
+                    f"lds: {name} applies only if the matrices are random."
+                )
     if system is not None:
         for name, value in {"A": A, "B": B, "C": C, "key": key}.items():
             if value is not None:
@@ -189,13 +197,14 @@ def lds(
             )
         if A is None and C is not None:
             raise ValueError("lds: C needs A and B. For a random C, pass observations.")
-        if A is not None and observations is not None:
-            raise ValueError(
-                "lds: observations applies only if the matrices are random. Pass C "
-                "with A and B."
-            )
         if A is None:
-            A, B, C = _random(key, states, controls, observations, spectral_radius)
+            A, B, C = _random(
+                key,
+                2 if states is None else states,
+                1 if controls is None else controls,
+                observations,
+                0.9 if spectral_radius is None else spectral_radius,
+            )
         elif key is not None:
             raise ValueError("lds: pass A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)

@@ -49,7 +49,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
         ranges = {"dynamics.system.length": (0.8, 1.2)}
 
         def cost(key):
-            plant = dlx.randomise(env, key, ranges)
+            plant_key, key = jax.random.split(key)
+            plant = dlx.randomise(env, plant_key, ranges)
             zero = dlx.controllers.Zero(1)
             return dlx.rollout(plant, zero, key=key, x0=[0.1, 0.0]).total_cost
 

@@ -131,7 +131,9 @@ class Runner:
         if mesh is not None:
             spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
             numbers = jax.device_put(numbers, spread)
-        return self._traced(arguments, numbers)
+        made = self._traced(arguments, numbers)
+        # A list would be one of rows.
+        return {"value": made} if isinstance(made, list) else made
 
     def _traced(self, arguments: dict[str, Any], numbers: Any) -> Any:
         """Call the function for all seeds, with as many numbers traced as possible.

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._page import escape, Page
 from ._results import Results
-from ._statistics import Bootstrap, interquartile_mean, is_number
+from ._statistics import Bootstrap, interquartile_mean, is_number, quantile
 
 
 # The largest number of panels in a figure, and of cases in a panel.
@@ -102,7 +102,7 @@ def summary(results: Results) -> tuple[list[str], list[list]]:
         statistics: dict[str, Any] = {name: interquartile_mean}
         if many and any(_varies(rows, name) for rows in cases):
             for k in (25, 75):
-                statistics[f"{name} {k}%"] = lambda v, k=k: float(np.percentile(v, k))
+                statistics[f"{name} {k}%"] = lambda v, k=k: float(quantile(v, k / 100))
         with np.errstate(invalid="ignore"):
             for heading, of in statistics.items():
                 columns.append((heading, [of(v) if v else None for v in values]))
@@ -249,7 +249,7 @@ def _panel(axes: Any, title: str, cases: dict[str, list[float]]) -> None:
         place, finite = -len(labels), [v for v in values if math.isfinite(v)]
         axes.plot(finite, [place] * len(finite), "|", color="0.6")
         with np.errstate(invalid="ignore"):
-            low, high = np.quantile(values, [0.25, 0.75])
+            low, high = quantile(values, [0.25, 0.75])
             middle = interquartile_mean(values)
         axes.plot([low, high], [place, place], color="C0", lw=3, alpha=0.5)
         axes.plot(middle, place, "o", color="C0", ms=4)

@@ -12,6 +12,16 @@ from ._results import Results
 from ._store import PASSED
 
 
+def quantile(values: Any, shares: Any) -> Any:
+    """Quantiles, also where some values are infinite: `numpy.quantile` then computes
+    infinity times zero, or the difference of two infinities, and gives NaN."""
+    with np.errstate(invalid="ignore"):
+        between = np.quantile(values, shares)
+    ends = (np.quantile(values, shares, method=end) for end in ("lower", "higher"))
+    low, high = ends
+    return np.where(low == high, low, between)
+
+
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     """The interquartile mean: the mean of the values between the quartiles.
 
@@ -275,5 +285,5 @@ class Bootstrap:
     def _ends(self, resampled: np.ndarray) -> tuple[float, float]:
         # Efron's percentile interval.
         tail = (1 - self.confidence) / 2
-        low, high = np.quantile(resampled, [tail, 1 - tail])
+        low, high = quantile(resampled, [tail, 1 - tail])
         return float(low), float(high)

@@ -92,10 +92,17 @@ class Bound(NamedTuple):
         if not isinstance(start, Const) or start.value.ndim or steps is None:
             return None
         first, step = steps
+        is_exact = sign == 0
         sign = sign or (1 if step > 0 else -1)
         limit = self._limit(right, sign)
         if limit is None or sign * step <= 0:
             return None
+        if start.value.dtype.kind == "f":
+            # A floating-point counter may step over a limit that it should equal.
+            if is_exact:
+                return None
+            more = _rounded_steps(start.value, first, step, limit, sign, reaches)
+            return None if more is None else more + 1 + late
         rounds = sign * (limit - float(start.value) - first) / abs(step)
         if not np.isfinite(rounds):
             return None
@@ -187,6 +194,22 @@ class Bound(NamedTuple):
         return self._made(counts[1 - same]) if is_flag else None
 
 
+def _rounded_steps(
+    start: Any, first: float, step: float, limit: float, sign: int, reaches: int
+) -> int | None:
+    """The steps of a floating-point counter up to a limit, after its first step; `None`
+    if there are too many. Each sum is rounded as in the loop, which changes their
+    number."""
+    kind = start.dtype.type
+    value, step, limit = kind(start + kind(first)), kind(step), kind(limit)
+    for count in range(_MOST_STEPS):
+        if not (sign * value < sign * limit or reaches and value == limit):
+            return count
+        value = kind(value + step)
+    return None
+
+
+_MOST_STEPS = 1_000_000
 _BETWEEN = "select_n", "convert_element_type", "min", "max", "squeeze"
 _TESTS = {
     "lt": (1, 0),

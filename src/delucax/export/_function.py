@@ -125,7 +125,10 @@ def export_function(
                         "export.c: the function must return arrays and numbers, got "
                         f"{shortened(leaf)}."
                     )
-            return [jnp.asarray(leaf) for _, leaf in leaves]
+            arrays = [jnp.asarray(leaf) for _, leaf in leaves]
+            # The header has one floating-point type.
+            is_real = lambda a: jnp.issubdtype(a.dtype, jnp.floating)
+            return [a.astype(dtype) if is_real(a) else a for a in arrays]
 
         block = trace(flat, *shapes)
     heads = labels or _names_of(function, len(example))

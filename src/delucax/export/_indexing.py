@@ -17,6 +17,8 @@ def clamped(e: Any, expr: Expr, most: int) -> Index:
     if expr.low >= 0 and expr.high <= most:
         return index_of(e.define(expr))
     params: Any = {}
+    # A small type of integers may not reach the last index.
+    most = min(most, np.iinfo(expr.dtype).max)
     make, _ = operation("clamp", params, [expr.dtype], expr.dtype, e.shared)
     ends = literal(0, expr.dtype), literal(most, expr.dtype)
     return index_of(e.define(make([ends[0], expr, ends[1]])))
@@ -129,7 +131,7 @@ def _starts(e, numbers, shape, sizes, indices, batch, drops):
     inside = None
     for k, axis in enumerate(axes):
         expr = indices.at((*batch, known(k)))
-        most = shape[axis] - sizes[axis]
+        most = min(shape[axis] - sizes[axis], np.iinfo(expr.dtype).max)
         if drops and not (expr.low >= 0 and expr.high <= most):
             expr = e.define(expr)
             for op, end in (("ge", 0), ("le", most)):

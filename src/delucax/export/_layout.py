@@ -112,7 +112,8 @@ def placed(buffers: list[Buffer], top: Scope) -> tuple[list[str], int]:
             kinds.setdefault(buffer.dtype, []).append(buffer)
     for dtype, group in kinds.items():
         kind = c_type(dtype, stored=True)
-        arena = "work" if dtype.kind == "f" else f"work_{dtype}"
+        is_only = dtype.kind == "f" and sum(d.kind == "f" for d in kinds) == 1
+        arena = "work" if is_only else f"work_{dtype}"
         size, live, wheres = 0, [], []
         for buffer in sorted(group, key=lambda b: used[b.name]):
             begin, end = used[buffer.name]

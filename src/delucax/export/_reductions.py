@@ -33,8 +33,10 @@ def _neutral(op, dtype):
     kind = np.dtype(dtype).kind
     if op in ("add", "or", "xor"):
         return 0
+    if op == "and" and kind in "iu":
+        return -1 if kind == "i" else np.iinfo(dtype).max
     if op in ("mul", "and"):
-        return -1 if op == "and" and kind in "iu" else 1
+        return 1
     ends = {"f": (-np.inf, np.inf), "b": (False, True)}.get(kind)
     if ends is None:
         info = np.iinfo(dtype)

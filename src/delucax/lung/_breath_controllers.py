@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, PyTree
 
 from .._check import check_choice, check_count, check_key, check_step
-from .._controller import AbstractController, check_controller
+from .._controller import AbstractController, check_controller, Tally
 from .._module import mlp, parameter, positive, weight
 from .._typing import PRNGKey, Real, RealScalar
 from ..math import clip
@@ -87,7 +87,7 @@ class Breathing(AbstractController):
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         inhale = self.waveform.is_inspiration(t)
         begins = inhale & ~state.inhaling
-        inner = _where(begins, state.first, state.inner)
+        inner = _restarted(begins, state.first, state.inner)
         u_in, after = self.inspiratory(t, y, inner)
         # The valve opens with a time constant of 0.2 s.
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
@@ -109,14 +109,27 @@ class Breathing(AbstractController):
 
 
 def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
-    """Select one of two states. Random keys come from `no`, so none is used twice."""
+    """Select one of two states."""
 
     def where(yes, no):
-        if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
+        if not eqx.is_array(no):
             return no
-        return jnp.where(condition, yes, no).astype(no.dtype)
+        chosen = jnp.where(condition, yes, no)
+        return chosen if _is_key(no) else chosen.astype(no.dtype)
 
     return jax.tree.map(where, yes, no)
+
+
+def _restarted(begins: Array, first: PyTree, now: PyTree) -> PyTree:
+    """The first state where a breath begins. Random keys and tallies go on, so that no
+    key is used twice and no incident is forgotten."""
+    goes_on = lambda leaf: isinstance(leaf, Tally) or _is_key(leaf)
+    choose = lambda a, b: b if goes_on(b) else _where(begins, a, b)
+    return jax.tree.map(choose, first, now, is_leaf=goes_on)
+
+
+def _is_key(leaf: Any) -> bool:
+    return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 class BangBang(AbstractController):

@@ -105,7 +105,8 @@ def read_breaths(
                 f"for length = {length} samples of {dt:.3g} s"
             )
             raise _wrong(path, table["line"][start], "u_out", words)
-        held = np.clip(np.searchsorted(t, grid + 1e-9) - 1, 0, None)
+        # The times of a file are rounded.
+        held = np.clip(np.searchsorted(t, grid + 0.01 * dt) - 1, 0, None)
         pressure = np.interp(grid, t, table["pressure"][start:stop])
         samples.append((table["u_in"][start:stop][held], pressure))
     u_in, pressure = jnp.asarray(np.array(samples)).swapaxes(0, 1)

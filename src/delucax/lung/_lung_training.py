@@ -224,7 +224,7 @@ def breath_error(
     def one(pip, key):
         world, policy = BreathWaveform.at_pip((env, whole), pip)
         run: Any = rollout(world, policy, key=key, **options)
-        return jnp.mean(run.costs)
+        return jnp.where(run.failed, jnp.nan, jnp.mean(run.costs))
 
     keys = jax.random.split(check_key(key, where), pips.shape[0])
     return jax.vmap(one)(pips, keys)

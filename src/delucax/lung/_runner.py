@@ -139,6 +139,7 @@ class SimulatedRunner:
         start, self._key = jax.random.split(key)
         self.state = environment.reset(start)
         self.steps, self.controls, self.is_clean = 0, (0.0, 0.0), False
+        self._noise = jnp.zeros((0, 1))
         if self.real_time:
             # Compile now, not within the first interval.
             self._advanced()
@@ -149,9 +150,11 @@ class SimulatedRunner:
         y = self.environment.dynamics.observe(self.steps * self.dt, self.state)
         noise = self.environment.sensor_noise
         if noise is not None:
-            own = jax.random.fold_in(self._key, self.steps)
-            times = self.dt * np.arange(self.steps, self.steps + 2)
-            y = y + noise.sequence(own, jnp.asarray(times, self.state.dtype))[0]
+            if self.steps >= len(self._noise):
+                # The noise of a longer episode begins with that of a shorter one.
+                count = max(self.environment.horizon, 2 * self.steps)
+                self._noise = noise.draw(self._key, self.dt, count, self.state.dtype)
+            y = y + self._noise[self.steps]
         return float(y[0])
 
     def actuate(self, u_in: float, u_out: float) -> None:

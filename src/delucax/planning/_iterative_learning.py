@@ -16,6 +16,7 @@ from .._check import (
     check_instance,
     check_number,
     check_positive,
+    check_range,
     finite_rows,
 )
 from .._module import as_float_array
@@ -209,9 +210,7 @@ def igpc(
     """
     where = "igpc"
     check_number(learning_rate, "learning_rate", where)
-    # A rate of zero is valid: nothing is learned within a run.
-    if not (isinstance(learning_rate, int | float) and learning_rate == 0):
-        check_positive(learning_rate, "learning_rate", where)
+    check_range(learning_rate, "learning_rate", where)
     check_choice(indices, ("aligned", "deluca"), "indices", where)
     online = _Online(
         check_count(memory, "memory", where),

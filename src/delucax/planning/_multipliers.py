@@ -38,7 +38,9 @@ class Multipliers(eqx.Module):
         controls, these are the multipliers of the hard bounds.
     - `costates`: the multipliers of the dynamics, shape `(T+1, n)`. Row `k` is minus
         the derivative of the cost from stage `k` on with respect to $x_k$, as in
-        [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`.
+        [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`. If the plan has
+        [`delucax.planning.Unknowns`][], a column for each unknown follows, in scaled
+        units, here and in `states`.
     - `penalty`: the last penalty weight of `ILQR`; `None` for
         [`delucax.planning.SQP`][].
 

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import shown
-from .._results import choose, first_of, or_none, RESULTS
+from .._results import choose, first_of, or_none, Result, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
@@ -176,6 +176,16 @@ class Problem(eqx.Module):
             `w`: disturbance, shape `(k,)`, or `None`.
         """
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
+
+    def failure(self, states: Array, controls: Array) -> Result:
+        """The first failure of the steps along a trajectory, or success.
+
+        **Arguments:** `states`: shape `(T+1, n)`. `controls`: shape `(T, m)`.
+        """
+        # If all steps succeed statically, nothing is computed.
+        of = lambda t, x, u, w: or_none(self.dynamics.advance(t, x, u, w)[1])
+        times = self.times(controls.shape[0])
+        return first_of(jax.vmap(of)(times[:-1], states[:-1], controls, self.w))
 
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
         """The values of the constraints of a step, at `t`, `x` and `u`."""

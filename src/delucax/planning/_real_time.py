@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._results import choose, RESULTS
+from .._results import choose, first_failure, RESULTS
 from ..qp._derivatives import optimum, Options
 from ..qp._embedding import Tolerances
 from ._convex import Convex, convexified, held_rows, made_convex
@@ -84,6 +84,7 @@ def fed_back(problem: Problem, ready: Prepared, max_steps: int) -> Plan:
     result = choose(bad <= 1, RESULTS.no_feasible_point, RESULTS.diverged)
     result = choose(usable, RESULTS.not_converged, result)
     result = choose(posed & (solved <= 1), RESULTS.successful, result)
+    result = first_failure(problem.failure(states, controls), result)
     return problem.plan(
         states,
         controls,

@@ -91,6 +91,25 @@ def _draw(key: PRNGKey, correlation: Array, count: int, like: Array) -> Array:
     return jnp.concatenate([jnp.zeros((1, T, m), like.dtype), noise])
 
 
+@eqx.filter_custom_jvp
+def _cost_of(problem: Problem, controls: Float[Array, "T m"]) -> Float[Array, ""]:
+    """The cost of a sequence of controls. Where it is infinite, its derivative is zero,
+    because the sequence has no weight."""
+    return problem.roll_out(controls)[2]
+
+
+@_cost_of.def_jvp
+def _slope_of(primals, tangents):
+    (problem, controls), whole = primals, lambda p, u: p.roll_out(u)[2]
+    good = jnp.isfinite(whole(problem, controls))
+    # The tangents are masked, not only their result: in reverse mode the states of a
+    # sequence that diverged would make NaN of a zero.
+    masked = jax.tree.map(lambda t: jnp.where(good, t, 0), tangents)
+    cost, slope = eqx.filter_jvp(whole, primals, masked)
+    slope = jnp.zeros_like(cost) if slope is None else slope
+    return cost, jnp.where(good, slope, 0)
+
+
 @eqx.filter_jit
 def _search(
     planner: AbstractSampler, problem: Problem, start: Start, key: PRNGKey
@@ -99,7 +118,7 @@ def _search(
     if start.gains is not None or start.count > 1:
         controls = start.cheapest(problem)[2]
     T, m = controls.shape
-    cost_of = lambda controls: problem.roll_out(controls)[2]
+    cost_of = lambda controls: _cost_of(problem, controls)
 
     def better(best, *now):
         return jax.tree.map(lambda a, b: jnp.where(now[1] < best[1], a, b), now, best)

@@ -17,6 +17,7 @@ from .._check import (
 )
 from .._jax import quickly_compiled
 from .._module import parameter
+from .._results import first_failure
 from .._typing import PRNGKey
 from ..qp import Soft
 from ..qp._solve import as_scalar
@@ -265,6 +266,8 @@ def _solve(problem: Problem, start: Start, options: Options) -> Plan:
     at, gains = fields.pop("at"), fields.pop("gains")
     limits = limits_of(whole, start.horizon)
     fields["multipliers"] = multipliers_of(whole, limits, at)
+    steps = whole.failure(at.states, at.controls)
+    fields["result"] = first_failure(steps, fields["result"])
     cost = whole.total(at.states, at.controls)
     if carried is not None:
         values = carried.values(at.states[0, n:])

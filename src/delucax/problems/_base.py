@@ -8,12 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_count, check_instance, check_positive
+from .._check import bounds_field, check_count, check_instance, check_positive
 from .._module import parameter, replace, shown
 from .._typing import Real
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics, Discretized, open_loop
-from ..planning import AbstractPlanner, Constraints, Plan, Problem, SQP, Unknowns
+from ..planning import (
+    AbstractPlanner,
+    Constraints,
+    Plan,
+    Problem,
+    SoftConstraint,
+    SQP,
+    Unknowns,
+)
+from ..qp import Soft
 
 
 class Simulated(NamedTuple):
@@ -91,7 +100,7 @@ class OptimalControl(eqx.Module):
     controls: Float[Array, "T m"] = parameter()
     reference: float = eqx.field(static=True)
     states: Float[Array, "points n"] | None = parameter(None)
-    bounds: tuple[Any, Any] | None = None
+    bounds: tuple[Any, Any] | None = bounds_field("OptimalControl", default=None)
     constraints: Constraints | None = None
     unknowns: Unknowns | None = None
     is_maximised: bool = eqx.field(static=True, default=False)
@@ -190,27 +199,40 @@ def _fine(dynamics: Any, points: int, rtol: float) -> Any:
     )
 
 
+_FUNCTIONS = "inequality", "equality", "final_inequality", "final_equality"
+
+
 def _violation(
     solved: OptimalControl, fine: AbstractDynamics, states: Array, controls: Array
 ) -> Array:
     """The largest violation of a constraint along a simulation."""
     own, points = solved.constraints, (len(states) - 1) // len(controls)
     over = [jnp.zeros((), states.dtype)]
-    pairs = [(solved.bounds, controls)]
+    # For each pair of bounds: the values, and how often a row of bounds is repeated.
+    # The first row of the bounds of states does not count, because the start is given.
+    pairs: list[Any] = [(solved.bounds, controls, 1, 0)]
     if own is not None:
-        bounds = own.states
-        if bounds is not None and jnp.ndim(bounds[0]) == 2:
-            bounds = tuple(jnp.repeat(end, points, 0)[: len(states)] for end in bounds)
-        pairs += [(bounds, states), (own.controls, controls)]
-        problem = Problem(
-            fine, solved.cost, states[0], jnp.zeros_like(states[0, 0]), constraints=own
-        )
-        held = jnp.repeat(controls, points, axis=0)
-        for c, equal in problem.constraints_along(states, held):
-            over.append(jnp.max(jnp.where(equal, jnp.abs(c), c), initial=0))
-    for pair, values in pairs:
-        if pair is not None:
-            over += [jnp.max(pair[0] - values), jnp.max(values - pair[1])]
+        pairs += [(own.states, states, points, 1), (own.controls, controls, 1, 0)]
+        is_hard = lambda f: not isinstance(f, SoftConstraint)
+        hard = {
+            field: {n: f for n, f in own.named(field).items() if is_hard(f)} or None
+            for field in _FUNCTIONS
+        }
+        if any(hard.values()):
+            start, t0 = states[0], jnp.zeros_like(states[0, 0])
+            constraints = Constraints(**hard)
+            problem = Problem(fine, solved.cost, start, t0, constraints=constraints)
+            held = jnp.repeat(controls, points, axis=0)
+            for c, equal in problem.constraints_along(states, held):
+                over.append(jnp.max(jnp.where(equal, jnp.abs(c), c), initial=0))
+    for pair, values, times, first in pairs:
+        if pair is None or isinstance(pair, Soft):
+            continue
+        for sign, end in zip((-1, 1), map(jnp.asarray, pair), strict=True):
+            varies = end.ndim == 2
+            skipped = first * (times if varies else 1)
+            end = jnp.repeat(end, times, 0)[skipped : len(values)] if varies else end
+            over.append(jnp.max(sign * (values[skipped:] - end)))
     return jnp.max(jnp.stack(over))
 
 

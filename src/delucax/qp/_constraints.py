@@ -301,6 +301,7 @@ def common_horizon(
     horizon: Any,
     states: Any,
     controls: Any,
+    rows: Any,
     where: str,
 ) -> int:
     """The number of stages. All arrays with a time axis must have the same."""
@@ -319,9 +320,18 @@ def common_horizon(
             lengths[name] = len(array)
     if horizon is not None:
         lengths["horizon"] = check_count(horizon, "horizon", where)
-    for name, value, extra in (("states", states, 1), ("controls", controls, 0)):
-        for array in jax.tree.leaves(value):
-            if np.ndim(array) == 2:
+    ends: Any = ()
+    if rows is not None:
+        ends = rows.lower, rows.upper, rows.linear, rows.quadratic
+    for name, value, extra in (
+        ("states", states, 1),
+        ("controls", controls, 0),
+        ("rows", ends, 0),
+    ):
+        # A bound may be a list of lists.
+        is_pair = isinstance(value, tuple | list)
+        for array in value if is_pair else jax.tree.leaves(value):
+            if array is not None and np.ndim(array) == 2:
                 lengths[name] = np.shape(array)[0] - extra
     if not lengths:
         raise ValueError(
@@ -340,7 +350,7 @@ def check_stage_weights(given: dict[str, Array], where: str) -> None:
     parts = [given[name] for name in ("Q", "R", "S") if name in given]
     if all(map(is_concrete, parts)):
         Q, R, *cross = map(np.asarray, parts)
-        S = cross[0] if cross else np.zeros((Q.shape[-1], R.shape[-1]))
+        S = cross[0] if cross else np.zeros((Q.shape[-1], R.shape[-1]), Q.dtype)
         stages = np.broadcast_shapes(Q.shape[:-2], R.shape[:-2], S.shape[:-2])
         Q, S, R = (np.broadcast_to(M, (*stages, *M.shape[-2:])) for M in (Q, S, R))
         check_convex(

@@ -158,8 +158,10 @@ def evaluated(method: Method, at: Iterate) -> Residuals:
         left_x, Hx, form.q, pulled, pulled * D, Hx * D
     )
     missed, p_term, drift = _largest(left_p, form.f, reached * E)
+    # A bound that is far away, such as 1e6 for none, does not excuse another one.
+    near = jnp.where(violated != 0, sides.h, 0)
     violated, *z_terms, outward, product = _largest(
-        violated, row, sides.h, outward * R, slack
+        violated, row, near, outward * R, slack
     )
     left_t, support = t, push
     if method.is_soft:

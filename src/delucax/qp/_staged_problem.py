@@ -222,7 +222,7 @@ class Staged(eqx.Module):
         if rows is not None:
             sizes |= dict(C=(p, n), D=(p, m))
         self.horizon = T = common_horizon(
-            given, sizes, horizon, states, controls, where
+            given, sizes, horizon, states, controls, rows, where
         )
         for name in ("Q", "R", "final"):
             if name in given:
@@ -317,7 +317,9 @@ class Staged(eqx.Module):
 
     def hessians(self) -> list[Array]:
         """The matrices that must be semidefinite; a stack if they vary in time."""
-        S = jnp.zeros(self.B.shape[-2:]) if self.S is None else self.S
+        S = self.S
+        if S is None:
+            S = jnp.zeros(self.B.shape[-2:], self.Q.dtype)
         leading = jnp.broadcast_shapes(*(M.shape[:-2] for M in (self.Q, S, self.R)))
         full = lambda M: jnp.broadcast_to(M, (*leading, *M.shape[-2:]))
         Q, S, R = map(full, (self.Q, S, self.R))

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from .._extras import extra
 from .._jax import host_unless_traced, xp
 from .._module import shown
-from .._results import choose, INCIDENTS, Result, RESULTS
+from .._results import choose, first_failure, INCIDENTS, Result, RESULTS
 from .._typing import Array
 from ..dynamics import Events
 
@@ -258,12 +258,16 @@ class Trajectory(eqx.Module):
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
-        # A failure by incidents is dropped if none of these incidents is in the slice.
+        # A failure by incidents becomes the first of those in the slice, if any.
         result, is_end = self.result, stop == self.steps
+        by_incident, found = jnp.zeros((), bool), RESULTS.successful
         for name, kind in INCIDENTS.items():
             if incidents is not None and name in incidents:
-                elsewhere = (result == kind) & ~jnp.any(incidents[name])
-                result = choose(elsewhere, RESULTS.successful, result)
+                by_incident |= result == kind
+                here = choose(jnp.any(incidents[name]), kind, RESULTS.successful)
+                found = first_failure(found, here)
+        if found is not RESULTS.successful:
+            result = choose(by_incident, found, result)
         # The run has its final cost at its own end, which may be before the last row.
         has_end = (start < self.length) & (self.length <= stop)
         final_cost = jnp.where(has_end, self.final_cost, 0)

@@ -70,13 +70,16 @@ class AbstractSystemWrapper(AbstractSystem):
     state_names = _forwarded("state_names")
     control_names = _forwarded("control_names")
     disturbance_names = _forwarded("disturbance_names")
-    disturbance_size = _forwarded("disturbance_size")
-    noise = _forwarded("noise")
     angle_names = _forwarded("angle_names")
     state_units = _forwarded("state_units")
     control_units = _forwarded("control_units")
     time_unit = _forwarded("time_unit")
-    projects_state = _forwarded("projects_state")
+
+    @property
+    def projects_state(self) -> bool:
+        """Whether the class, or the wrapped system, overrides `project`."""
+        own = type(self).project is not AbstractSystemWrapper.project
+        return own or self.system.projects_state
 
     def observe(self, t: Time, x: State) -> Observation:
         return self.system.observe(t, x)
@@ -148,6 +151,14 @@ class Calibrated(AbstractSystemWrapper):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         u = self.control_scale * u + self.control_offset
         return self.system.vector_field(t, x, u, w)
+
+    def diffusion(self, t: Time, x: State, u: Control) -> Array | None:
+        u = self.control_scale * u + self.control_offset
+        return self.system.diffusion(t, x, u)
+
+    def equilibrium(self) -> tuple[State, Control]:
+        x, u = self.system.equilibrium()
+        return x, (u - self.control_offset) / self.control_scale
 
     def observe(self, t: Time, x: State) -> Observation:
         return self.output_scale * self.system.observe(t, x) + self.output_offset

@@ -159,9 +159,12 @@ class Adaptive(AbstractController):
     ) -> AdaptiveState:
         """The state with new weights, not normalised, and perhaps another choice."""
         old, alive = state.weights, state.weights > 0
-        # The loss of an empty slot may not be finite.
-        losses = jnp.where(alive, losses, 0)
-        played = old @ losses
+        # The loss of an empty slot may not be finite, nor that of an expert whose
+        # control would leave the domain of the cost.
+        usable = alive & jnp.isfinite(losses)
+        share = jnp.sum(jnp.where(usable, old, 0))
+        losses, known = jnp.where(usable, losses, 0), share > 0
+        played = jnp.where(known, old @ losses / jnp.where(known, share, 1), state.mean)
         # A plain mean at first, then an exponential one over about `every` steps.
         fading = 1 / jnp.minimum(state.step + 1, self.every).astype(old.dtype)
         mean = state.mean + fading * (played - state.mean)
@@ -169,6 +172,7 @@ class Adaptive(AbstractController):
         spread = jnp.sqrt(jnp.where(variance > 0, variance, 1))
         # Clipped, to bound the decrease of a weight in one step.
         excess = jnp.clip((losses - played) / spread, -1, 1)
+        excess = jnp.where(usable, excess, jnp.where(known, 1.0, 0.0))
         new = jnp.where(alive, old * jnp.exp(-self.rate * excess), 0)
         state = state._replace(mean=mean, variance=variance)
         if state.chosen is not None:

@@ -173,7 +173,9 @@ class BPC(AbstractController):
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         cost = cost.astype(state.level.dtype)
-        steps = state.steps + 1
+        # A cost that is not finite gives no update, and is forgotten.
+        finite = jnp.isfinite(cost)
+        steps = state.steps + finite
         # There is no mean to compare the first cost with.
         off = jnp.where(state.steps > 0, cost - state.level, 0)
         size = state.theta.size
@@ -183,6 +185,8 @@ class BPC(AbstractController):
         gradient = size / self.delta * off * jnp.sum(state.tried, axis=0)
         return projected_step(self, gradient.astype(state.theta.dtype), state)._replace(
             loop=self.loop.applied(u, cost, state.loop),
-            level=state.level + (cost - state.level) / steps,
-            steps=steps,
+            level=jnp.where(
+                finite, state.level + (cost - state.level) / steps, state.level
+            ),
+            steps=steps.astype(state.steps.dtype),
         )

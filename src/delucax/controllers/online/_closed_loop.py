@@ -128,7 +128,9 @@ class ClosedLoop(eqx.Module):
         self.observed = dynamics.observes_state
         self.nature = not self.observed if nature is None else nature
         is_lti = isinstance(dynamics, LinearDynamics) and not dynamics.is_time_varying
-        is_constant = is_lti and isinstance(base, _AFFINE)
+        # Over a finite horizon the gain of H-infinity control varies.
+        varies = isinstance(base, HInfinity) and base.K.ndim > 2
+        is_constant = is_lti and isinstance(base, _AFFINE) and not varies
         if not is_constant and not self.observed:
             raise ValueError(
                 f"{where}: if the state is not observed, dynamics must be linear and "
@@ -396,8 +398,11 @@ def _tangents_along(dynamics, base, x, u) -> Tangents:
     """The derivatives at one point, or at one point for each time."""
 
     def at(t, x, u):
-        state = base.init(key=None)
-        u_base, _ = base(t, dynamics.observe(t, x), state)
+        # After a step, because the first one of a PID has no derivative of the error.
+        y = dynamics.observe(t, x)
+        u_base, state = base(t, y, base.init(key=None))
+        state = base.applied(u_base, jnp.zeros((), x.dtype), state)
+        u_base, _ = base(t, y, state)
         return _tangents(dynamics, base, t, x, state, u - u_base)
 
     if x.ndim == 1:

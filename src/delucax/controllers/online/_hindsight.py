@@ -218,15 +218,17 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
         left = predicted / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
         # A negative predicted decrease is rounding.
-        left = jnp.where((k > 0) & (predicted >= 0), left, jnp.inf)
+        is_known = (k > 0) & jnp.isfinite(cost)
+        left = jnp.where(is_known & (predicted >= 0), left, jnp.inf)
         # With less damping, rounding would move weights without an effect on the cost.
         damping = pick(jnp.maximum(damping / 10, least), damping * 10)
         local = jax.tree.map(pick, tried, local)
         return pick(best + change, best), local, damping, left, k + 1
 
     def unfinished(carry):
-        *_, left, k = carry
-        return (k <= iterations) & ~(left <= tolerance)
+        _, (cost, *_), _, left, k = carry
+        goes_on = (k == 0) | jnp.isfinite(cost)
+        return (k <= iterations) & goes_on & ~(left <= tolerance)
 
     eye = jnp.eye(len(start), dtype=start.dtype)
     least = jnp.finfo(start.dtype).eps ** 0.75
@@ -234,7 +236,8 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
     infinite = jnp.asarray(jnp.inf, start.dtype)
     unknown = infinite, jnp.zeros_like(start), 0 * eye
     carry = start, unknown, 100 * least, infinite, 0
-    theta, _, _, left, k = lax.while_loop(unfinished, step, carry)
+    theta, (cost, *_), _, left, k = lax.while_loop(unfinished, step, carry)
     best, trajectory = run(theta, ("states", "controls", "costs", "disturbances"))
     result = choose(left <= tolerance, RESULTS.successful, RESULTS.not_converged)
+    result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
     return Hindsight(best, trajectory, left, jnp.asarray(k - 1), result)

@@ -93,9 +93,9 @@ def make(
 def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
     """The entry point of all ids. The time limit of Gymnasium ends the episodes.
 
-    Some tasks end at their own horizon instead: tasks with an explicit horizon; tasks
-    with disturbances or noise, because these are drawn for the whole horizon; and tasks
-    with an explicit cost that has a final cost.
+    Some tasks end at their own horizon too, if it comes first: tasks with an explicit
+    horizon; tasks with disturbances or noise, because these are drawn for the whole
+    horizon; and tasks with an explicit cost that has a final cost.
     """
     options = "discrete", "render_mode", "backend"
     own = {name: kwargs.pop(name) for name in options if name in kwargs}

@@ -183,6 +183,10 @@ def bootstrap(
     unknown = len(fitted.names) + begins * x0.shape[-1]
     total = sum(map(len, records)) * outputs[0].shape[1]
     residuals = residuals * np.sqrt(total / max(total - unknown, 1))
+    # A block is within one record.
+    ends = np.cumsum([len(y) for y in outputs])
+    last = np.repeat(ends, np.diff(ends, prepend=0)) - block
+    possible = jnp.asarray(np.flatnonzero(np.arange(ends[-1]) <= last))
     options: Any = dict(x0=x0, window=window, burn_in=fitted.burn_in)
     options |= dict(max_steps=max_steps, throw=False)
 
@@ -191,7 +195,7 @@ def bootstrap(
         keys = jr.split(key, len(records))
         for own, given, y in zip(keys, records, outputs, strict=True):
             count = -(-len(given) // block)
-            begins = jr.randint(own, (count,), 0, len(residuals) - block + 1)
+            begins = possible[jr.randint(own, (count,), 0, len(possible))]
             at = (begins[:, None] + jnp.arange(block)).ravel()[: len(given)]
             y = y + residuals[at]
             made.append(
