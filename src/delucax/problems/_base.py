@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import bounds_field, check_count, check_instance, check_positive
+from .._check import check_count, check_instance, check_positive
 from .._module import parameter, replace, shown
 from .._typing import Real
 from ..costs import AbstractCost
@@ -100,7 +100,7 @@ class OptimalControl(eqx.Module):
     controls: Float[Array, "T m"] = parameter()
     reference: float = eqx.field(static=True)
     states: Float[Array, "points n"] | None = parameter(None)
-    bounds: tuple[Any, Any] | None = bounds_field("OptimalControl", default=None)
+    bounds: tuple[Any, Any] | None = None
     constraints: Constraints | None = None
     unknowns: Unknowns | None = None
     is_maximised: bool = eqx.field(static=True, default=False)
