@@ -17,8 +17,7 @@ def quantile(values: Any, shares: Any) -> Any:
     infinity times zero, or the difference of two infinities, and gives NaN."""
     with np.errstate(invalid="ignore"):
         between = np.quantile(values, shares)
-    ends = (np.quantile(values, shares, method=end) for end in ("lower", "higher"))
-    low, high = ends
+    low, high = (np.quantile(values, shares, method=end) for end in ("lower", "higher"))
     return np.where(low == high, low, between)
 
 

@@ -260,14 +260,14 @@ class Trajectory(eqx.Module):
         costs, incidents = steps(self.costs), steps(self.incidents)
         # A failure by incidents becomes the first of those in the slice, if any.
         result, is_end = self.result, stop == self.steps
-        by_incident, found = jnp.zeros((), bool), RESULTS.successful
+        by_incident, first = jnp.zeros((), bool), RESULTS.successful
         for name, kind in INCIDENTS.items():
             if incidents is not None and name in incidents:
                 by_incident |= result == kind
                 here = choose(jnp.any(incidents[name]), kind, RESULTS.successful)
-                found = first_failure(found, here)
-        if found is not RESULTS.successful:
-            result = choose(by_incident, found, result)
+                first = first_failure(first, here)
+        if first is not RESULTS.successful:
+            result = choose(by_incident, first, result)
         # The run has its final cost at its own end, which may be before the last row.
         has_end = (start < self.length) & (self.length <= stop)
         final_cost = jnp.where(has_end, self.final_cost, 0)
