@@ -380,6 +380,23 @@ def test_without_time_for_a_comparison_there_is_more_for_the_training(monkeypatc
     assert not search.budget.may_train
 
 
+def test_derivatives_are_expected_to_take_longer_than_evolution(monkeypatch):
+    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    line = known("network", dlx.controllers.Zero(1), 1.0)
+    monkeypatch.setattr(PolicySearch, "trained", lambda *_: line.policy)
+    search.attempt(line, "evolution")
+    search.budget.longest = 2.0
+    monkeypatch.setattr(Budget, "spent", 7.9)
+    # A gradient would take until 10.9 s, and a plan until 13.9 s.
+    assert search.may_begin(line, "gradient")
+    assert not search.budget.may_compare("plan", 7.9)
+    monkeypatch.setattr(Budget, "spent", 8.1)
+    assert not search.may_begin(line, "gradient")
+    search.attempt(line, "gradient")
+    search.budget.longest = 2.0
+    assert search.budget.may_compare("plan", 7.9)
+
+
 @pytest.mark.parametrize(
     ("task", "cost", "first"),
     [

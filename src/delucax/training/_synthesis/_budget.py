@@ -11,6 +11,10 @@ _TRAINING, _ALONE, _CHOOSING = 0.7, 0.9, 0.05
 # is expected to take so many times as long as the longest step so far, because plans,
 # and MPC even more, take longer to compile than a training.
 _OVERRUN, _LONGER = 1.1, {"MPC": 2.0, "plan": 1.5}
+# Derivatives compile longer than a rollout alone. So before the first derivative (with
+# events evolution comes first) a gradient is expected to take so many times as long as
+# the longest step, and a comparison so many times as long as above.
+_GRADIENT, _DERIVATIVES = 1.5, 2.0
 
 
 class Budget:
@@ -22,6 +26,8 @@ class Budget:
         self.total, self.began = total, time.perf_counter()
         # The longest step so far: a first round, which compiles, or a comparison.
         self.longest = 0.0
+        # Whether one of these steps compiled a derivative.
+        self.differentiated = False
 
     @property
     def spent(self) -> float:
@@ -38,9 +44,10 @@ class Budget:
         """Whether not even a comparison may go on."""
         return self.spent > _OVERRUN * self.total
 
-    def add_step(self, seconds: float) -> None:
-        """Tell how long a step took."""
+    def add_step(self, seconds: float, differentiates: bool) -> None:
+        """Tell how long a step took, and whether its program has a derivative."""
         self.longest = max(self.longest, seconds)
+        self.differentiated |= differentiates
 
     @property
     def training_ends(self) -> float:
@@ -60,11 +67,13 @@ class Budget:
         """Whether there is time to train."""
         return self.spent < self.training_ends
 
-    @property
-    def may_compile(self) -> bool:
+    def may_compile(self, differentiates: bool) -> bool:
         """Whether there is time to train by a program that is not compiled yet."""
-        return self.may_train and self.spent + self.longest < self.total
+        first = differentiates and not self.differentiated
+        factor, ends = (_GRADIENT, _OVERRUN) if first else (1.0, 1.0)
+        return self.may_train and self.spent + factor * self.longest < ends * self.total
 
     def may_compare(self, name: str, at: float) -> bool:
         """Whether there is time for a comparison with this controller from then on."""
-        return at + self.longest * _LONGER[name] < _OVERRUN * self.total
+        factor = _LONGER[name] * (1.0 if self.differentiated else _DERIVATIVES)
+        return at + factor * self.longest < _OVERRUN * self.total

@@ -131,7 +131,7 @@ class PolicySearch:
         """Whether there is time to train a candidate with a method."""
         if _program(candidate, method) in self.compiled:
             return self.budget.may_train
-        return self.budget.may_compile
+        return self.budget.may_compile(method != _EVOLUTION)
 
     @property
     def choice_keys(self) -> Array:
@@ -197,7 +197,7 @@ class PolicySearch:
                 return
         self.refine(candidates)
         self.ended = "no training lowered the cost any more"
-        if not self.budget.may_compile:
+        if not self.budget.may_compile(differentiates=False):
             self.ended = "the time was over"
 
     def refine(self, candidates: list[Candidate]) -> None:
@@ -300,7 +300,7 @@ class PolicySearch:
             parts.append(np.asarray(costs, float))
             self.show()
         # The next comparison may take as long.
-        self.budget.add_step(self.budget.spent - began)
+        self.budget.add_step(self.budget.spent - began, differentiates=True)
         return np.concatenate(parts)
 
     def trained(self, candidate: Candidate, method: str) -> AbstractController:
@@ -362,7 +362,8 @@ class PolicySearch:
             after = best._replace(method=method, policy=policy, costs=costs)
             if not ends:
                 # The first round compiles.
-                self.budget.add_step(self.budget.spent - began)
+                took = self.budget.spent - began
+                self.budget.add_step(took, method != _EVOLUTION)
                 self.compiled.add(_program(candidate, method))
                 ends = self.budget.spent + _ATTEMPT * self.budget.total
             least = min(least, self.mean(after))
