@@ -361,21 +361,28 @@ def check_vector(value: Any, name: str, where: str) -> None:
 
 
 def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
-    """Raise unless `R` is positive definite, or semidefinite if `definite` is false.
-    Traced matrices are skipped."""
+    """Raise unless `R`, or each matrix of a stack, is positive definite, or
+    semidefinite if `definite` is false. Traced matrices are skipped."""
     if not is_concrete(R):
         return
-    array = np.asarray(R)
-    least, *_ = eigenvalues = np.linalg.eigvalsh(array)
+    arrays = scaled = np.asarray(R).reshape(-1, *np.shape(R)[-2:])
+    if definite:
+        # In units in which the diagonal is 1, because entries have different units.
+        diagonal = np.diagonal(arrays, axis1=1, axis2=2)
+        by = np.sqrt(np.where(diagonal > 0, diagonal, 1))
+        scaled = arrays / by[:, :, None] / by[:, None, :]
+    eigenvalues = np.linalg.eigvalsh(scaled)
     # The computed eigenvalues of a symmetric matrix are off by a few eps times the
     # largest (Weyl). For a semidefinite product C'C the error grows with its rows.
-    rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
-    slack = -rounding if definite else 100 * len(array) * rounding
-    if least < -slack or definite and least <= 0:
-        kind = "definite" if definite else "semidefinite"
+    rounding = np.finfo(arrays.dtype).eps * np.max(np.abs(eigenvalues), axis=1)
+    least, n = eigenvalues[:, 0], arrays.shape[-1]
+    slack = -rounding if definite else 100 * n * rounding
+    bad = (least < -slack) | (definite & (least <= 0))
+    if np.any(bad):
+        kind, array = "definite" if definite else "semidefinite", arrays[bad.argmax()]
         raise ValueError(
             f"{where}: {name} must be positive {kind}, got {array}, whose least "
-            f"eigenvalue is {least:.3g}."
+            f"eigenvalue is {np.linalg.eigvalsh(array)[0]:.3g}."
         )
 
 

@@ -124,5 +124,7 @@ def test_an_unstable_lane_harms_no_other():
 def test_bad_horizons():
     with user_error(match="horizon must be positive and finite, got 0"):
         an.controllability_gramian(LinearSystem(A, B), 0.0)
+    with user_error(match="horizon must be a number, got shape"):
+        an.controllability_gramian(LinearSystem(A, B), [1.0, 2.0])
     with user_error(match="horizon must be a whole number of at least 1, got 2.5"):
         an.observability_gramian(dlx.LinearDynamics(A_STEP, B), 2.5)

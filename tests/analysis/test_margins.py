@@ -203,6 +203,26 @@ def test_gradients_are_central_differences_beside_an_unstable_loop():
     assert np.all(np.isfinite(slopes[7]))
 
 
+@pytest.mark.parametrize(
+    ("A", "B", "C", "phase"),
+    [
+        # k / (s - 1), with a gain margin at zero: the phase margin is acos(1 / k).
+        ([[1.0]], [[1.0]], lambda k: [[k]], np.arccos),
+        # (k s + 2) / (s^2 + 1), with a pole at 1 and without a gain margin.
+        ([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], lambda k: [[2.0, k]], None),
+    ],
+)
+def test_gradients_beside_a_margin_at_zero_or_without_one(A, B, C, phase):
+    def margin(k):
+        loop = LinearSystem(jnp.array(A), jnp.array(B), C=jnp.array(C(k)))
+        return an.margins(loop, throw=False).phase_margin
+
+    if phase is not None:
+        assert_close(margin(2.0), phase(1 / 2.0), rtol=1e-9)
+    slope = (margin(2.0 + 1e-5) - margin(2.0 - 1e-5)) / 2e-5
+    assert_close(jax.grad(margin)(2.0), slope, rtol=1e-6)
+
+
 def test_disk_margins_of_several_channels():
     # A loop that is fragile only if both gains change at once (Seiler et al., 2020).
     A = jnp.array([[0.0, 10.0], [-10.0, 0.0]])
@@ -235,6 +255,8 @@ def test_bad_loops_are_refused():
         an.margins(two)
     with user_error(match="as many outputs as controls, got 2 and 1"):
         an.disk_margin(LinearSystem(-jnp.eye(2), jnp.ones((2, 1))))
+    with user_error(match="skew must be a number"):
+        an.disk_margin(two, [0.0, 1.0])
     with user_error(match="channel must be at most 1"):
         an.disk_margin(two, channel=2)
     with user_error(match="margins: model must be a LinearSystem"):

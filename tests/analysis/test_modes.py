@@ -80,6 +80,12 @@ def test_a_stable_model_has_no_worst_unstable_mode():
     )
 
 
+@pytest.mark.parametrize("A", [np.eye(2), np.diag([1.0, 0.5]), np.full((2, 2), 0.5)])
+def test_a_mode_on_the_boundary_is_not_stable(A):
+    steps = dlx.LinearDynamics(A, np.zeros((2, 1)))
+    assert not an.is_stabilizable(steps)
+
+
 def test_a_defective_mode_is_found_though_it_is_known_to_half_the_digits():
     # A chain of two at 0.5 that the input reaches, and one more that it does not.
     A = np.diag([0.5, 0.5, 0.5, -1.0]) + np.diag([1.0, 0, 0], 1)

@@ -179,11 +179,15 @@ def test_of_nan_the_norms_are_nan():
         model = LinearSystem(-a * jnp.eye(1), b * jnp.eye(1))
         peak = an.hinf_norm(model, throw=False)
         ill_posed = peak.result == dlx.RESULTS.ill_posed
-        return jnp.stack([an.h2_norm(model), peak.gain]), ill_posed
+        gramian = an.controllability_gramian(model, throw=False)[0, 0]
+        still = an.dcgain(model, throw=False)[0, 0]
+        turning = jnp.abs(an.frequency_response(model, 0.0)[0, 0])
+        others = gramian, still, turning
+        return jnp.stack([an.h2_norm(model), peak.gain, *others]), ill_posed
 
     found, ill_posed = norms(np.array([2, np.nan, 2]), np.array([1, 1, np.nan]))
-    nan = np.full(2, np.nan)
-    assert_close(found, [[0.5, 0.5], nan, nan], rtol=1e-6)
+    nan = np.full(5, np.nan)
+    assert_close(found, [[0.5, 0.5, 0.25, 0.5, 0.5], nan, nan], rtol=1e-6)
     np.testing.assert_array_equal(ill_posed, [False, True, True])
 
 

@@ -89,6 +89,12 @@ def test_angles_wrap():
     assert_close(controller(0.0, far, None)[0], u, rtol=1e-4)
 
 
+def test_a_disturbance_without_effect():
+    law = HInfinity(dlx.LinearDynamics(A, B, E=np.zeros((2, 1))), Q, R)
+    assert law.gamma == 0
+    assert_close(law.K, dlx.riccati.dare(A, B, Q, R).K, atol=1e-5)
+
+
 def test_no_controller():
     with pytest.raises(RuntimeError, match="gamma is below the smallest level"):
         HInfinity(dlx.LinearDynamics(A, B), Q, R, gamma=2.9)

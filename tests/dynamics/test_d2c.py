@@ -145,6 +145,14 @@ def test_the_trapezoidal_rule_gives_no_minus_one():
         dlx.d2c(dynamics, "tustin")
 
 
+def test_the_trapezoidal_rule_fails_at_a_rounded_eigenvalue():
+    T = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    A = T @ np.diag([40.0, -1.0, -2.0]) @ T.T
+    system = dlx.systems.LinearSystem(A, np.ones((3, 1)))
+    with user_error(RuntimeError, match="eigenvalue"):
+        dlx.c2d(system, 0.05, "tustin")
+
+
 def test_bad_arguments_of_d2c():
     A, B = jnp.eye(2), jnp.ones((2, 1))
     with user_error(match="d2c: dynamics must be a LinearDynamics"):

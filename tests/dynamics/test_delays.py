@@ -142,6 +142,23 @@ def test_derivatives_with_respect_to_a_delay(kind):
         assert_close(jax.grad(cost)(tau), right, rtol=1e-5)
 
 
+@pytest.mark.parametrize("tau", [0.0, H])
+@needs_x64
+def test_derivatives_with_respect_to_a_whole_delay_with_adaptive_steps(tau):
+    """Diffrax takes no step in a part without length."""
+    steps = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+    options = dict(solver=diffrax.Tsit5(), stepsize_controller=steps)
+    plant = dlx.Discretized(Spring(), dt=H, **options)
+
+    def end(tau):
+        delayed = dlx.dynamics.TransportDelay(plant, controls=tau, control_memory=2)
+        x = delayed.filled(START, np.ones(1))
+        return dlx.open_loop(delayed, x, CONTROLS[:4])[-1, 0]
+
+    right = (end(tau + 1e-5) - end(tau)) / 1e-5
+    assert_close(jax.grad(end)(tau), right, rtol=1e-4)
+
+
 def test_a_delay_beyond_the_memory_has_a_status():
     delayed = late({"controls": 0.05}, control_memory=2)
     x = delayed.filled(START)
@@ -246,6 +263,18 @@ def test_a_delay_of_many_steps():
         assert steps.memory == round(100 * tau)
         _, result = steps.advance(0.0, steps.filled([1.0]), jnp.zeros(1), None)
         assert bool(result == dlx.RESULTS.successful)
+
+
+def test_room_for_longer_delays_changes_nothing():
+    """The state jumps where a disturbance is added, at the ends of old steps."""
+    w = jnp.array([[1.0], [0.0], [0.0], [-2.0], [0.0], [0.0]])
+
+    def run(memory):
+        steps = dlx.dynamics.MethodOfSteps(Lag(delays=[0.2]), dt=H, memory=memory)
+        x = steps.filled([1.0])
+        return dlx.open_loop(steps, x, jnp.zeros((6, 1)), w)[:, 0]
+
+    assert_close(run(4), run(2), atol=tolerance(1e-6, 1e-14))
 
 
 def test_a_given_past():

@@ -78,6 +78,22 @@ def test_linearize_is_central_differences():
     assert model.state_names == ("angle", "velocity")
 
 
+def test_a_diffusion_is_not_an_input_of_a_linearised_system():
+    class Drifting(dlx.AbstractSystem):
+        state_names, control_names, disturbance_names = ("x",), ("u",), ("noise",)
+
+        def vector_field(self, t, x, u, w):
+            return u - x
+
+        def diffusion(self, t, x, u):
+            return jnp.ones((1, 1))
+
+    at = dict(x=[0.0], u=[0.0])
+    assert dlx.linearize(Drifting(), **at).E is None
+    steps = dlx.linearize(dlx.Discretized(Drifting(), dt=0.1), **at)
+    assert_close(steps.E, [[0.95]], atol=0.06)
+
+
 def test_linearize_keeps_the_operating_point():
     system = dlx.systems.Pendulum()
     model = dlx.linearize(system)

@@ -25,6 +25,16 @@ def of_another_kind():
     return dlx.make("tests/system")
 
 
+class Rubbing(dlx.systems.Pendulum):
+    def vector_field(self, t, x, u, w):
+        return super().vector_field(t, x, u - x[1:], w)
+
+
+class Drifting(dlx.systems.CartPole):
+    def diffusion(self, t, x, u):
+        return jnp.ones((4, 1))
+
+
 BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
 
 
@@ -63,6 +73,21 @@ BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
             r"lds: no argument is called 'horizn'; did you mean 'horizon'\?",
         ),
         (of_another_kind, "'tests/system' must return an Environment, got Pendulum"),
+        (
+            lambda: dlx.make("pendulum", system=Rubbing()),
+            "GymPendulum: system must not have a vector_field of its own.*solver",
+        ),
+        (
+            lambda: dlx.make("cartpole", system=Drifting()),
+            "GymCartPole: system must not have a diffusion, which Gym's integrator",
+        ),
+        (
+            lambda: dlx.replace(
+                dlx.make("pendulum"), {"dynamics.system": dlx.systems.VanDerPol()}
+            ),
+            "system must be a Pendulum, got VanDerPol",
+        ),
+        (lambda: dlx.systems.TwoTank().equilibrium(-5.0), "level must be .*got -5"),
         (lambda: dlx.make("pendulum", dt="0.1"), "dt must be positive.*got '0.1'"),
         (lambda: dlx.make("pendulum", dt=jnp.ones(2)), r"dt must be a number.*\(2,\)"),
     ],
@@ -113,6 +138,24 @@ def test_numbers_of_tasks(task):
         for bad in ("a", np.nan):
             with user_error(match=f"{name} must be .*, got '?{bad}"):
                 dlx.make(task, **{name: bad})
+
+
+def test_limits_may_be_lists():
+    made = dlx.make("permanent_magnet_motor", max_voltage=[150, 100])
+    np.testing.assert_array_equal(made.control_bounds[0], [-150, -100])
+
+
+def test_an_action_that_is_not_in_the_table_fails_the_rollout(key):
+    class Constant(dlx.AbstractController):
+        action: jax.Array
+
+        def __call__(self, t, y, state):
+            return self.action, state
+
+    task = dlx.make("cartpole", horizon=3)
+    for action in (-1, 2):
+        law = Constant(jnp.array(action))
+        assert dlx.rollout(task, law, key=key, throw=False).failed
 
 
 def test_a_goal_is_one_number():

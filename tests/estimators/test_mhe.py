@@ -259,6 +259,30 @@ def test_a_parameter_that_drifts_is_followed():
 
 
 @needs_x64
+def test_parameters_keep_their_names_in_any_order():
+    """JAX sorts the keys of a dictionary where a module enters a program."""
+    names = "system.length", "system.gravity"
+    start, ys = np.array([0.1, 0.0]), np.tile([0.1, 0.0], (4, 1))
+    walks = {
+        name: c.RandomWalk(variance, step=0.0)
+        for name, variance in zip(names, (1e-4, 4e-4), strict=True)
+    }
+    given = swinging(1.2), 1e-8 * np.eye(2), 1e-4 * np.eye(2), 3
+    mhe = c.MHE(*given, mean=start, parameters=walks)
+    state = mhe.init()
+    for k in range(2):
+        state = eqx.filter_jit(mhe.update)(jnp.asarray(0.05 * k), ys[k], state)
+        state = eqx.filter_jit(mhe.predict)(jnp.asarray(0.05 * k), jnp.zeros(1), state)
+    found = c.run_estimator(mhe, ys, np.zeros((4, 1)))
+    last = jax.tree.map(lambda a: a[-1], found.states)
+    for beliefs in (mhe.estimated_parameters(state), mhe.estimated_parameters(last)):
+        assert_close(beliefs["system.length"].mean, [1.2], atol=0.1)
+        assert_close(beliefs["system.gravity"].mean, [9.81], rtol=0.1)
+        assert_close(beliefs["system.length"].covariance, [[1e-4]], rtol=0.2)
+        assert_close(beliefs["system.gravity"].covariance, [[4e-4]], rtol=0.2)
+
+
+@needs_x64
 def test_outliers():
     """Every tenth reading is wrong by 30 standard deviations."""
     dynamics = dlx.LinearDynamics(

@@ -61,7 +61,7 @@ def test_additive_disturbances_are_inputs_one_a_state():
 
 def test_a_chosen_order_of_disturbances_is_kept():
     system = control.ss(A, np.array([[1.0, 2, 3], [4, 5, 6]]), C, 0)
-    model = from_control(system, disturbances=("u[2]", 0))
+    model = from_control(system, disturbances=("u[2]", np.int64(0)))
     assert_close(model.E, [[3, 1], [6, 4]])
     assert_close(model.B, [[2], [5]])
     assert model.control_names == ("u[1]",)

@@ -4,6 +4,7 @@ import control
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse
 from helpers import assert_close, once, user_error
 from scipy.io import savemat
 
@@ -62,6 +63,10 @@ def test_files_that_do_not_fit(written, tmp_path):
     for name in ("none.npz", "none.mat"):
         with user_error(FileNotFoundError, match=f"path must be a file, got .*{name}"):
             read_linear(tmp_path / name)
+    with user_error(match="A must be real, but is complex in the file"):
+        read_linear(written(A=np.diag([1j, -1j]), B=B, dt=1.0))
+    savemat(tmp_path / "sparse.mat", {"A": scipy.sparse.csc_matrix(A), "B": B})
+    assert_close(read_linear(tmp_path / "sparse.mat", dt=0).A, A)
     with user_error(match="read_linear: path must be the path of a file, got 3"):
         read_linear(3)
 

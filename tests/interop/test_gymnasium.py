@@ -361,6 +361,10 @@ def test_vector_starts_with_a_seed_or_a_state_each():
             lambda e: interop.make_vector("pendulum", 2, max_episode_steps=0),
             "max_episode_steps must be a whole number of at least 1",
         ),
+        (
+            lambda e: interop.make_vector("pendulum", 2, max_episode_steps=-1),
+            "max_episode_steps must be positive, got -1",
+        ),
     ],
 )
 def test_bad_input_of_many(call, match):
@@ -434,3 +438,41 @@ def test_a_step_as_stable_baselines3_tells_of_it():
     assert ends[0]["TimeLimit.truncated"] is True
     assert ends[1]["TimeLimit.truncated"] is False
     assert np.abs(ends[1]["terminal_observation"][2]) > 0.2
+
+
+@once
+def test_a_plant_that_moves_on_moves_in_its_pictures():
+    made = interop.make("drift", render_mode="rgb_array")
+    made.reset(seed=0)
+    frames = [made.render()]
+    for _ in range(5):
+        made.step(np.zeros(2))
+    frames.append(made.render())
+    assert_close(made._picture.times, [0.0, 5 * made.environment.dt], rtol=1e-6)
+    assert np.any(frames[0] != frames[1])
+    made.reset(seed=0)
+    made.render()
+    assert made._picture.times == [0.0]
+
+
+class Layered(dlx.AbstractSystem):
+    """With a list of layers, which has no hash."""
+
+    state_names, control_names = ("x",), ("u",)
+    layers: list
+
+    def vector_field(self, t, x, u, w):
+        for layer in self.layers:
+            x = layer * x
+        return u - x
+
+
+@once
+def test_a_plant_with_a_list_is_adapted():
+    plant = dlx.Discretized(Layered([jnp.ones(1), 2 * jnp.ones(1)]), dt=0.1)
+    made = interop.GymnasiumEnv(
+        dlx.Environment(plant, dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1)), [1.0])
+    )
+    made.reset(seed=0)
+    observation, *_ = made.step(np.zeros(1))
+    assert 0.8 < observation[0] < 0.9

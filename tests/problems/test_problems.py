@@ -91,6 +91,16 @@ def test_steps_of_several_lengths():
     assert_close(fine.dt, 1.0)
     alone = dlx.open_loop(sampled, states[0], jnp.zeros((3, 1)))
     assert_close(halves[::2], alone, rtol=1e-4)
+    # There is no step after the last one.
+    beyond = dlx.open_loop(sampled, states[0], jnp.zeros((4, 1)), throw=False)
+    assert np.all(np.isnan(beyond[4])) and np.all(np.isfinite(beyond[:4]))
+    with user_error(match="Sampled: widths must be positive"):
+        dlx.problems.Sampled(inner, jnp.array([0.1, -0.1]))
+    linear = dlx.linearize(inner)
+    quadratic = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1))
+    other = dlx.problems.OptimalControl(linear, quadratic, x, jnp.zeros((3, 1)), 0.0)
+    with user_error(match="simulate: dynamics must be a delucax.Discretized"):
+        other.simulate(other.solve(throw=False))
 
 
 @once

@@ -88,6 +88,15 @@ def test_least_energy():
     assert_close(moved, [-2, -1.5], rtol=tolerance(1e-5, 1e-12))
 
 
+def test_weights_of_controls_in_different_units():
+    R = np.array([1.0, 1e-8], dtype())
+    eye = np.eye(2, dtype=dtype())
+    solution = dlx.riccati.care(-eye, eye, eye, np.diag(R))
+    # Each entry for itself: X^2 / r + 2 X = 1.
+    expected = R * (np.sqrt(1 + 1 / R) - 1)
+    assert_close(np.diag(solution.X), expected, rtol=tolerance(1e-4, 1e-11))
+
+
 def test_compiled_and_where_it_cannot_be_seen():
     data = [np.asarray(M, dtype()) for M in (A, B, Q, R)]
     solve, ill_posed = compiled, dlx.RESULTS.ill_posed

@@ -133,6 +133,9 @@ def test_no_solution():
         stuck = np.diag([unstable, -0.5])
         lost = solve(stuck, B, None, Q, R, throw=False)
         assert lost.result == dlx.RESULTS.not_stabilising
+        assert lost.gamma == np.inf
+    with user_error(match="hinf_dre: Q must be positive semidefinite"):
+        hinf_dre(A, B, None, np.diag([2.0, -3.0]), R, horizon=2)
 
 
 T = 60

@@ -261,6 +261,11 @@ def test_one_solve_counts_too(key):
         pendulum, Cautious("failed_plan"), 0.0, 1.0, UPRIGHT, ts=ts, **options
     )
     assert some.result == dlx.RESULTS.plan_failed and not some.failed
+    # The first call of the controller is after the first save.
+    given = Cautious("failed_plan"), 0.0, 1.0, jnp.array([0.1, 3.0])
+    hurried = dlx.simulate(pendulum, *given, ts=ts, **options)
+    assert hurried.incidents["failed_plan"][0]
+    assert_close(hurried.incident_times["failed_plan"], 0.0)
 
     @jax.jit
     @jax.grad

@@ -183,3 +183,19 @@ def test_a_wrapper_may_override_each_hook():
     assert turned.projects_state and not plain.projects_state
     assert Wrapper(noisy).noise == "brownian" and Wrapper(turned).projects_state
     assert dlx.Discretized(noisy, 0.05).increments == 1
+
+
+@once
+def test_names_may_be_a_list(key):
+    plant = dlx.systems.FunctionSystem(lambda t, x, u, w: u - x, ["x"], ["u"])
+    steps = dlx.Discretized(plant, dt=0.1)
+    run = dlx.open_loop(steps, jnp.ones(1), jnp.zeros((2, 1)))
+    assert_close(run[-1], [np.exp(-0.2)], rtol=1e-5)
+
+    class Listed(Spring):
+        state_names = ["x", "v"]  # noqa: RUF012
+
+    cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1))
+    env = dlx.Environment(dlx.Discretized(Listed(), dt=0.1), cost, horizon=3)
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=[1.0, 0.0])
+    assert jax.jit(lambda run: run.total_cost)(run) == run.total_cost

@@ -386,15 +386,15 @@ def test_derivatives_are_expected_to_take_longer_than_evolution(monkeypatch):
     monkeypatch.setattr(PolicySearch, "trained", lambda *_: line.policy)
     search.attempt(line, "evolution")
     search.budget.longest = 2.0
-    monkeypatch.setattr(Budget, "spent", 7.9)
-    # A gradient would take until 10.9 s, and a plan until 13.9 s.
+    monkeypatch.setattr(Budget, "spent", 6.9)
+    # A gradient would take until 9.9 s, and a plan until 12.9 s.
     assert search.may_begin(line, "gradient")
-    assert not search.budget.may_compare("plan", 7.9)
-    monkeypatch.setattr(Budget, "spent", 8.1)
+    assert not search.budget.may_compare("plan", 6.9)
+    monkeypatch.setattr(Budget, "spent", 7.1)
     assert not search.may_begin(line, "gradient")
     search.attempt(line, "gradient")
     search.budget.longest = 2.0
-    assert search.budget.may_compare("plan", 7.9)
+    assert search.budget.may_compare("plan", 6.9)
 
 
 @pytest.mark.parametrize(

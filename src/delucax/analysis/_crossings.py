@@ -8,6 +8,11 @@ from ..math._linear_solve import eigenvalues, lu_solve
 from ._state_space import norm, StateSpace
 
 
+ANYWHERE = 0.7368
+"""A frequency in place of one that does not exist. It has many digits, because at 1 a
+loop might have a pole."""
+
+
 def gains(
     loop: StateSpace, omega: Float[Array, "*frequencies"], order: int = 0
 ) -> list[Complex[Array, "*frequencies"]]:
@@ -43,13 +48,15 @@ def follow(
 
     def newton(_, crossed):
         L, change = gains(loop, crossed, 1)
+        # The loop may be zero there.
+        L = xp.where(moves, L, 1)
         relative = change / L
         turn = xp.real(L) / norm(L, ()) * xp.imag(relative)
         slope = xp.where(kind == 0, turn, xp.real(relative))
         g = _crossing(kind, L)
         return crossed - xp.where(moves, g / xp.where(moves, slope, 1), 0)
 
-    crossed = fori_loop(0, 2, newton, xp.where(moves, omega, 1))
+    crossed = fori_loop(0, 2, newton, xp.where(moves, omega, ANYWHERE))
     return xp.where(moves, crossed, omega)
 
 

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 
-from .._check import check_at_most, check_count
+from .._check import check_at_most, check_count, check_number
 from .._jax import compiled_unless_on_host, host_unless_traced, xp
 from .._module import shown
 from .._results import raise_on_failure, Result
@@ -119,6 +119,7 @@ def disk_margin(
     if channel is not None:
         channel = check_count(channel, "channel", where, least=0)
         check_at_most(channel, m - 1, "channel", where)
+    check_number(skew, "skew", where)
     disk = disk_of(system, xp.asarray(skew, system.A.dtype), channel)
     return raise_on_failure(disk, where, throw)
 

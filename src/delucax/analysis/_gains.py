@@ -1,6 +1,7 @@
 """Gains of linear models: at a frequency, and the H2 and H-infinity norms."""
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
 from .._check import is_concrete
@@ -71,7 +72,7 @@ def frequency_response(
     # At infinite frequency the response is zero, so it is probably a mistake.
     array = as_float_array(omega)
     real = eqx.is_inexact_array(array) and not xp.iscomplexobj(array)
-    if not real or is_concrete(array) and not bool(xp.all(xp.isfinite(array))):
+    if not real or is_concrete(array) and not np.all(np.isfinite(array)):
         raise ValueError(f"{where}: omega must be real and finite, got {array}.")
     return _responses(system, array)
 
@@ -81,7 +82,8 @@ def _responses(
     system: StateSpace, omega: Float[Array, "*frequencies"]
 ) -> Complex[Array, "*frequencies p m"]:
     gains = system.response(omega.astype(system.A.dtype).reshape(-1))
-    gains = xp.where(xp.isfinite(gains), gains, xp.inf)
+    # At a pole the gain is infinite.
+    gains = xp.where(xp.isfinite(gains), gains, system.infinity())
     return gains.reshape(*omega.shape, *gains.shape[1:])
 
 
@@ -144,7 +146,7 @@ def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
     singular = ~(values[-1] > len(values) * eps * values[0])
     invertible = xp.where(singular, system.eye, matrix)
     gain = system.C @ lu_solve(invertible, system.B) + system.D
-    return xp.where(singular, xp.inf, gain), singular
+    return xp.where(singular, system.infinity(), gain), singular
 
 
 _LEVELS = 30

@@ -2,7 +2,7 @@
 
 from jaxtyping import Float
 
-from .._check import check_count, check_positive
+from .._check import check_count, check_step
 from .._jax import compiled_unless_on_host, host_unless_traced, xp
 from .._results import raise_if
 from .._typing import Array, BoolScalar, RealScalar, Scalar
@@ -196,7 +196,7 @@ def _gramian(
     if horizon is not None:
         if system.is_discrete:
             return _gramian_over(system, check_count(horizon, "horizon", where))
-        check_positive(horizon, "horizon", where)
+        check_step(horizon, where, "horizon")
         return _gramian_over(system, xp.asarray(horizon, system.A.dtype))
     W, stable = _gramian_of_all_time(system)
     message = (
@@ -218,7 +218,7 @@ def _krylov(system: StateSpace) -> Float[Array, "n nm"]:
 def _gramian_of_all_time(system: StateSpace) -> tuple[Float[Array, "n n"], BoolScalar]:
     stable = system.is_stable()
     W = stable_gramian(system.stable_or_placeholder(stable))
-    return xp.where(stable, W, xp.inf), stable
+    return xp.where(stable, W, system.infinity()), stable
 
 
 @full_precision

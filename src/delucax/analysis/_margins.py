@@ -13,7 +13,7 @@ from .._jax import (
 from .._module import shown
 from .._results import first_of, raise_on_failure, Result
 from .._typing import BoolScalar, Scalar
-from ._crossings import crossings, follow, gains
+from ._crossings import ANYWHERE, crossings, follow, gains
 from ._disk_margin import disk_of, DiskMargin
 from ._state_space import LinearModel, norm, state_space, StateSpace
 
@@ -166,13 +166,14 @@ def _margins(loop: StateSpace) -> Margins:
     nearest = xp.argmin(candidates, axis=1)
     exists = xp.isfinite(xp.min(candidates, axis=1))
     followed = follow(loop, kinds, omegas[kinds, nearest], exists)
-    # Without a crossing, a placeholder at which everything is finite.
-    followed = xp.where(exists, followed, 1)
+    followed = xp.where(exists, followed, ANYWHERE)
     L = xp.where(exists, gains(loop, followed)[0], 1)
     factor = 1 / norm(L, ())
     angle = xp.arctan2(-xp.imag(L), -xp.real(L))
-    lag = xp.where(angle < 0, angle + 2 * xp.pi, angle) / followed
-    margins = xp.stack([factor[0], factor[1], xp.abs(angle[2]), lag[3]])
+    # Only here: a gain margin may be at frequency zero.
+    turn = xp.where(angle[3] < 0, angle[3] + 2 * xp.pi, angle[3])
+    lag = turn / followed[3]
+    margins = xp.stack([factor[0], factor[1], xp.abs(angle[2]), lag])
     none = xp.array([xp.inf, 0, xp.inf, xp.inf], dtype)
     unstable = xp.array([1, 1, 0, 0], dtype)
     margins = xp.where(stable, xp.where(exists, margins, none), unstable)

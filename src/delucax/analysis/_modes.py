@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Bool, Complex, Float
 
-from .._check import check_positive
+from .._check import check_step
 from .._jax import compiled_unless_on_host, host_unless_traced, stop_gradient, vmap, xp
 from .._module import shown
 from .._typing import Array, BoolScalar, RealScalar, Scalar
@@ -318,7 +318,7 @@ def _modal_test(
     eps = xp.finfo(system.A.dtype).eps
     if tolerance is None:
         tolerance = float(10 * len(system.A) * eps)
-    check_positive(tolerance, "tolerance", where)
+    check_step(tolerance, where, "tolerance")
     return _tested(system, xp.asarray(tolerance, system.A.dtype))
 
 
@@ -357,5 +357,7 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
 
     modes, distances = vmap(nearby)(eigenvalues(A))
     modes = modes * scale_A
-    unstable = system.growth(modes) >= 0
+    # The scale rounds a mode on the boundary of stability to either side. Negated, so
+    # that a NaN counts as unstable.
+    unstable = ~(system.growth(modes) < -4 * eps * xp.abs(modes))
     return ModalTest(modes, distances, unstable, tolerance)

@@ -17,7 +17,7 @@ from .._check import (
     check_instance,
     is_concrete,
 )
-from .._jax import bounded_while, jacobian
+from .._jax import bounded_while, first_possible
 from .._module import as_float_array, shown
 from .._results import choose, promote, raise_on_failure, Result, RESULTS
 from .._typing import Numbers, RealScalar
@@ -170,7 +170,10 @@ def _return(dynamics, event, x, u, t0, max_steps) -> Return:
         # A product, because a sum of steps would be rounded at each step.
         after = (count * dynamics.dt + outcome.s).astype(x.dtype)
         done = outcome.stopped | (outcome.result != RESULTS.successful)
-        new = outcome.x, after, count + 1, done, outcome.result
+        # As in a rollout: at the end of an interval, but not at the event.
+        ends = dynamics.system.project(outcome.x).astype(x.dtype)
+        x_next = jnp.where(outcome.stopped, outcome.x, ends)
+        new = x_next, after, count + 1, done, outcome.result
         over = carry[3]
         return jax.tree.map(lambda a, b: jnp.where(over, a, b), carry, new)
 
@@ -269,8 +272,14 @@ def _orbit(dynamics, event, x0, u, tolerance, iterations, max_steps) -> Periodic
         missed, solver, x0, given, max_steps=iterations, throw=False
     )
     x = solved.value
-    again = _return(dynamics, event, x, u, zero, max_steps)
-    J = jacobian(lambda x: _return(dynamics, event, x, u, zero, max_steps).state)(x)
+
+    def returned(x):
+        after = _return(dynamics, event, x, u, zero, max_steps)
+        return after.state, after
+
+    # One copy of the map, which compiles slowly.
+    forward = jax.jacfwd(returned, has_aux=True)
+    J, again = first_possible(forward, jax.jacrev(returned, has_aux=True))(x)
     values: Any = jnp.linalg.eigvals(J)
     values = values[jnp.argsort(-jnp.abs(values))]
     result = promote(solved.result)

@@ -57,6 +57,11 @@ class StateSpace(NamedTuple):
         numbers = [xp.ravel(M) for M in self if M is not None]
         return xp.all(xp.isfinite(xp.concatenate(numbers)))
 
+    def infinity(self) -> Scalar:
+        """Infinity, for what a finite model has no finite value of; NaN if the model is
+        not finite."""
+        return xp.where(self.is_finite(), xp.inf, xp.nan)
+
     def stable_or_placeholder(self, stable: BoolScalar) -> "StateSpace":
         """This system, or a stable placeholder if it is not stable, so that discarded
         results have finite derivatives."""

@@ -2,7 +2,7 @@
 
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._check import check_count, check_positive, check_step
+from .._check import check_count, check_range, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
 from .._typing import Difference, Numbers, RealScalar
@@ -127,7 +127,8 @@ class HInfinity(AbstractController):
         self.gamma, self.dt = solution.gamma, dynamics.dt if is_finite else None
 
     def __check_init__(self):
-        check_positive(self.gamma, "gamma", "HInfinity")
+        # Zero if the disturbance has no effect.
+        check_range(self.gamma, "gamma", "HInfinity")
         if self.dt is not None:
             check_step(self.dt, "HInfinity")
 

@@ -190,9 +190,8 @@ def _sampled(
         half = A * (dt / 2)
         eye = xp.eye(n, dtype=half.dtype)
         right = xp.concatenate([eye + half, inputs * dt], axis=1)
-        sampled = solve(eye - half, right)
+        sampled, failed = _solved(eye - half, right)
         A, inputs = sampled[:, :n], sampled[:, n:]
-        failed = ~xp.all(xp.isfinite(sampled))
     A, inputs = A * unit / unit.T, inputs * unit
     B, drift, E = _parts(inputs, system)
     return (A, B, E, system.x_ref + drift), failed
@@ -226,15 +225,22 @@ def _from_hold(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array
     return log / dt, solve(held, inputs) / dt, failed
 
 
+def _solved(matrix: Array, right: Array) -> tuple[Array, BoolScalar]:
+    """The solution, and whether the matrix is singular up to rounding."""
+    n = matrix.shape[0]
+    # By the least singular value, because the eigenvalues themselves are rounded.
+    sizes = xp.linalg.svd(stop_gradient(matrix), compute_uv=False)
+    singular = ~(sizes[-1] > n * xp.finfo(matrix.dtype).eps * sizes[0])
+    eye = xp.eye(n, dtype=matrix.dtype)
+    return solve(xp.where(singular, eye, matrix), right), singular
+
+
 def _from_trapezium(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
     n = A.shape[0]
     eye = xp.eye(n, dtype=A.dtype)
-    # By the least singular value, because the eigenvalues themselves are rounded.
-    sizes = xp.linalg.svd(stop_gradient(A + eye), compute_uv=False)
-    failed = ~(sizes[-1] > n * xp.finfo(A.dtype).eps * sizes[0])
-    matrix = xp.where(failed, eye, A + eye)
-    solved = solve(matrix, xp.concatenate([A - eye, inputs], axis=1)) * (2 / dt)
-    return solved[:, :n], solved[:, n:], failed
+    right = xp.concatenate([A - eye, inputs], axis=1)
+    solved, failed = _solved(A + eye, right)
+    return solved[:, :n] * (2 / dt), solved[:, n:] * (2 / dt), failed
 
 
 _INVERSES = {

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector, check_count, check_instance, check_number, is_concrete
+from .._integration import evaluate_field
 from .._module import parameter
 from .._results import choose, first_failure, Result, RESULTS
 from .._typing import Control, Numbers, Observation, Real, RealScalar, State, Time
 from ._base import AbstractDiscretization, AbstractDynamics, AbstractWrapper
+from ._discretized import Discretized
 
 
 _SLACK = 8
@@ -314,8 +316,17 @@ class TransportDelay(_AbstractDelay):
         the events."""
         part = eqx.tree_at(lambda inner: inner.dt, self.dynamics, h)
         if recorded:
-            return part.advance_with_events(t, x, u, w)
-        return *part.advance(t, x, u, w), None
+            x_next, result, events = part.advance_with_events(t, x, u, w)
+        else:
+            (x_next, result), events = part.advance(t, x, u, w), None
+        if isinstance(part, Discretized) and part.stepsize_controller is not None:
+            # Diffrax takes no step in a part of length zero, so the derivative by the
+            # length, which is the vector field, would be lost.
+            _, held, _ = part._parts_of(x, w)
+            change = h - lax.stop_gradient(h)
+            rate = evaluate_field(part.system, t, x, u, held)
+            x_next = x_next + jnp.where(h == 0, change, 0) * rate
+        return x_next, result, events
 
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None

@@ -142,8 +142,9 @@ def _first_order(model: Any, t: Array, x: State, u: Control) -> Any:
         # Dynamics are called, because `advance` would not raise if the solver fails.
         return evaluate_field(model, t, x, u, w) if is_system else model(t, x, u, w)
 
-    # Without disturbance names, w does not enter the field, and there is no E.
-    if is_system and not model.disturbance_names:
+    # Without disturbance names, or with a diffusion, w does not enter the field, and
+    # there is no E.
+    if is_system and model.noise is not None:
         return C, *value_and_jacobians(f, x, u, in_loop=True)
     w = jnp.zeros(model.disturbance_size, x.dtype)
     return C, *value_and_jacobians(f, x, u, w, in_loop=True)

@@ -223,13 +223,19 @@ class MethodOfSteps(Forwarding):
         if held is None and self.noise is None:
             held = jnp.zeros(self.disturbance_size, x.dtype)
         tableau: Any = tableau_of(self.solver)
+        rounding = 16 * jnp.finfo(x.dtype).eps * delays / h
 
         def body(carry, k):
             own, history = carry
             begin = t + k * h
 
             def field(s, x):
-                late = _at(history, (delays - s) / h, h)
+                age = (delays - s) / h
+                # At both ends of this step, the age may be whole, and two old steps
+                # meet there. The state may jump between them, and the old step that
+                # this one goes through is meant.
+                index = jnp.floor(age + (2 * s / h - 1) * rounding)
+                late = _at(history, age, index, h)
                 return system.vector_field(begin + s, x, u, held, late)
 
             after = runge_kutta_step(tableau, field, jnp.zeros((), x.dtype), own, h)
@@ -259,9 +265,9 @@ class MethodOfSteps(Forwarding):
         return self.filled(x), u
 
 
-def _at(history: Array, age: Array, h: Array) -> Array:
-    """The states `age` substeps ago, by Hermite's cubic."""
-    index = jnp.clip(jnp.floor(age).astype(int), 0, len(history) - 1)
+def _at(history: Array, age: Array, index: Array, h: Array) -> Array:
+    """The states `age` substeps ago, by Hermite's cubic of the substep `index`."""
+    index = jnp.clip(index.astype(int), 0, len(history) - 1)
     start, rise, end, fall = jnp.moveaxis(history[index], 1, 0)
     s = (1 - (age - index))[:, None]
     # In the form of Hairer, Nørsett and Wanner, II.6: exact at both ends.

@@ -336,7 +336,9 @@ class Environment(eqx.Module):
                 raise ValueError(
                     f"Environment: u must be an action from 0 to {count - 1}, got {u}."
                 )
-            control = self.actions[control]
+            # NaN for an unknown action, so that a compiled rollout fails.
+            row = self.actions.at[control]
+            control = row.get(mode="fill", wrap_negative_indices=False)
         # Before the bounds, against which a wrong shape could be broadcast.
         control = as_vector(
             control, self.control_size, "u (the control)", "Environment"

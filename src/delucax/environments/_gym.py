@@ -1,6 +1,7 @@
 """Gym's integrators: the default dynamics of the classic control tasks."""
 
 import abc
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,6 +27,33 @@ class AbstractGymStep(AbstractDiscretization):
     cart-pole are not wrapped.
     """
 
+    kind: ClassVar[Any]
+    """The class of the system. Gym's step calls its accelerations, and not its vector
+    field, unless `calls_field`."""
+    calls_field: ClassVar[bool] = False
+
+    def __check_init__(self):
+        system, kind, where = self.system, self.kind, type(self).__name__
+        if not isinstance(system, kind):
+            raise ValueError(
+                f"{where}: system must be a {kind.__name__}, got "
+                f"{type(system).__name__}."
+            )
+        changes = {
+            "a vector_field of its own": type(system).vector_field
+            is not kind.vector_field,
+            "disturbance_names": bool(system.disturbance_names),
+        }
+        changes = {} if self.calls_field else changes
+        changes["a diffusion"] = system.noise == "brownian"
+        changes["a project of its own"] = system.projects_state
+        for what, is_there in changes.items():
+            if is_there:
+                raise ValueError(
+                    f"{where}: system must not have {what}, which Gym's integrator "
+                    "does not use. Pass a solver, such as delucax.dynamics.RK4()."
+                )
+
     @abc.abstractmethod
     def gym_step(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         """The next state, before an additive `w`, in any precision.
@@ -47,6 +75,7 @@ class AbstractGymStep(AbstractDiscretization):
 class GymPendulum(AbstractGymStep):
     """A semi-implicit Euler step whose velocity is clipped before the angle moves."""
 
+    kind = Pendulum
     system: Pendulum
     dt: Real = parameter(0.05, constraint=positive)
     max_speed: Real = parameter(8.0, constraint=positive)
@@ -64,6 +93,7 @@ class GymCartPole(AbstractGymStep):
     """An explicit Euler step; with `semi_implicit`, Gym's other integrator, the
     positions move with the new velocities."""
 
+    kind = CartPole
     system: CartPole
     dt: Real = parameter(0.02, constraint=positive)
     semi_implicit: bool = eqx.field(static=True, default=False)
@@ -88,6 +118,7 @@ class GymMountainCar(AbstractGymStep):
     """A semi-implicit Euler step with clipped velocity and position. A car that runs
     into the left wall stops there."""
 
+    kind = MountainCar
     system: MountainCar
     dt: Real = parameter(1.0, constraint=positive)
     max_speed: Real = parameter(0.07, constraint=positive)
@@ -114,6 +145,7 @@ class GymAcrobot(AbstractGymStep):
     """One Runge-Kutta step of order 4 with torque and `w` held. Then the angles are
     wrapped to +-pi and the velocities are clipped."""
 
+    kind, calls_field = Acrobot, True
     system: Acrobot
     dt: Real = parameter(0.2, constraint=positive)
     max_velocity_1: Real = parameter(4 * np.pi, constraint=positive)

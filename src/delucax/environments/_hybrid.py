@@ -175,8 +175,9 @@ class _Falls(eqx.Module):
         u = jnp.zeros(1, x.dtype)
         (height,), (ahead,) = self.system.guards(t, x, u), self.system.enabled(t, x, u)
         leans = abs(x[1] + self.system.slope) > self.max_lean
-        # The tolerance is for a foot that strikes at the end of an interval.
-        return leans | ahead & (height < -8 * jnp.finfo(x.dtype).eps)
+        # The tolerance is for a foot that strikes at the end of an interval: the next
+        # one begins with this step.
+        return leans | ahead & (height < -(jnp.finfo(x.dtype).eps ** 0.6))
 
 
 @task(CompassGait, dt=0.05, horizon=200)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .._check import (
     as_bounds,
+    as_float_array,
     check_instance,
     check_key,
     check_keywords,
@@ -213,6 +214,8 @@ def task(
             for name, check, default in checks:
                 if (value := chosen.get(name, default)) is not default:
                     check(value, name, where)
+                    if isinstance(value, list | tuple):
+                        chosen[name] = as_float_array(value)
             fields: Fields = dict(dynamics=dynamics, horizon=horizon)
             fields |= build(system if gym is None else dynamics, **chosen)
             # The bounds of the observations only hold for the unchanged task.

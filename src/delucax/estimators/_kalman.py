@@ -17,7 +17,7 @@ from .._check import (
     is_concrete,
 )
 from .._check_models import check_time_invariant
-from .._jax import host_unless_traced, jacobian, xp
+from .._jax import host_unless_traced, jacobian, value_and_jacobians, xp
 from .._module import function_field, parameter, positive, weight
 from .._results import raise_on_failure, RESULTS
 from .._typing import Array, Difference, Numbers, Real
@@ -221,12 +221,6 @@ class _AbstractNonlinearFilter(AbstractGaussianFilter):
             return x_next
         return jnp.where(result == RESULTS.successful, x_next, jnp.nan)
 
-    def _noise(self, t, u, x):
-        """`E W E'`, the covariance that the disturbance adds to the next state."""
-        # E is the derivative at w = 0, the mean of the disturbance.
-        w = jnp.zeros(len(self.W), x.dtype)
-        return congruence(jacobian(lambda w: self._advanced(t, x, u, w))(w), self.W)
-
 
 class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     r"""The extended Kalman filter: the dynamics are linearised about the estimate.
@@ -300,10 +294,12 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
     def _transition(self, t, u, belief):
         # A is used for the covariance only; the mean is moved by F itself.
-        A = jacobian(lambda x: self._advanced(t, x, u))(belief.mean)
-        mean = self._advanced(t, belief.mean, u)
-        noise = self._noise(t, u, belief.mean)
-        return Joint(mean, None, A, belief.covariance, noise)
+        # E is the derivative at w = 0, the mean of the disturbance.
+        w = jnp.zeros(len(self.W), belief.mean.dtype)
+        mean, (A, E) = value_and_jacobians(
+            lambda x, w: self._advanced(t, x, u, w), belief.mean, w
+        )
+        return Joint(mean, None, A, belief.covariance, congruence(E, self.W))
 
 
 class UnscentedKalmanFilter(_AbstractNonlinearFilter):
@@ -391,8 +387,10 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
         return self._sampled(observe, self.observation_difference, belief, self.V)
 
     def _transition(self, t, u, belief):
-        advance = lambda x: self._advanced(t, x, u)
-        noise = self._noise(t, u, belief.mean)
+        advance = lambda x, w=None: self._advanced(t, x, u, w)
+        # E is the derivative at w = 0, the mean of the disturbance.
+        w = jnp.zeros(len(self.W), belief.mean.dtype)
+        noise = congruence(jacobian(lambda w: advance(belief.mean, w))(w), self.W)
         return self._sampled(advance, self.dynamics.difference, belief, noise)
 
     @full_precision

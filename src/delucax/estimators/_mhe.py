@@ -165,6 +165,12 @@ class MHE(AbstractEstimator):
                     f"perfect sensor has no outliers, got {shortened(self.V)}."
                 )
 
+    @property
+    def _walks(self) -> dict[str, RandomWalk]:
+        """The parameters in the order in which JAX sorts them, because a dictionary
+        comes out of `jax.jit` in this order."""
+        return dict(sorted(self.parameters.items()))
+
     def _model(self) -> tuple[Model, Belief]:
         """The model with the parameters as states, and the prior of the first state."""
         dynamics, W, P, mean = self.dynamics, self.W, self.covariance, self.mean
@@ -173,8 +179,8 @@ class MHE(AbstractEstimator):
             pair and tuple(end.astype(dtype) for end in pair)
             for pair in (self.bounds, self.disturbance_bounds)
         )
-        if walks := tuple(self.parameters.values()):
-            wide = WithParameters(dynamics, tuple(self.parameters))
+        if walks := tuple(self._walks.values()):
+            wide = WithParameters(dynamics, tuple(self._walks))
             sizes = [value.size for value in wide.values(wide.start).values()]
 
             def joined(entries):
@@ -246,7 +252,7 @@ class MHE(AbstractEstimator):
         **Returns:** a dictionary from paths to a [`delucax.estimators.Belief`][] of the
         flattened parameter.
         """
-        wide = WithParameters(self.dynamics, tuple(self.parameters))
+        wide = WithParameters(self.dynamics, tuple(self._walks))
         at, out = self.dynamics.state_size, {}
         for path, value in wide.values(state.belief.mean[at:]).items():
             here = slice(at, at + value.size)

@@ -29,7 +29,9 @@ class HashableEnvironment:
         is_key = lambda a: jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
         raw = lambda a: np.asarray(jr.key_data(a) if is_key(a) else a)
         values = [(a.shape, str(a.dtype), raw(a).tobytes()) for a in leaves]
-        self.value = (*values, treedef, static)
+        # Flattened, because a list or a dictionary has no hash.
+        rest, structure = jax.tree.flatten(static)
+        self.value = (*values, treedef, tuple(rest), structure)
         self._hash = hash(self.value)
 
     def __hash__(self):

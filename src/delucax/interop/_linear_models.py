@@ -96,7 +96,15 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
             ) from error
     else:
         raise ValueError(f"{where}: path must end in .npz or .mat, got '{path}'.")
-    return {name: np.asarray(file[name], float) for name in names if name in file}
+    return {name: _real(file[name], name, where) for name in names if name in file}
+
+
+def _real(matrix: Any, name: str, where: str) -> np.ndarray:
+    """A matrix from a file, which may be sparse."""
+    matrix = np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix)
+    if np.iscomplexobj(matrix):
+        raise ValueError(f"{where}: {name} must be real, but is complex in the file.")
+    return matrix.astype(float)
 
 
 def to_control(
@@ -227,8 +235,9 @@ def from_control(
         raise ValueError(f"{where}: system must have states, got none.")
     labels = list(system.input_labels)
     for d in disturbances:
-        known = isinstance(d, str | int) and d in (*labels, *range(len(labels)))
-        if not known:
+        is_index = isinstance(d, int | np.integer) and not isinstance(d, bool)
+        is_known = isinstance(d, str) and d in labels
+        if not (is_known or is_index and d in range(len(labels))):
             raise ValueError(
                 f"{where}: disturbances must be among the inputs {labels}, by name or "
                 f"index, got {d!r}."

@@ -57,7 +57,10 @@ class Box:
 
     def sample(self, key: PRNGKey) -> Array:
         """A uniform draw."""
-        return jr.uniform(key, self.shape, self.dtype, self.low, self.high)
+        # Not from low + share * (high - low): the width of a space without bounds is
+        # beyond the largest number.
+        share = jr.uniform(key, self.shape, self.dtype)
+        return share * self.high + (1 - share) * self.low
 
     def contains(self, x: Any) -> Array:
         """Whether `x` lies between the bounds."""

@@ -113,20 +113,37 @@ class Renderer:
         trajectory = rollout(environment, idle, key=jax.random.key(0), throw=False)
         states = np.asarray(trajectory.states, float)
         moments = zip(states, np.asarray(trajectory.controls, float), strict=False)
+        self.dt = float(environment.dt)
+        self.times: list[float] = []
+        self.states: list[np.ndarray] = []
         ax = self.figure.add_subplot()
         self.plant = PlantArtist(ax, Episode(environment, trajectory), moments)
 
-    def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def frame(self, x: np.ndarray, u: np.ndarray, step: int = 0) -> np.ndarray:
         """The picture at a state and a control.
 
         **Arguments:**
 
         - `x`: the state, shape `(n,)`.
         - `u`: the control, shape `(m,)`.
+        - `step`: the number of steps since the start of the episode, 0 by default. A
+            plant that moves on, such as a walker, moves by the pictures of the episode
+            so far. An episode starts with a smaller number than that of the last
+            picture.
 
         **Returns:** an array of shape `(height, width, 3)`.
         """
-        self.plant.draw(np.asarray(x, float), np.asarray(u, float))
+        time, state = self.dt * step, np.asarray(x, float)
+        if self.times and time <= self.times[-1]:
+            # The same picture again, or a new episode.
+            kept = len(self.times) - 1 if time == self.times[-1] else 0
+            del self.times[kept:], self.states[kept:]
+        self.times.append(time)
+        self.states.append(state)
+        # Only for plants that move on: others would leave a path.
+        past = (np.array(self.times), np.stack(self.states))
+        given = [past] if self.plant.drawing.walks else []
+        self.plant.draw(state, np.asarray(u, float), *given)
         canvas: Any = self.figure.canvas
         canvas.draw()
         if self.pyplot is not None:

@@ -189,6 +189,12 @@ class OptimalControl(eqx.Module):
 def _fine(dynamics: Any, points: int, rtol: float) -> Any:
     """The dynamics over a fraction of a step, with adaptive steps."""
     if not isinstance(dynamics, Discretized):
+        if not hasattr(dynamics, "refined"):
+            raise ValueError(
+                "OptimalControl.simulate: dynamics must be a delucax.Discretized, or "
+                "have the method refined as delucax.problems.Sampled has, got "
+                f"{type(dynamics).__name__}."
+            )
         return dynamics.refined(points, lambda inner: _fine(inner, 1, rtol))
     return Discretized(
         dynamics.system,

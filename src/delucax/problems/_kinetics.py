@@ -12,11 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._check import check_positive
 from .._module import indexed_names, parameter
 from .._results import Result
 from .._typing import Control, Disturbance, Observation, RealScalar, State, Time
 from ..costs import AbstractCost
 from ..dynamics import AbstractWrapper, Discretized
+from ..math._steps import row_at
 from ..planning import Unknowns
 from ..systems import AbstractSystem
 from ._base import OptimalControl
@@ -100,6 +102,7 @@ class Sampled(AbstractWrapper):
     dt: Array = parameter(1.0)
 
     def __check_init__(self):
+        check_positive(self.widths, "widths", "Sampled")
         if self.noise == "brownian":
             raise ValueError(
                 "Sampled: the system of inner must have no diffusion, because its "
@@ -124,7 +127,7 @@ class Sampled(AbstractWrapper):
     ) -> tuple[Array, Result]:
         k = self._step_at(t)
         at = lambda inner: inner.dt
-        inner = eqx.tree_at(at, self.inner, self.widths[k].astype(x.dtype))
+        inner = eqx.tree_at(at, self.inner, row_at(self.widths, k).astype(x.dtype))
         return inner.advance(self._start(k), x, u, w)
 
     def _step_at(self, t: Time) -> Array:
@@ -132,7 +135,7 @@ class Sampled(AbstractWrapper):
 
     def _start(self, k: Array) -> Array:
         """The time of the system at the start of step `k`."""
-        return jnp.pad(jnp.cumsum(self.widths), (1, 0))[k]
+        return row_at(jnp.pad(jnp.cumsum(self.widths), (1, 0)), k)
 
     def refined(self, points: int, inner: Callable[[Any], Any]) -> "Sampled":
         """The same dynamics with each step cut into parts, and with new inner dynamics.

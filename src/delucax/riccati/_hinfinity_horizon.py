@@ -128,6 +128,8 @@ def hinf_dre(
         D = xp.eye(xp.shape(A)[-1], dtype=xp.result_type(A, xp.float32))
     stage = stage_arguments(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
     final = final_weight(final, stage["A"], where)
+    check_definite(stage["Q"], "Q", where, False)
+    check_definite(final, "final", where, False)
     problem = (*stage.values(), final)
     return at_level(_solution, where, True, problem, gamma, tolerance, throw)
 

@@ -49,7 +49,8 @@ class GameSolution(eqx.Module):
         `(T, m, n)`, or `(N, m, n)`.
     - `L`: the gain of the worst disturbance $w = L x$, shape `(k, n)`; over a finite
         horizon `(T, k, n)`, or `(N, k, n)`.
-    - `gamma`: the level $\gamma$ that the control attains.
+    - `gamma`: the level $\gamma$ that the control attains; infinite if no level was
+        found.
     - `closed_loop`: the matrix $A - B K$, shape `(n, n)`; over a finite horizon
         `(T, n, n)`, or `(N, n, n)`.
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
@@ -174,6 +175,11 @@ class Bisection(NamedTuple):
     game: Game
     trials: Array
 
+    @property
+    def is_attained(self) -> Array:
+        """Whether a level was found."""
+        return xp.isfinite(self.high) & self.solvable
+
 
 Barrier = Callable[[tuple, Array], Array]
 Solve = Callable[[tuple, Array, Array], Game]
@@ -280,7 +286,7 @@ def bisect_level(
     end = while_loop(more, body, begin)
     if gamma is not None:
         return end, gamma
-    level = xp.where(xp.isfinite(end.high) & end.solvable, end.high, one)
+    level = xp.where(end.is_attained, end.high, one)
     return end, xp.where(end.solvable & ~end.affected, 0, level)
 
 
@@ -311,6 +317,8 @@ def game_at_level(
     end, level = bisect_level(solve_game, problem, start, gamma, tolerance)
     if gamma is None:
         attained = with_derivative(barrier, problem, level)
+        known = end.is_attained | end.solvable & ~end.affected
+        attained = xp.where(known, attained, xp.inf)
     else:
         attained = level = gamma
     return end, xp.where(level > 0, level, 1), attained

@@ -29,6 +29,7 @@ from ._arguments import (
     where_solved,
 )
 from ._doubling import continuous_start, discrete_start
+from ._recursion import is_clearly_definite
 from ._residual import (
     if_needed,
     is_small,
@@ -215,11 +216,8 @@ class _Problem(NamedTuple):
 def _in_fitting_units(discrete: bool, data: RiccatiData) -> _Problem:
     by = units(data)
     A, B, _, R, _, E = data = in_units(by, data)
-    eps = float(xp.finfo(A.dtype).eps)
     # In discrete time R + B'XB is inverted, in continuous time R alone.
-    well_posed = (
-        is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
-    )
+    well_posed = is_semidefinite(R) if discrete else is_clearly_definite(R)
     # The starting points need E^-1 A and E^-1 B.
     if E is not None:
         A, B = map(factorised(E), (A, B))

@@ -19,7 +19,10 @@ def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
     names = ("disturbance_size", "state_names", "control_names")
     names += ("state_units", "control_units", "time_unit")
     fields = {name: getattr(plant, name) for name in names}
-    return fields | {"event_names": tuple(getattr(plant, "event_names", ()))}
+    fields["event_names"] = getattr(plant, "event_names", ())
+    # A class may have lists of names, which cannot be static fields.
+    as_tuple = lambda value: tuple(value) if isinstance(value, list) else value
+    return {name: as_tuple(value) for name, value in fields.items()}
 
 
 def checked(

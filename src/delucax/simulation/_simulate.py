@@ -310,6 +310,12 @@ def _simulate(
     finite = jnp.all(jnp.isfinite(final_state))
     result = solve_result(solution, options["stepsize_controller"], dtype)
     result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))
+    # A save at the start is part of the first step, after the first call of the
+    # controller, but the counters of the start are those before it.
+    for name, first in tallies(args.memory).items():
+        at_start = saves[:count] <= 0
+        rows = jnp.where(at_start, first, counts[name][:count])
+        counts[name] = counts[name].at[:count].set(rows)
     # Counted up to the last save time. The record at `t1` has the counters of the first
     # state.
     last = {name: totals[count - 1] for name, totals in counts.items()}

@@ -128,6 +128,11 @@ class LinearSystem(AbstractSystem):
         return self.x_ref, self.u_ref
 
 
+def _as_tuple(names: Any) -> Any:
+    # Only lists, so that a string is refused later.
+    return tuple(names) if isinstance(names, list) else names
+
+
 class FunctionSystem(AbstractSystem):
     """A system whose vector field is a function. [`delucax.system`][] makes one.
 
@@ -154,10 +159,12 @@ class FunctionSystem(AbstractSystem):
     """
 
     function: Callable[..., Array] = function_field()
-    state_names: tuple[str, ...] = eqx.field(static=True)
-    control_names: tuple[str, ...] = eqx.field(static=True)
+    state_names: tuple[str, ...] = eqx.field(static=True, converter=_as_tuple)
+    control_names: tuple[str, ...] = eqx.field(static=True, converter=_as_tuple)
     _: KW_ONLY
-    disturbance_names: tuple[str, ...] = eqx.field(static=True, default=())
+    disturbance_names: tuple[str, ...] = eqx.field(
+        static=True, converter=_as_tuple, default=()
+    )
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> Any:
         return self.function(t, x, u, w)

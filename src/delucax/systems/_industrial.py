@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._check import is_concrete
+from .._check import check_range, is_concrete
 from .._jax import host_unless_traced, xp
 from .._message import shortened
 from .._module import parameter, positive
@@ -186,6 +186,7 @@ class TwoTank(AbstractSystem):
 
         **Returns:** `(x, u)`, shapes `(2,)` and `(1,)`.
         """
+        check_range(level, "level", "TwoTank")
         level = xp.asarray(level, jnp.result_type(float))
         flow = self._outflow(self.lower_outlet, level)
         # The level of the upper tank at that outflow: r(h)^2 = r is quadratic in h^2.

@@ -156,7 +156,12 @@ def make_vector(
             f"{where}: render_mode must be left out, because only a single environment "
             'can be rendered (`gymnasium.make`, or `vectorization_mode="sync"`).'
         )
-    if max_episode_steps not in (None, -1):  # Gymnasium's -1 means no limit
+    if max_episode_steps == -1:
+        raise ValueError(
+            f"{where}: max_episode_steps must be positive, got -1. Only a single "
+            "environment can run without a limit."
+        )
+    if max_episode_steps is not None:
         steps = check_count(max_episode_steps, "max_episode_steps", where)
         kwargs["horizon"] = min(steps, kwargs.get("horizon", steps))
     num_envs = check_count(num_envs, "num_envs", where)

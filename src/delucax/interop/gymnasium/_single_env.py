@@ -257,7 +257,8 @@ class GymnasiumEnv(gymnasium.Env):
         control = self._action
         if self.discrete:
             control = self._table[int(control[0])] * self._stepped
-        frame = self._picture.frame(self.state, control)
+        step = int(self._packed[programs.STEP])
+        frame = self._picture.frame(self.state, control, step)
         return frame if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

@@ -57,12 +57,16 @@ class GymnaxParams(eqx.Module):
 
     def __init__(self, environment: Environment):
         check_instance(environment, Environment, "environment", "GymnaxParams")
-        self.arrays, self.static = eqx.partition(environment, eqx.is_array)
+        self.arrays, static = eqx.partition(environment, eqx.is_array)
+        # Flattened, because a list or a dictionary has no hash.
+        leaves, structure = jax.tree.flatten(static)
+        self.static = tuple(leaves), structure
 
     @property
     def environment(self) -> Environment:
         """The environment with these numbers."""
-        return eqx.combine(self.arrays, self.static)
+        leaves, structure = self.static
+        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
 
     @property
     def max_steps_in_episode(self) -> int:

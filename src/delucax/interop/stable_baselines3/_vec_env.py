@@ -59,8 +59,15 @@ class SB3VecEnv(VecEnv):
 
         **Returns:** the observations.
         """
-        states = [options["state"] for options in self._options if options]
-        options = {"state": np.stack(states)} if states else None
+        options = None
+        if any(self._options):
+            if any(set(options) != {"state"} for options in self._options):
+                raise ValueError(
+                    "SB3VecEnv.reset: options must be {'state': ...} for each copy, "
+                    f"got {self._options}."
+                )
+            states = [options["state"] for options in self._options]
+            options = {"state": np.stack(states)}
         observations, _ = self.vector.reset(seed=self._seeds, options=options)
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()

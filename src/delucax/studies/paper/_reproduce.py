@@ -73,7 +73,7 @@ def reproduce(
         ```
     """
     pd = extra("pandas", "tables")
-    extra("matplotlib", "plot").use("agg")
+    extra("matplotlib", "plot")
     chosen = [names] if isinstance(names, str) else list(names)
     for name in chosen:
         check_choice(name, ("all", *STUDIES), "names", "reproduce")

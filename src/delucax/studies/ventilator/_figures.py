@@ -95,9 +95,10 @@ def simulator_figure(
     breath = int(np.argmin(np.abs(np.max(test.pressure[middle], axis=-1) - 30)))
     u, read = test.u_in[middle, breath], np.asarray(test.pressure[middle, breath])
     times = float(np.ravel(test.dt)[0]) * np.arange(len(u))
-    truth = test.pressure if test.truth is None else test.truth
     left.plot(times, read, ".", color=NEUTRAL, ms=4, label="read")
-    left.plot(times, np.asarray(truth[middle, breath]), color="0.2", lw=1, label="true")
+    if test.truth is not None:
+        truth = np.asarray(test.truth[middle, breath])
+        left.plot(times, truth, color="0.2", lw=1, label="true")
     for k, (label, model) in enumerate(models.items()):
         if label in ("learned", "single compartment", "balloon"):
             predict = eqx.filter_jit(unstack(model)[middle].predict)

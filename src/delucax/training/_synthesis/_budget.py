@@ -70,8 +70,8 @@ class Budget:
     def may_compile(self, differentiates: bool) -> bool:
         """Whether there is time to train by a program that is not compiled yet."""
         first = differentiates and not self.differentiated
-        factor, ends = (_GRADIENT, _OVERRUN) if first else (1.0, 1.0)
-        return self.may_train and self.spent + factor * self.longest < ends * self.total
+        expected = self.longest * (_GRADIENT if first else 1.0)
+        return self.may_train and self.spent + expected < self.total
 
     def may_compare(self, name: str, at: float) -> bool:
         """Whether there is time for a comparison with this controller from then on."""
