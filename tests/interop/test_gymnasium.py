@@ -471,7 +471,11 @@ class Layered(dlx.AbstractSystem):
 def test_a_plant_with_a_list_is_adapted():
     plant = dlx.Discretized(Layered([jnp.ones(1), 2 * jnp.ones(1)]), dt=0.1)
     made = interop.GymnasiumEnv(
-        dlx.Environment(plant, dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1)), [1.0])
+        dlx.Environment(
+            plant,
+            dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1)),
+            initial_state=jnp.ones(1),
+        )
     )
     made.reset(seed=0)
     observation, *_ = made.step(np.zeros(1))

@@ -1,6 +1,7 @@
 """Linear models from files, and from and to python-control."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,10 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
         from scipy.io import loadmat
 
         try:
-            file = loadmat(path, variable_names=names)
+            with warnings.catch_warnings():
+                # About the class of sparse matrices, which plays no part here.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                file = loadmat(path, variable_names=names)
         except NotImplementedError as error:
             raise ValueError(
                 f"{where}: '{path}' is a .mat file of version 7.3; save it with "
@@ -182,7 +186,7 @@ def to_control(
 
 
 def from_control(
-    system: Any, *, disturbances: Sequence[str | int] = ()
+    system: Any, *, disturbances: Sequence[str | int | np.integer] = ()
 ) -> LinearSystem | LinearDynamics:
     """Convert a `control.StateSpace` of python-control to a linear model.
 
