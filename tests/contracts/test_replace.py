@@ -209,7 +209,7 @@ def part(name):
         ("LQI", {"reference": lambda t: np.ones(2)}, "LQI: reference must be a vector"),
         ("LQI", {"dt": -1.0}, "LQI: dt must be positive"),
         ("FiniteHorizonLQR", {"dt": -1.0}, "FiniteHorizonLQR: dt must be positive"),
-        ("HInfinity", {"gamma": -1.0}, "HInfinity: gamma must be positive"),
+        ("HInfinity", {"gamma": -1.0}, "HInfinity: gamma must be at least 0"),
         ("LQG", {"regulator.K": np.ones((1, 3)), "regulator.P": np.eye(3),
             "regulator.x_ref": np.ones(3)}, r"regulator.K must have shape \(1, 2\)"),
         ("LQG", {"regulator": dlx.controllers.Linear([[1.0, 2.0]])}, "must be a LQR"),

@@ -232,6 +232,17 @@ def test_what_cannot_hold_is_named():
             SQP()(dynamics, cost, x0, U, bounds=(-1.0, 1.0), constraints=limits)
 
 
+def test_what_cannot_hold_is_violated_as_little_as_possible():
+    reactor = dlx.make("cstr", horizon=12)
+    hot, low, high = jnp.array([0.6495, 352.0]), 280.0, 320.0
+    limits = Constraints(states=(-jnp.inf, jnp.array([jnp.inf, 349.5])))
+    given = dict(bounds=(low, high), constraints=limits, throw=False)
+    plan = SQP()(reactor.dynamics, reactor.cost, hot, 12, **given)
+    coldest = dlx.open_loop(reactor.dynamics, hot, jnp.full((12, 1), low))
+    assert plan.result == dlx.RESULTS.no_feasible_point and plan.iterations < 25
+    assert_close(plan.violation, jnp.max(coldest[1:, 1]) - 349.5, rtol=1e-3)
+
+
 @needs_x64
 def test_all_that_cannot_hold_together_is_named():
     dynamics, cost, x0, U = steered()

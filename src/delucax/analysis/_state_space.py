@@ -60,7 +60,7 @@ class StateSpace(NamedTuple):
     def infinity(self) -> Scalar:
         """Infinity, for what a finite model has no finite value of; NaN if the model is
         not finite."""
-        return xp.where(self.is_finite(), xp.inf, xp.nan)
+        return xp.where(self.is_finite(), xp.inf, xp.nan).astype(self.A.dtype)
 
     def stable_or_placeholder(self, stable: BoolScalar) -> "StateSpace":
         """This system, or a stable placeholder if it is not stable, so that discarded

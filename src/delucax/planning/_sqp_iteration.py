@@ -71,8 +71,10 @@ NEAR = 0.01
 rises, and an elastic program is followed by one with the constraints."""
 FIRST_PRICE = 10.0
 """The first price, relative to the gradient of the cost."""
-MOST_PRICE = 1e7
-"""The largest price, relative to the gradient of the cost over the violation."""
+MOST_PRICE, MOST_ROUNDING = 1e7, 0.01
+"""The largest price, relative to the gradient of the cost over the violation, and its
+largest product with the unit of rounding: at a higher price, a step loses the cost in
+the rounding of the squared violations."""
 PATIENCE = 50
 """After this many iterations, elastic programs use a penalty function, not the funnel.
 """
@@ -199,9 +201,11 @@ def iterated(problem: Problem, start: Start, options: Options) -> Outcome:
         feasible = violation <= options.constraint_tolerance
         settled = error <= options.tolerance
         # Near a stationary point that is not feasible, the price is too low.
-        most = MOST_PRICE * (1 + jnp.max(jnp.abs(model.h))) / violation
+        most = min(MOST_PRICE, MOST_ROUNDING / eps)
+        most = most * (1 + jnp.max(jnp.abs(model.h))) / violation
         low = (error <= NEAR) & ~feasible & before.elastic
-        hopeless = settled & low & (before.price >= most)
+        # The violation still changes a little, and with it the largest price.
+        hopeless = settled & low & (before.price >= 0.9 * most)
         price = jnp.where(low, jnp.minimum(10 * before.price, most), before.price)
         cost = model.values.cost + limits.penalty(model.values.rows)
         lost = ~jnp.isfinite(cost + slope + error + violation)
