@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from .. import controllers
 from .._controller import AbstractController
+from .._results import RESULTS
 from ..controllers import mlp_policy, OpenLoop, Zero
 from ..disturbances import Gaussian, Zero as Undisturbed
 from ..environments import Environment, make, registered, UniformState
@@ -26,6 +27,7 @@ from ..lung import BreathCost, Breathing
 from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI, SQP
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
+from ..training._costs import nan_if_failed
 
 
 # For every training: the optimiser steps on the gradient, the episodes in a step, and
@@ -267,7 +269,10 @@ def _suited(task: str, method: str) -> Any:
 
 @eqx.filter_jit
 def _cost(env: Environment, agent: Any, key: Any) -> Any:
-    return expected_cost(env, batch=1)(agent, key)
+    run: Any = rollout(env, agent, key=key, keep=(), throw=False)
+    # A learner that refuses an update keeps its weights, and the run goes on.
+    refused = run.result == RESULTS.update_refused
+    return jnp.where(refused, run.total_cost, nan_if_failed(run, run.total_cost))
 
 
 @eqx.filter_jit
