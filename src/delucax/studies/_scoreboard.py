@@ -27,7 +27,6 @@ from ..lung import BreathCost, Breathing
 from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI, SQP
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
-from ..training._costs import nan_if_failed
 
 
 # For every training: the optimiser steps on the gradient, the episodes in a step, and
@@ -272,7 +271,7 @@ def _cost(env: Environment, agent: Any, key: Any) -> Any:
     run: Any = rollout(env, agent, key=key, keep=(), throw=False)
     # A learner that refuses an update keeps its weights, and the run goes on.
     refused = run.result == RESULTS.update_refused
-    return jnp.where(refused, run.total_cost, nan_if_failed(run, run.total_cost))
+    return jnp.where(run.failed & ~refused, jnp.nan, run.total_cost)
 
 
 @eqx.filter_jit
