@@ -94,7 +94,8 @@ def is_compared(row: dict[str, Any]) -> bool:
 
 def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """A row for each task: what its seeds reach, on starts of their own, and, as
-    `beside all`, on those of the scoreboard beside everything that ran there."""
+    `beside all`, on those of the scoreboard beside everything that ran there. The
+    latter is a score, and `costs more` the same as a share of the best known cost."""
     from benchmarks.scoreboard import stored
 
     board, made = stored(), []
@@ -103,6 +104,7 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
         own = [regret(row) if is_compared(row) else np.nan for row in seeds]
         names = [n for n in FLOOR if all(n in row["costs"] for row in seeds)]
         floor = np.array([[regret(row, name) for row in seeds] for name in names])
+        cost, best = board.cost(str(task), "synthesise"), board.best(str(task))
         made.append(
             {
                 "task": task,
@@ -112,6 +114,7 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
                 "above best": np.nanmedian(own) if np.any(np.isfinite(own)) else None,
                 "worst seed": np.nanmax(own) if np.any(np.isfinite(own)) else None,
                 "beside all": board.excess(str(task), "synthesise"),
+                "costs more": cost and (cost.middle - best) / abs(best),
                 "floor": np.min(np.median(floor, axis=1)),
                 "worst beside floor": np.max(
                     [regret(row) for row in seeds] - np.min(floor, axis=0)
@@ -143,6 +146,7 @@ def tasks(only: list[str], seeds: int = SEEDS, **how: Any) -> dict[str, Any]:
         counts = {"tasks": len(group), "near": near.sum(), "by LQR": simple.sum()}
         counts["compared"] = group["above best"].notna().sum()
         counts["near beside all"] = beside.sum()
+        counts["cost near beside all"] = (group["costs more"] <= within).sum()
         summary.append({"kind": name} | {k: int(v) for k, v in counts.items()})
         print(f"{name}: {near.sum()} of {len(group)} within {within:.0%}", end="")
         print(f", {beside.sum()} beside all that ran on the scoreboard", end="")

@@ -25,7 +25,14 @@ def test_the_rimless_wheel_has_its_multiplier():
     kept = np.cos(np.pi / 4) ** 2
     assert_close(orbit.multipliers, [kept, 0.0], atol=1e-8)
     gained = 4 * 9.81 * np.sin(np.pi / 8) * np.sin(0.1)
-    assert_close(orbit.state[1], np.sqrt(kept * gained / (1 - kept)), rtol=1e-9)
+    speed = np.sqrt(kept * gained / (1 - kept))
+    assert_close(orbit.state[1], speed, rtol=1e-9)
+    of_slope = lambda slope: dlx.analysis.periodic_orbit(
+        wheel(slope, 0.02), "step", GUESS
+    ).state[1]
+    assert_close(jax.grad(of_slope)(0.1), speed / (2 * np.tan(0.1)), rtol=1e-6)
+    forward = jax.jvp(of_slope, (0.1,), (1.0,))[1]
+    assert_close(forward, speed / (2 * np.tan(0.1)), rtol=1e-6)
 
 
 def walk(slope, guess):

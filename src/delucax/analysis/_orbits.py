@@ -17,7 +17,7 @@ from .._check import (
     check_instance,
     is_concrete,
 )
-from .._jax import bounded_while, first_possible
+from .._jax import bounded_while, first_possible, value_and_jacobians
 from .._module import as_float_array, shown
 from .._results import choose, promote, raise_on_failure, Result, RESULTS
 from .._typing import Numbers, RealScalar
@@ -257,19 +257,41 @@ def periodic_orbit(
     return raise_on_failure(orbit, where, throw, "the last iterate")
 
 
+def _missed(x, dynamics, event, u, max_steps):
+    """By how much the map misses its argument."""
+    zero = jnp.zeros((), x.dtype)
+    after = _return(dynamics, event, x, u, zero, max_steps).state
+    return dynamics.difference(after, x)
+
+
+@eqx.filter_custom_jvp
+def _newton_map(x, given):
+    return _missed(x, *given)
+
+
+@_newton_map.def_jvp
+def _newton_map_jvp(primals, tangents):
+    """The Jacobian in forward mode: `jax.linearize`, which Newton's method calls, makes
+    a program of twice the size from the loops of the map."""
+    x, given = primals
+    dx, dgiven = tangents
+    value, change = x, jnp.zeros_like(x)
+    if jax.tree.leaves(dgiven):
+        of_given = lambda given: _missed(x, *given)
+        value, change = eqx.filter_jvp(of_given, (given,), (dgiven,))
+    if dx is not None:
+        value, (J,) = value_and_jacobians(lambda x: _missed(x, *given), x)
+        change += J @ dx
+    return value, change
+
+
 @eqx.filter_jit
 def _orbit(dynamics, event, x0, u, tolerance, iterations, max_steps) -> PeriodicOrbit:
     zero = jnp.zeros((), x0.dtype)
-
-    def missed(x, given):
-        dynamics, u = given
-        after = _return(dynamics, event, x, u, zero, max_steps).state
-        return dynamics.difference(after, x)
-
     solver = optx.Newton(rtol=tolerance, atol=tolerance)
-    given = dynamics, u
+    given = dynamics, event, u, max_steps
     solved = optx.root_find(
-        missed, solver, x0, given, max_steps=iterations, throw=False
+        _newton_map, solver, x0, given, max_steps=iterations, throw=False
     )
     x = solved.value
 
