@@ -341,6 +341,24 @@ def test_explore_identifies_through_bounds(low, K):
     assert np.max(np.abs(found.B - B)) < 0.05 and np.max(np.abs(found.A - A)) < 0.3
 
 
+def test_explore_gives_its_controller_a_key():
+    """`BPC` draws random controls."""
+    K = np.array([[0.2, 0.8]])
+    learner = c.Explore(lambda model: c.BPC(model, c.Linear(K)), K, steps=5)
+    first, other = (keys_in(learner.init(key=jax.random.key(i))) for i in range(2))
+    # The key of the exploration is another one than that of the learner.
+    assert len(first) == 2 and not np.array_equal(first[0], first[1])
+    assert not np.any(np.all(np.equal(first, other), axis=1))
+    env = dlx.Environment(PLANT, COST, horizon=8)
+    assert np.all(np.isfinite(dlx.rollout(env, learner, key=KEY).controls))
+
+
+def keys_in(state):
+    """The random keys among the leaves."""
+    is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return [jax.random.key_data(k) for k in jax.tree.leaves(state) if is_key(k)]
+
+
 def mean_cost(K, w):
     """Of a gain, over the last 500 steps."""
     x, costs = np.zeros(2), []

@@ -30,6 +30,11 @@ class Rubbing(dlx.systems.Pendulum):
         return super().vector_field(t, x, u - x[1:], w)
 
 
+class AngleAlone(dlx.systems.Pendulum):
+    def observe(self, t, x):
+        return x[:1]
+
+
 class Drifting(dlx.systems.CartPole):
     def diffusion(self, t, x, u):
         return jnp.ones((4, 1))
@@ -55,6 +60,11 @@ BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
         (
             lambda: environment(encode=lambda y: y[0]).feature_size,
             r"encode must return a vector, got an array of shape \(\)",
+        ),
+        (
+            lambda: dlx.make("pendulum", system=AngleAlone()).feature_size,
+            r"encode: .*its states \(angle, velocity\), got an observation of shape "
+            r"\(1,\)\. Pass your own encode",
         ),
         (
             lambda: environment(control_bounds=(jnp.zeros(2), jnp.ones(2))),

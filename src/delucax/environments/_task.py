@@ -25,7 +25,7 @@ from .._check import (
 )
 from .._jax import host_unless_traced, xp
 from .._module import parameter, shown
-from .._typing import Array, BoolScalar, PRNGKey, Real, State, Time
+from .._typing import Array, BoolScalar, PRNGKey, Real, State, Time, Vector
 from ..costs import Arrival
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
@@ -81,6 +81,29 @@ def box(spread: Any, centre: Any = 0.0) -> tuple[Array, Array]:
     dtype = jnp.result_type(float)
     spread, centre = xp.asarray(spread, dtype), xp.asarray(centre, dtype)
     return centre - spread, centre + spread
+
+
+class StateFeatures(eqx.Module):
+    """The `encode` of a task: a function of the whole state.
+
+    With a sensor of its own a task has observations of another size, of which this
+    function would read entries that do not exist.
+    """
+
+    function: Callable[[State], Vector]
+    state_names: tuple[str, ...] = eqx.field(static=True)
+
+    __repr__ = shown
+
+    def __call__(self, x: State) -> Vector:
+        if jnp.shape(x) != (len(self.state_names),):
+            raise ValueError(
+                f"encode: the features of this task are computed from its states "
+                f"({', '.join(self.state_names)}), got an observation of shape "
+                f"{jnp.shape(x)}. Pass your own encode to the Environment, or "
+                "encode=None for the observation itself."
+            )
+        return self.function(x)
 
 
 _CHANGES_OBSERVATIONS = frozenset(
@@ -218,6 +241,9 @@ def task(
                         chosen[name] = as_float_array(value)
             fields: Fields = dict(dynamics=dynamics, horizon=horizon)
             fields |= build(system if gym is None else dynamics, **chosen)
+            if "encode" in fields:
+                names = dynamics.state_names
+                fields["encode"] = StateFeatures(fields["encode"], names)
             # The bounds of the observations only hold for the unchanged task.
             if not _CHANGES_OBSERVATIONS.isdisjoint(others):
                 fields["observation_bounds"] = None

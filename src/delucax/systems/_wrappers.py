@@ -174,6 +174,9 @@ class Corrected(AbstractSystemWrapper):
     The last layer of the network is initialised to zero, so the model starts as the
     known system. [`delucax.training.sysid.grey_box`][] fits both together.
 
+    `equilibrium()` is that of the known system. From there [`delucax.trim`][] finds the
+    equilibrium of the sum.
+
     **Arguments:**
 
     - `system`: the known part, a [`delucax.AbstractSystem`][].

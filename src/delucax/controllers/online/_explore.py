@@ -131,7 +131,7 @@ class Explore(AbstractController):
         # A placeholder for the structure of the state. It is stable, so designs exist.
         A, B = jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype)
         model = LinearDynamics(A, B, dt=self.dt)
-        arrays, inner = self._designed(model)
+        arrays, inner = self._designed(model, jr.fold_in(own, 0))
         return ExploreState(
             step=jnp.zeros((), jnp.int32),
             excitations=jnp.zeros((self.order + 1, m), dtype),
@@ -189,21 +189,24 @@ class Explore(AbstractController):
         closed_loop = solve(gram, before @ after.T).T
         # The identified closed loop is A - B K.
         model = LinearDynamics(closed_loop + B @ self.K, B, dt=self.dt)
-        arrays, inner = self._designed(model)
+        arrays, inner = self._designed(model, jr.fold_in(state.key, 0))
         return state._replace(model=model, arrays=arrays, inner=inner)
 
-    def _designed(self, model: LinearDynamics) -> tuple[PyTree, PyTree]:
+    def _designed(self, model: LinearDynamics, key: PRNGKey) -> tuple[PyTree, PyTree]:
         """The arrays of the controller for a model, and its initial state."""
 
         @eqx.filter_jit
-        def design(model):
+        def design(model, key):
             controller = self.build(model)
             check_controller(controller, "what build makes", "Explore")
-            return eqx.filter(controller, eqx.is_array), controller.init(key=None)
+            return eqx.filter(controller, eqx.is_array), controller.init(key=key)
 
         # `lax.cond` needs the same types in both branches: none may be weak.
-        strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731
-        return jax.tree.map(strong, design(model))
+        def strong(x):
+            is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+            return x if is_key else lax.convert_element_type(x, x.dtype)
+
+        return jax.tree.map(strong, design(model, key))
 
     def _controller(self, state: ExploreState) -> AbstractController:
         """The controller with the arrays in the state.
