@@ -64,7 +64,11 @@ BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
         (
             lambda: dlx.make("pendulum", system=AngleAlone()).feature_size,
             r"encode: .*its states \(angle, velocity\), got an observation of shape "
-            r"\(1,\)\. Pass your own encode",
+            r"\(1,\)\. Give the environment an encode",
+        ),
+        (
+            lambda: dlx.replace(environment(), {"encode": None}),
+            "encode must be a function, got None",
         ),
         (
             lambda: environment(control_bounds=(jnp.zeros(2), jnp.ones(2))),

@@ -25,6 +25,7 @@ from .._message import shortened
 from .._module import (
     as_float_array,
     as_module,
+    check_function,
     check_parameters,
     function_field,
     parameter,
@@ -177,6 +178,7 @@ class Environment(eqx.Module):
         if self.sensor_noise is not None:
             check_signal(self.sensor_noise, dynamics.observation_size, "sensor_noise")
         check_parameters(self)
+        check_function(self.encode, "encode", where)
         if not callable(self.initial_state):
             x0 = as_vector(self.initial_state, n, "initial_state", where)
             check_finite(x0, "initial_state", where)

@@ -24,7 +24,7 @@ from .._check import (
     keywords_of,
 )
 from .._jax import host_unless_traced, xp
-from .._module import parameter, shown
+from .._module import function_field, parameter, shown
 from .._typing import Array, BoolScalar, PRNGKey, Real, State, Time, Vector
 from ..costs import Arrival
 from ..dynamics import AbstractDynamics, Discretized
@@ -90,7 +90,7 @@ class StateFeatures(eqx.Module):
     function would read entries that do not exist.
     """
 
-    function: Callable[[State], Vector]
+    function: Callable[[State], Vector] = function_field()
     state_names: tuple[str, ...] = eqx.field(static=True)
 
     __repr__ = shown
@@ -100,8 +100,8 @@ class StateFeatures(eqx.Module):
             raise ValueError(
                 f"encode: the features of this task are computed from its states "
                 f"({', '.join(self.state_names)}), got an observation of shape "
-                f"{jnp.shape(x)}. Pass your own encode to the Environment, or "
-                "encode=None for the observation itself."
+                f"{jnp.shape(x)}. Give the environment an encode of its own, such as "
+                "encode=lambda y: y for the observation itself."
             )
         return self.function(x)
 
