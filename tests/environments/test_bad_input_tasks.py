@@ -64,7 +64,7 @@ BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
         (
             lambda: dlx.make("pendulum", system=AngleAlone()).feature_size,
             r"encode: .*its states \(angle, velocity\), got an observation of shape "
-            r"\(1,\)\. Give the environment an encode",
+            r"\(1,\)\. If the sensors show something else",
         ),
         (
             lambda: dlx.replace(environment(), {"encode": None}),

@@ -275,13 +275,13 @@ def _newton_map_jvp(primals, tangents):
     a program of twice the size from the loops of the map."""
     x, given = primals
     dx, dgiven = tangents
-    value, change = x, jnp.zeros_like(x)
+    by_given = lambda: eqx.filter_jvp(lambda g: _missed(x, *g), (given,), (dgiven,))
+    if dx is None:
+        return by_given()
+    value, (J,) = value_and_jacobians(lambda x: _missed(x, *given), x)
+    change = J @ dx
     if jax.tree.leaves(dgiven):
-        of_given = lambda given: _missed(x, *given)
-        value, change = eqx.filter_jvp(of_given, (given,), (dgiven,))
-    if dx is not None:
-        value, (J,) = value_and_jacobians(lambda x: _missed(x, *given), x)
-        change += J @ dx
+        change += by_given()[1]
     return value, change
 
 

@@ -100,8 +100,9 @@ class StateFeatures(eqx.Module):
             raise ValueError(
                 f"encode: the features of this task are computed from its states "
                 f"({', '.join(self.state_names)}), got an observation of shape "
-                f"{jnp.shape(x)}. Give the environment an encode of its own, such as "
-                "encode=lambda y: y for the observation itself."
+                f"{jnp.shape(x)}. If the sensors show something else, give the "
+                "environment another encode, such as lambda y: y. If the observation "
+                "is encoded already, remove the features of the controller."
             )
         return self.function(x)
 
