@@ -79,6 +79,7 @@ def model(
     """
     size, times = states.shape[1], problem.times(controls.shape[0])
     t, end = times[:-1], times[-1]
+    has_events = bool(problem.dynamics.event_names)
     # One vector of state and control gives the cross terms in the same derivative.
     z = jnp.concatenate([states[:-1], controls], axis=1)
     like = jax.tree.map(
@@ -99,8 +100,10 @@ def model(
     if problem.multipliers is not None:
         y, end_y, rho = problem.multipliers
     if spacing is None:
-        # Reverse mode if possible, because a step has fewer outputs than inputs.
-        slopes = first_possible(jax.jacrev(step), jax.jacfwd(step))
+        # Reverse mode if possible, because a step has fewer outputs than inputs. But
+        # the loops of events take twice as long to compile in reverse mode.
+        modes = jax.jacrev(step), jax.jacfwd(step)
+        slopes = first_possible(*(modes[::-1] if has_events else modes))
     else:
         slopes = central(step, spacing, problem.deviation)
     F = jax.vmap(slopes)(z, t, problem.w)
@@ -118,6 +121,7 @@ def model(
         # one mode.
         slope = jax.grad(lagrangian)
         ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(lagrangian))
+        ways = ways[::-1] if has_events else ways
         given = z, t, problem.w, costates_of(F, h, v), push
         # The flag is traced, so the second derivatives are computed in any case.
         used = lambda M: M if use_exact is None else jnp.where(use_exact, M, 0)

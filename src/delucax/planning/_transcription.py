@@ -284,20 +284,34 @@ def expanded(
     def stage(z, t, w, p, y):
         cost = lambda z: problem.cost(t, z[:n], z[n:]) + 0.0
 
+        def values(z):
+            values = stored(z, t, w), constraints(z, t)
+            return values, values
+
         # One forward pass differentiates everything: the Jacobian of the gradient is
         # the Hessian.
         def terms(z):
             h = slope = jax.grad(cost)(z)
             if not second_order:
-                after, c = stored(z, t, w), constraints(z, t)
+                after, c = values(z)[0]
                 return (after, c, slope), (after, c, h, cost(z))
             after, pull = jax.vjp(lambda z: stored(z, t, w), z)
             c, push = jax.vjp(lambda z: constraints(z, t), z)
             slope = h - pull(p)[0] + push(y[: c.size])[0]
             return (after, c, slope), (after, c, h, cost(z))
 
-        (F, G, H), values = jax.jacfwd(terms, has_aux=True)(z)
-        return F, G, H, *values
+        # The same without reverse mode, in which the loops of events take long to
+        # compile.
+        def gradient(z):
+            h = jax.grad(cost)(z)
+            (F, G), (after, c) = jax.jacfwd(values, has_aux=True)(z)
+            return h - p @ F + y[: c.size] @ G, (F, G, after, c, h, cost(z))
+
+        if second_order and problem.dynamics.event_names:
+            H, (F, G, *rest) = jax.jacfwd(gradient, has_aux=True)(z)
+            return F, G, H, *rest
+        (F, G, H), rest = jax.jacfwd(terms, has_aux=True)(z)
+        return F, G, H, *rest
 
     each = z, times[:-1], problem.w, costates[1:], y[:-1]
     F, G, H, reached, c, h, cost = jax.vmap(stage)(*each)
