@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,9 @@ import jax.numpy as jnp
 from ._check import as_matrix, check_count, check_key
 from ._module import indexed_names, mlp, names_of
 from ._typing import Array
+
+
+_FORWARD = diffrax.DirectAdjoint, diffrax.ForwardMode
 
 
 def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
@@ -112,3 +116,16 @@ def state_network(
     depth = check_count(depth, "depth", where, least=0)
     size = len(names) + len(inputs)
     return names, inputs, mlp(size, len(names), width, depth, activation, key=key)
+
+
+def check_forward_mode(model: Any, where: str) -> None:
+    """Raise if a plant with adaptive steps inside of `model` has no forward mode."""
+    is_plant = lambda node: hasattr(node, "stepsize_controller")
+    for plant in filter(is_plant, jax.tree.leaves(model, is_leaf=is_plant)):
+        has_forward = isinstance(plant.adjoint, _FORWARD)
+        if plant.stepsize_controller is not None and not has_forward:
+            raise ValueError(
+                f"{where}: dynamics with a stepsize_controller must have an adjoint "
+                "with a forward mode, adjoint=diffrax.DirectAdjoint(), got "
+                f"{plant.adjoint!r}."
+            )

@@ -3,6 +3,7 @@ and soft limits, derivatives, and what must not go wrong."""
 
 import re
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -374,3 +375,22 @@ def test_what_a_transformation_outside_traces_is_refused():
 
     with pytest.raises(ValueError, match="closes over"):
         jax.grad(f)(jnp.asarray(2.0))
+
+
+@once
+def test_adaptive_steps_need_forward_mode():
+    """Before anything is compiled, and with the adjoint that helps."""
+    steps = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    adaptive = dict(solver=diffrax.Tsit5(), stepsize_controller=steps)
+    plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05, **adaptive)
+    env = dlx.Environment(plant, dlx.costs.Quadratic([1.0, 1.0], [1.0]))
+    record = dlx.training.sysid.Record(np.eye(9)[:, :2], np.eye(8)[:, :1], dt=0.05)
+    problem = plant, env.cost, [1.0, 0.0], jnp.zeros((3, 1))
+    for call in (
+        lambda: dlx.planning.SQP()(*problem),
+        lambda: dlx.planning.ILQR(second_order=True)(*problem),
+        lambda: dlx.training.sysid.validate(plant, record),
+        lambda: dlx.training.sysid.physical(plant, record, parameters="system.mass"),
+    ):
+        with user_error(match="stepsize_controller must .*DirectAdjoint"):
+            call()

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,14 +16,12 @@ from .._check import (
     check_instance,
     is_concrete,
 )
+from .._check_models import check_forward_mode
 from .._jax import bounded_while, first_possible, value_and_jacobians
 from .._module import as_float_array, shown
 from .._results import choose, promote, raise_on_failure, Result, RESULTS
 from .._typing import Numbers, RealScalar
 from ..dynamics import Discretized
-
-
-_FORWARD = diffrax.DirectAdjoint, diffrax.ForwardMode
 
 
 class Return(eqx.Module):
@@ -237,12 +234,7 @@ def periodic_orbit(
     max_steps = check_count(max_steps, "max_steps", where)
     iterations = check_count(max_iterations, "max_iterations", where)
     check_bool(throw, "throw", where)
-    adaptive = dynamics.stepsize_controller is not None
-    if adaptive and not isinstance(dynamics.adjoint, _FORWARD):
-        raise ValueError(
-            f"{where}: dynamics with a stepsize_controller must have an adjoint with a "
-            f"forward mode, adjoint=diffrax.DirectAdjoint(), got {dynamics.adjoint!r}."
-        )
+    check_forward_mode(dynamics, where)
     least = 8 * float(jnp.finfo(x0.dtype).eps)
     given = index, x0, u, max(tolerance, least), iterations, max_steps
     orbit = _orbit(dynamics, *given)

@@ -15,6 +15,7 @@ from .._check import (
     check_range,
     finite_rows,
 )
+from .._check_models import check_forward_mode
 from .._module import parameter
 from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
@@ -214,6 +215,8 @@ class ILQR(AbstractPlanner):
         second_order = self.second_order
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
+        if second_order:
+            check_forward_mode(problem.dynamics, f"{where}(second_order=True)")
         filled: dict[str, Any] = dict(
             tolerance=tolerance,
             constraint_tolerance=feasible,

@@ -15,6 +15,7 @@ from .._check import (
     finite_rows,
     is_concrete,
 )
+from .._check_models import check_forward_mode
 from .._jax import quickly_compiled
 from .._module import parameter
 from .._results import first_failure
@@ -159,6 +160,7 @@ class SQP(AbstractPlanner):
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         dtype, states = start.controls.dtype, self.states
+        check_forward_mode(problem.dynamics, "SQP")
         check_unknowns(problem, start.horizon)
         _check_controls(problem, start.horizon)
         if states is not None:
@@ -208,6 +210,7 @@ class SQP(AbstractPlanner):
                 "SQP.prepare: problem.unknowns must be None, because a real-time "
                 "iteration takes none."
             )
+        check_forward_mode(problem.dynamics, "SQP.prepare")
         return prepared(problem, start, self.second_order)
 
     def feedback(self, problem: Problem, ready: PyTree, max_steps: int = 50) -> Plan:

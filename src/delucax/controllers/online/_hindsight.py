@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..._check import check_count
+from ..._check_models import check_forward_mode
 from ..._controller import AbstractController
 from ..._module import marked_leaves
 from ..._results import choose, Result, RESULTS
@@ -109,6 +110,7 @@ def best_in_hindsight(
             f"{type(controller).__name__}."
         )
     iterations = check_count(iterations, "iterations", where)
+    check_forward_mode(environment, where)
     rounding = float(jnp.finfo(states.dtype).eps ** 0.5)
     tolerance = rounding if tolerance is None else tolerance
     if environment.sensor_noise is not None:

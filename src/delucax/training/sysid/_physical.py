@@ -17,6 +17,7 @@ from ..._check import (
     check_positive,
     is_concrete,
 )
+from ..._check_models import check_forward_mode
 from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import AbstractDynamics
@@ -142,6 +143,7 @@ def physical(
     """
     where = "sysid.physical"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
+    check_forward_mode(dynamics, where)
     records = records_of(record, where)
     size, n = dynamics.observation_size, dynamics.state_size
     sizes = tuple(getattr(records[0], k).shape[1] for k in ("outputs", "controls"))

@@ -10,6 +10,7 @@ from jax.scipy.stats import chi2
 from jaxtyping import Array, Float
 
 from ..._check import check_count, check_instance
+from ..._check_models import check_forward_mode
 from ..._results import first_failure, promote, RESULTS
 from ...dynamics import AbstractDynamics
 from ._record import Record, Records, records_of
@@ -141,6 +142,7 @@ def validate(
     """
     where = "sysid.validate"
     check_instance(model, AbstractDynamics, "model", where)
+    check_forward_mode(model, where)
     records = records_of(record, where)
     sizes = tuple(getattr(records[0], k).shape[1] for k in ("outputs", "controls"))
     if sizes != (model.observation_size, model.control_size):
