@@ -120,7 +120,9 @@ def state_network(
 
 def check_forward_mode(model: Any, where: str) -> None:
     """Raise if a plant with adaptive steps inside of `model` has no forward mode."""
-    is_plant = lambda node: hasattr(node, "stepsize_controller")
+    # `Discretized` itself is on a higher floor.
+    fields = "stepsize_controller", "adjoint"
+    is_plant = lambda node: all(hasattr(node, name) for name in fields)
     for plant in filter(is_plant, jax.tree.leaves(model, is_leaf=is_plant)):
         has_forward = isinstance(plant.adjoint, _FORWARD)
         if plant.stepsize_controller is not None and not has_forward:

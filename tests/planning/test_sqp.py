@@ -379,14 +379,17 @@ def test_what_a_transformation_outside_traces_is_refused():
 
 @once
 def test_adaptive_steps_need_forward_mode():
-    """Before anything is compiled, and with the adjoint that helps."""
+    """The error comes before anything is compiled, and names what helps."""
     steps = diffrax.PIDController(rtol=1e-3, atol=1e-3)
     adaptive = dict(solver=diffrax.Tsit5(), stepsize_controller=steps)
     plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05, **adaptive)
     env = dlx.Environment(plant, dlx.costs.Quadratic([1.0, 1.0], [1.0]))
     record = dlx.training.sysid.Record(np.eye(9)[:, :2], np.eye(8)[:, :1], dt=0.05)
     problem = plant, env.cost, [1.0, 0.0], jnp.zeros((3, 1))
+    gain, key = dlx.controllers.Linear(jnp.zeros((1, 2))), jax.random.key(0)
+    run = dlx.rollout(env, gain, key=key, x0=[0.1, 0.0], horizon=2)
     for call in (
+        lambda: dlx.controllers.best_in_hindsight(env, gain, run),
         lambda: dlx.planning.SQP()(*problem),
         lambda: dlx.planning.ILQR(second_order=True)(*problem),
         lambda: dlx.training.sysid.validate(plant, record),
