@@ -73,8 +73,9 @@ def local_lqg(
 
 
         noise = dlx.disturbances.Gaussian(0.01, size=1)
-        changes = {"dynamics.system": AngleOnly(), "sensor_noise": noise}
-        env = dlx.replace(dlx.make("pendulum"), changes)
+        dynamics = dlx.Discretized(AngleOnly(), dt=0.05)
+        sensors = dict(encode=lambda y: y, sensor_noise=noise)
+        env = dlx.make("pendulum", dynamics=dynamics, **sensors)
         dlx.controllers.local_lqg(env, key=jax.random.key(0)).estimator.L.shape
         ```
 
