@@ -1,21 +1,24 @@
 """Are our sentences as clear as Diffrax's? A reader judges without knowing the source.
 
-    python scripts/sentences.py --seed 0 > reading.txt       # a prompt and 80 sentences
-    python scripts/sentences.py --reading reading.txt --answers said.txt  # count them
+    python scripts/sentences.py --seed 0 --folder readings   # a prompt and 80 sentences
+    python scripts/sentences.py --folder readings            # count the answers
 
 The script draws 40 sentences at random from our pages and docstrings, and 40 from the
-docstrings of the installed Diffrax. Give a reader the first output alone, and keep the
-answer in a file. Its lines are like `17 clear` and `18 unclear`. The last reading and
-what three readers said of it are in `scripts/readings/`.
+docstrings of the installed Diffrax. It writes them to `sentences.txt`, and whose they
+are, the seed and the versions to `key.txt`. Give a reader the first file alone, and
+keep what each says as `answers_1.txt` and so on, in lines like `17 clear` and `18
+unclear`. The last reading is in `scripts/readings/`.
 """
 
 import argparse
 import inspect
 import random
 import re
+import subprocess
 import sys
 import types
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import diffrax
@@ -98,10 +101,11 @@ def theirs() -> list[str]:
     return sorted({s for text in docstrings(diffrax) for s in sentences(text)})
 
 
-def drawn(seed: int) -> list[str]:
-    """Sentences of both, mixed."""
+def drawn(seed: int) -> list[tuple[str, str]]:
+    """`(whose, sentence)` for sentences of both, mixed."""
     rng = random.Random(seed)
-    mixed = rng.sample(ours(), COUNT) + rng.sample(theirs(), COUNT)
+    mixed = [("ours", s) for s in rng.sample(ours(), COUNT)]
+    mixed += [("theirs", s) for s in rng.sample(theirs(), COUNT)]
     rng.shuffle(mixed)
     return mixed
 
@@ -111,37 +115,45 @@ def hidden(sentence: str) -> str:
     return re.sub(r"(?i)delucax|diffrax", "library", sentence)
 
 
-def read(reading: str) -> list[tuple[str, str]]:
-    """`(whose, sentence)` for each sentence of a reading."""
-    known = set(map(hidden, theirs()))
-    each = re.findall(r"^\d+\. (.*)$", reading, re.M)
-    return [("theirs" if s in known else "ours", s) for s in each]
+def write(seed: int, folder: Path) -> None:
+    """Draw sentences; write what a reader gets, and the key to it."""
+    pairs = drawn(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [f"{i}. {hidden(s)}" for i, (_, s) in enumerate(pairs, 1)]
+    (folder / "sentences.txt").write_text("\n".join([PROMPT, *lines, ""]))
+    commit = subprocess.check_output(["git", "rev-parse", "HEAD"], cwd=ROOT, text=True)
+    made = f"# seed {seed}, commit {commit.strip()}, Diffrax {version('diffrax')}"
+    lines = [f"{i} {whose}" for i, (whose, _) in enumerate(pairs, 1)]
+    (folder / "key.txt").write_text("\n".join([made, *lines, ""]))
+
+
+def count(folder: Path) -> None:
+    """How many sentences of each side each reader calls clear, and which ones not."""
+    text = (folder / "sentences.txt").read_text()
+    each = re.findall(r"^\d+\. (.*)$", text, re.M)
+    whose = re.findall(r"^\d+ (\w+)$", (folder / "key.txt").read_text(), re.M)
+    for path in sorted(folder.glob("answers_*.txt")):
+        said = dict(re.findall(r"^(\d+)\W+(clear|unclear)", path.read_text(), re.M))
+        if missing := [i for i in range(1, len(whose) + 1) if str(i) not in said]:
+            sys.exit(f"{path.name}: no answer to {missing}")
+        print(path.name)
+        for side in ("ours", "theirs"):
+            own = [i for i, of in enumerate(whose, 1) if of == side]
+            unclear = [i for i in own if said[str(i)] == "unclear"]
+            print(f"{side}: {len(own) - len(unclear)} of {len(own)} are clear")
+            print(*(f"  {i}. {each[i - 1]}" for i in unclear), sep="\n")
 
 
 def main() -> None:
-    """Print what a reader gets, or count what a reader said."""
+    """Write what a reader gets, or count what the readers said."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0, help="of the draw")
-    parser.add_argument("--reading", type=Path, help="what a reader got")
-    parser.add_argument("--answers", type=Path, help="what the reader said of it")
+    parser.add_argument("--folder", type=Path, required=True, help="of one reading")
+    parser.add_argument("--seed", type=int, help="draw sentences with this seed")
     options = parser.parse_args()
-    if (options.reading is None) != (options.answers is None):
-        parser.error("--reading and --answers go together")
-    if options.answers is None:
-        lines = [f"{i}. {hidden(s)}" for i, s in enumerate(drawn(options.seed), 1)]
-        print("\n".join([PROMPT, *lines]))
-        return
-    pairs = read(options.reading.read_text())
-    said = dict(
-        re.findall(r"^(\d+)\W+(clear|unclear)", options.answers.read_text(), re.M)
-    )
-    if missing := [i for i in range(1, len(pairs) + 1) if str(i) not in said]:
-        sys.exit(f"no answer to {missing}")
-    for whose in ("ours", "theirs"):
-        own = [i for i, (of, _) in enumerate(pairs, 1) if of == whose]
-        unclear = [i for i in own if said[str(i)] == "unclear"]
-        print(f"{whose}: {len(own) - len(unclear)} of {len(own)} are clear")
-        print(*(f"  {i}. {pairs[i - 1][1]}" for i in unclear), sep="\n")
+    if options.seed is None:
+        count(options.folder)
+    else:
+        write(options.seed, options.folder)
 
 
 if __name__ == "__main__":

@@ -79,6 +79,12 @@ def test_page_runs(page, tmp_path, monkeypatch):
         assert message.split() == shown.split()
 
 
+def test_wheels_have_the_name_of_this_version():
+    texts = [(ROOT / "README.md").read_text(), *(p.read_text() for p in PAGES)]
+    named = {n for text in texts for n in re.findall(r"delucax-([\d.]+)-py3", text)}
+    assert named == {dlx.__version__}
+
+
 def test_every_status_is_explained():
     text = (ROOT / "docs" / "errors.md").read_text()
     missing = [name for name in dlx.RESULTS._name_to_item if f"`{name}`" not in text]

@@ -117,3 +117,14 @@ def test_results_are_of_one_kind(name):
     assert jax.tree.structure(made) == jax.tree.structure(item)
     assert dlx.RESULTS.where(jnp.array(True), item, item) is item
     assert isinstance(made, dlx.RESULTS) and made == item
+
+
+@needs_x32
+def test_functions_say_what_they_are():
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+    cost = dlx.costs.Quadratic([1.0, 1.0], [1.0])
+    env = dlx.Environment(dynamics, cost)
+    assert "encode" not in repr(env)
+    heard = dlx.replace(env, {"encode": jnp.cos})
+    assert "encode=<function cos>" in repr(heard)
+    assert "difference=Discretized.difference" in repr(dlx.controllers.local_lqr(env))

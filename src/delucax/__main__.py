@@ -79,11 +79,12 @@ _CACHE = (
         "~/.cache/delucax/programs)",
         metavar="DIR",
     ),
-    _flag(
+    _option(
         "--no-cache",
-        "do not keep compiled programs on disk, as with "
-        "JAX_ENABLE_COMPILATION_CACHE=false",
-        **{"dest": "is_kept", "action": "store_false"},
+        "do not keep compiled programs on disk (default: they are kept, unless "
+        "JAX_ENABLE_COMPILATION_CACHE is false)",
+        dest="is_kept",
+        action="store_false",
     ),
 )
 

@@ -6,6 +6,7 @@ a `ValueError` that names the argument, what was expected, and what was given.
 
 import functools
 import inspect
+import operator
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -301,10 +302,13 @@ def check_bool(value: Any, name: str, where: str) -> bool:
 
 def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
     """`value` as an int of at least `least`."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < least:
+    try:
+        count = least - 1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:  # not a whole number, or a traced one
+        count = least - 1
+    if count < least:
         raise _error(value, name, where, f"be a whole number of at least {least}")
-    return int(value)
+    return count
 
 
 def check_at_most(

@@ -88,6 +88,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A guard touches zero and hardly crosses it, so the derivatives of its event "
         "are NaN."
     )
+    unknown_action = (
+        "A controller returned an integer action that the environment does not have. "
+        "The actions are 0, 1 and so on, one for each row of its `actions`."
+    )
     unknown_mode = "The mode of a state is not one of the modes of its system."
     plan_failed = (
         "At least one plan of the controller did not succeed. "

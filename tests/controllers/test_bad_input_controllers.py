@@ -56,6 +56,19 @@ DYNAMICS = dlx.LinearDynamics(0.5 * EYE, EYE[:, :1])
             "an action from 0 to 1, got 7",
         ),
         (lambda: batch()[9], "from -4 to 3"),
+        (
+            lambda: dlx.costs.Function(lambda x, u: 0.0),
+            r"stage must be a function of \(t, x, u\), got <lambda>, a function of "
+            r"\(x, u\)",
+        ),
+        (
+            lambda: dlx.make("pendulum", terminated=lambda x: x[0] > 1),
+            r"terminated must be a function of \(t, x\), got <lambda>",
+        ),
+        (
+            lambda: dlx.make("pendulum", encode=jnp.hypot),
+            r"encode must be a function of \(y\), got hypot, a function of \(x1, x2\)",
+        ),
     ],
 )
 def test_words(call, match):

@@ -112,3 +112,19 @@ def test_complex_controls():
         dlx.open_loop(dynamics, jnp.zeros(2), 1j * jnp.ones((3, 1)))
     with user_error(match="must be real, got dtype complex"):
         dlx.open_loop(dynamics, 1j * jnp.ones(2), jnp.ones((3, 1)))
+
+
+def test_an_open_loop_says_where_it_fails():
+    grows = dlx.system(lambda t, x, u, w: x**3, states=1, controls=1)
+    dynamics = dlx.Discretized(grows, 0.1)
+    with user_error(match=r"open_loop: x0 must be finite, got \[nan\]"):
+        dlx.open_loop(dynamics, [jnp.nan], jnp.zeros((9, 1)))
+    first = r"^open_loop: The states .* The state 2 is the first that is not finite"
+    with user_error(RuntimeError, match=first):
+        dlx.open_loop(dynamics, [3.0], jnp.zeros((50, 1)))
+    ball = dlx.make("bouncing_ball").dynamics
+    guard = r"^open_loop: A state is beyond .* It was the event bounce at t = 0\.$"
+    with user_error(RuntimeError, match=guard):
+        dlx.open_loop(ball, -jnp.ones(2), jnp.zeros((9, ball.control_size)))
+    with user_error(RuntimeError, match="^Discretized: A state is beyond"):
+        ball(0.0, -jnp.ones(2), jnp.zeros(ball.control_size))

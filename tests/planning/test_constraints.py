@@ -137,3 +137,9 @@ def test_bad_constraints_are_named():
         Constraints()
     with user_error(match="inequality must be a function"):
         Constraints(3.0)
+    short = lambda t, x: x[0]
+    for wrong in (short, dlx.planning.SoftConstraint(short)):
+        with user_error(match=r"inequality must be a function of \(t, x, u\), got"):
+            Constraints(wrong)
+    with user_error(match=r"final_equality must be a function of \(t, x\), got"):
+        Constraints(final_equality=lambda t, x, u: x)

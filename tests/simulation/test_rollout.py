@@ -388,6 +388,15 @@ def test_integer_actions(key):
     run = dlx.rollout(env, Chooser(), key=key, x0=jnp.array([1.0, 0.0]), horizon=1)
     assert run.controls[0, 0] == 0.5
 
+    class Third(dlx.AbstractController):
+        def __call__(self, t, y, state):
+            return jnp.asarray(2), state
+
+    with user_error(RuntimeError, match="an integer action that the environment does"):
+        dlx.rollout(env, Third(), key=key)
+    run = dlx.rollout(env, Third(), key=key, throw=False)
+    assert run.result == dlx.RESULTS.unknown_action
+
 
 @once
 def test_random_controller_state_is_kept(key):

@@ -91,6 +91,10 @@ def test_system_from_a_function():
         dlx.system(lambda t, x, u, w: x, states=1.5, controls=1)
     with user_error(match="f must be a function"):
         dlx.system(3.0, states=1, controls=1)
+    with user_error(match=r"f must be a function of \(t, x, u, w\), got <lambda>"):
+        dlx.system(lambda x, u: x, states=1, controls=1)
+    with user_error(match=r"state_names must differ, got \('a', 'a'\)"):
+        dlx.system(lambda t, x, u, w: x, states=("a", "a"), controls=1)
 
 
 @once

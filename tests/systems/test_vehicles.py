@@ -65,7 +65,7 @@ def test_a_wind_is_any_function_and_enters_as_the_disturbance_does():
     blown = s.PlanarQuadrotor(wind=gust).vector_field(0.7, x, u, None)
     pushed = s.PlanarQuadrotor().vector_field(0.7, x, u, gust(0.7, x))
     assert_close(blown, pushed, rtol=1e-6)
-    with user_error(match="wind must be a function, got 0.1"):
+    with user_error(match=r"wind must be a function of \(t, x\), got 0.1"):
         s.PlanarQuadrotor(wind=0.1)
     calm = s.PlanarQuadrotor(wind=lambda t, x: jnp.zeros(3))
     with user_error(match=r"wind must return a force of shape \(2,\), got .*\(3,\)"):

@@ -122,6 +122,7 @@ def test_bad_input_and_data_that_tell_too_little():
         (lambda: sysid.subspace(given, 3, horizon=30), "at least 240 windows of 60"),
         (lambda: sysid.subspace(given[:9], 3), "24 windows of 6 .*got 4 in 9"),
         (lambda: sysid.subspace(given, 1, affine=True), "at most the 1 states, if aff"),
+        (lambda: given.split(1.5), "share must be between 0 and 1, got 1.5"),
     ):
         with user_error(match=match):
             call()
@@ -132,7 +133,7 @@ def test_bad_input_and_data_that_tell_too_little():
     slow = record(outputs(u * 0, STARTS[0]), np.sin([0.3 * t, 0.3 * t + 1]).T)
     fit = sysid.subspace(slow, 3, throw=False)
     assert fit.result == dlx.RESULTS.unexciting
-    with user_error(RuntimeError, match="excite the system too little"):
+    with user_error(RuntimeError, match="^sysid.subspace: .*excite the system too"):
         sysid.subspace(slow, 3)
     # More states than there are leave numbers, if not a model of use.
     assert np.all(np.isfinite(sysid.subspace(given, 8, throw=False).model.A))

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import inspect
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
@@ -318,9 +319,10 @@ def as_module(value: Any) -> Any:
     return StaticFunction(value) if is_plain else value
 
 
-def function_field(default: Any = dataclasses.MISSING) -> Any:
-    """A field that holds a function: a plain one, or a module with a `__call__`."""
-    return eqx.field(default=default, converter=as_module, metadata={_FUNCTION: True})
+def function_field(default: Any = dataclasses.MISSING, *, of: str | None = None) -> Any:
+    """A field that holds a function: a plain one, or a module with a `__call__`. `of`
+    names its arguments, as in "t, x", if they are always the same."""
+    return eqx.field(default=default, converter=as_module, metadata={_FUNCTION: of})
 
 
 def fields_of(node: Any) -> dict[str, dataclasses.Field]:
@@ -382,24 +384,36 @@ def check_parameters(module: eqx.Module) -> None:
         value = getattr(module, field.name, None)
         name = f"{type(module).__name__}: {field.name}"
         if _FUNCTION in field.metadata and value is not None:
-            check_function(value, field.name, type(module).__name__)
+            of = field.metadata[_FUNCTION]
+            check_function(value, field.name, type(module).__name__, of)
         if _ROLE in field.metadata:
             _check_numbers(value, name, field)
 
 
-def check_function(value: Any, name: str, where: str, of: str = "") -> None:
-    """Raise unless `value` is a function. `of` describes its arguments in the message,
-    as in " of time"."""
+def check_function(value: Any, name: str, where: str, of: str | None = None) -> None:
+    """Raise unless `value` is a function, which can be called with the arguments `of`,
+    such as "t, x"."""
+    rule = f"{where}: {name} must be a function{'' if of is None else f' of ({of})'}"
     if not callable(value):
-        raise ValueError(
-            f"{where}: {name} must be a function{of}, got {shortened(value)}."
-        )
-    inner = value.function if isinstance(value, StaticFunction) else value
+        raise ValueError(f"{rule}, got {shortened(value)}.")
+    inner: Any = value.function if isinstance(value, StaticFunction) else value
     if isinstance(inner, type):
         raise ValueError(
-            f"{where}: {name} must be a function{of}, got the class {inner.__name__}. "
-            f"You may mean an instance, {inner.__name__}(...)."
+            f"{rule}, got the class {inner.__name__}. You may mean an instance, "
+            f"{inner.__name__}(...)."
         )
+    if of is None:
+        return
+    try:
+        signature = inspect.signature(inner)
+    except (TypeError, ValueError):  # of some functions in C it is not known
+        return
+    try:
+        signature.bind(*of.split(", "))
+    except TypeError:
+        taken = ", ".join(map(str, signature.parameters))
+        called = getattr(inner, "__name__", type(inner).__name__)
+        raise ValueError(f"{rule}, got {called}, a function of ({taken}).") from None
 
 
 def _check_numbers(value: Any, name: str, field: dataclasses.Field) -> None:

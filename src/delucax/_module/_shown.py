@@ -43,6 +43,9 @@ def _module(
         value = getattr(module, field.name, None)
         is_option = isinstance(value, bool | int | float | str)
         is_default = is_option and value == field.default or value is field.default
+        # A function that is there by default says nothing.
+        if isinstance(value, StaticFunction) and value.function is field.default:
+            continue
         if field.repr and value is not None and not (is_part and is_default):
             shown_fields.append((field.name, value))
     begin, end = wl.TextDoc(f"{type(module).__name__}("), wl.TextDoc(")")
@@ -58,6 +61,10 @@ def _whole(node: Any) -> wl.AbstractDoc | None:
         return wl.TextDoc(_number(node))
     if isinstance(node, StaticFunction):
         return wl.pdoc(node.function, custom=_whole)
+    method = getattr(node, "__func__", None)
+    if method is not None:
+        owner = type(getattr(node, "__self__", None))
+        return wl.TextDoc(f"{owner.__name__}.{method.__name__}")
     if isinstance(node, Module):
         has_own = type(node).__repr__ not in (Module.__repr__, shown)
         return wl.TextDoc(repr(node)) if has_own else _module(node, _whole, True)

@@ -139,7 +139,7 @@ def sizes_of(
     dtype, sizes = jnp.result_type(float), []
     given = [jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (state_size,))]
     for name, function in functions.items():
-        check_function(function, f"barriers[{name!r}]", where, " of (t, x)")
+        check_function(function, f"barriers[{name!r}]", where, "t, x")
         try:
             like = eqx.filter_eval_shape(lambda *a, f=function: f(*a), *given)
         except (TypeError, IndexError) as error:

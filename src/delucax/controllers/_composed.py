@@ -168,7 +168,7 @@ class History(AbstractController):
     controls: int = eqx.field(static=True)
     length: int = eqx.field(default=1, static=True)
     _: KW_ONLY
-    features: Callable[[Array], Array] | None = function_field(None)
+    features: Callable[[Array], Array] | None = function_field(None, of="y")
 
     def __check_init__(self):
         check_controller(self.base, "base", "History")

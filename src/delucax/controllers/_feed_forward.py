@@ -32,10 +32,10 @@ class KnownSignals(eqx.Module):
     """
 
     dynamics: LinearDynamics
-    reference: Signal | None = function_field()
-    control_reference: Signal | None = function_field()
-    disturbance: Signal | None = function_field()
-    difference: Difference | None = function_field()
+    reference: Signal | None = function_field(of="t")
+    control_reference: Signal | None = function_field(of="t")
+    disturbance: Signal | None = function_field(of="t")
+    difference: Difference | None = function_field(of="a, b")
 
     def state(self, t: RealScalar) -> Float[Array, " n"]:
         """The reference `r(t)` of the state."""

@@ -95,7 +95,7 @@ class FiniteHorizonLQR(AbstractController):
     x_ref: Float[Array, "T n"] = parameter()
     u_ref: Float[Array, "T m"] = parameter()
     dt: Float[Array, ""] = parameter()
-    difference: Difference | None = function_field()
+    difference: Difference | None = function_field(of="a, b")
 
     def __init__(
         self,

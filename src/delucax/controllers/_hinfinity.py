@@ -92,7 +92,7 @@ class HInfinity(AbstractController):
     x_ref: Float[Array, "... n"] = parameter()
     u_ref: Float[Array, "... m"] = parameter()
     dt: Float[Array, ""] | None = parameter()
-    difference: Difference | None = function_field()
+    difference: Difference | None = function_field(of="a, b")
 
     def __init__(
         self,

@@ -115,7 +115,7 @@ class LQR(AbstractController):
     P: Float[Array, "n n"] = parameter()
     x_ref: Float[Array, " n"] = parameter()
     u_ref: Float[Array, " m"] = parameter()
-    difference: Difference | None = function_field()
+    difference: Difference | None = function_field(of="a, b")
     feed_forward: Preview | None
 
     def __init__(
@@ -267,8 +267,8 @@ class LQI(AbstractController):
     x_ref: Float[Array, " n"] = parameter()
     u_ref: Float[Array, " m"] = parameter()
     dt: Float[Array, ""] = parameter()
-    reference: Callable[[Any], Array] | None = function_field()
-    difference: Difference | None = function_field()
+    reference: Callable[[Any], Array] | None = function_field(of="t")
+    difference: Difference | None = function_field(of="a, b")
 
     def __init__(
         self,

@@ -202,7 +202,7 @@ class MPC(AbstractController):
     bounds: tuple[Array, Array] | None = bounds_field("MPC")
     planner: AbstractPlanner
     constraints: Constraints | None
-    difference: Difference | None = function_field()
+    difference: Difference | None = function_field(of="a, b")
     throw: bool = eqx.field(static=True)
     fallback: AbstractController | None
     real_time: bool = eqx.field(static=True)

@@ -78,7 +78,7 @@ class MLP(AbstractController):
     """
 
     network: eqx.nn.MLP = weight()
-    features: Callable[[Array], Array] | None = function_field()
+    features: Callable[[Array], Array] | None = function_field(of="y")
     bounds: tuple[Array, Array] | None = bounds_field("MLP")
 
     def __init__(
@@ -94,7 +94,7 @@ class MLP(AbstractController):
         key: PRNGKey,
     ):
         where = "MLP"
-        check_function(activation, "activation", where, " such as jnp.tanh")
+        check_function(activation, "activation", where, "x")
         check_key(key, where)
         self.network = mlp(
             check_count(in_size, "in_size", where),
@@ -255,7 +255,7 @@ class GRU(AbstractController):
 
     cell: eqx.nn.GRUCell = weight()
     readout: eqx.nn.Linear = weight()
-    features: Callable[[Array], Array] | None = function_field()
+    features: Callable[[Array], Array] | None = function_field(of="y")
     bounds: tuple[Array, Array] | None = bounds_field("GRU")
 
     def __init__(
@@ -339,7 +339,7 @@ class Standardise(eqx.Module):
 
     mean: Array = parameter()
     std: Real = parameter(1.0)
-    features: Callable[[Array], Array] | None = function_field(None)
+    features: Callable[[Array], Array] | None = function_field(None, of="y")
 
     __repr__ = shown
 

@@ -173,8 +173,10 @@ class Function(AbstractCost):
         ```
     """
 
-    stage: Callable[[RealScalar, Array, Array], Array] = function_field()
-    final_cost: Callable[[RealScalar, Array], Array] | None = function_field(None)
+    stage: Callable[[RealScalar, Array, Array], Array] = function_field(of="t, x, u")
+    final_cost: Callable[[RealScalar, Array], Array] | None = function_field(
+        None, of="t, x"
+    )
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Array | float:
         return self.stage(t, x, u)

@@ -45,7 +45,9 @@ class Arrival(AbstractCost):
         ```
     """
 
-    reached: Callable[[RealScalar, Array], Array] | None = function_field(None)
+    reached: Callable[[RealScalar, Array], Array] | None = function_field(
+        None, of="t, x"
+    )
     step_cost: Real = parameter(1.0)
     control_weight: Real = parameter(0.0)
     arrival_cost: Real = parameter(0.0)

@@ -110,7 +110,7 @@ class Quadratic(_AbstractQuadratic):
     Qf: Matrix | Vector | None = parameter()
     state_target: Array | None = parameter()
     control_target: Array | None = parameter()
-    difference: Difference | None = function_field()
+    difference: Difference | None = function_field(of="a, b")
 
     def __init__(
         self,
@@ -193,9 +193,9 @@ class Tracking(_AbstractQuadratic):
 
     Q: Matrix | Vector = parameter()
     R: Matrix | Vector = parameter()
-    reference: Callable[[RealScalar], Array] = function_field()
+    reference: Callable[[RealScalar], Array] = function_field(of="t")
     Qf: Matrix | Vector | None = parameter()
-    output: Callable[[Array], Array] | None = function_field()
+    output: Callable[[Array], Array] | None = function_field(of="x")
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class Tracking(_AbstractQuadratic):
         self.reference, self.output = reference, output
 
     def __check_init__(self):
-        check_function(self.reference, "reference", "Tracking", " of time")
+        check_function(self.reference, "reference", "Tracking", "t")
 
     def _state_error(self, t: RealScalar, x: State) -> Vector:
         y = x if self.output is None else self.output(x)

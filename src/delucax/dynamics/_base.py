@@ -1,7 +1,7 @@
 """The base classes of discrete-time dynamics, and the states that they lead to."""
 
 import abc
-from typing import Any, ClassVar, TYPE_CHECKING
+from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -10,10 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._check import as_rows, as_vector, check_instance, check_step
+from .._check import (
+    as_vector,
+    check_instance,
+    check_step,
+    finite_rows,
+    finite_vector,
+)
 from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array, check_parameters
-from .._results import choose, first_failure, first_of, or_none, Result, RESULTS
+from .._results import (
+    choose,
+    error_if,
+    first_failure,
+    first_of,
+    or_none,
+    plain_errors,
+    raise_on_failure,
+    Result,
+    RESULTS,
+)
 from .._typing import Control, Numbers, Observation, RealScalar, State, Time
 from ..systems import AbstractPlant, AbstractSystem
 
@@ -160,7 +176,8 @@ class AbstractDynamics(AbstractPlant):
         # Explicit steps cannot fail, so their programs need no check.
         if result is RESULTS.successful:
             return x_next
-        return result.error_if(x_next, result != RESULTS.successful)
+        failed = result != RESULTS.successful
+        return error_if(result, x_next, failed, lambda why: f"{where}: {why}")
 
 
 def open_loop(
@@ -188,8 +205,8 @@ def open_loop(
 
     **Returns:** the states, shape `(T + 1, n)`.
 
-    **Raises:** `ValueError` on a wrong shape, and an error at run time if the solver
-    fails or a state becomes NaN or infinite.
+    **Raises:** `ValueError` on a wrong shape or if an argument is not finite, and an
+    error at run time if the solver fails or a state becomes NaN or infinite.
 
     !!! example
 
@@ -208,11 +225,29 @@ def open_loop(
     """
     where = "open_loop"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
-    x0 = as_vector(x0, dynamics.state_size, "x0", where)
-    controls = as_rows(controls, dynamics.control_size, "controls", where)
+    x0 = finite_vector(x0, dynamics.state_size, "x0", where)
+    controls = finite_rows(controls, dynamics.control_size, "controls", where)
     if w is not None:
-        w = as_rows(w, dynamics.disturbance_size, "w", where, controls.shape[0])
-    return _open_loop(dynamics, x0, controls, w, as_float_array(t0))
+        w = finite_rows(w, dynamics.disturbance_size, "w", where, controls.shape[0])
+    t0 = as_float_array(t0)
+    with plain_errors(where):
+        run = _open_loop(dynamics, x0, controls, w, t0)
+
+    def facts() -> str:
+        bad = ~np.all(np.isfinite(run.states), axis=-1)
+        said = f"The state {np.argmax(bad)} is the first that is not finite."
+        if not dynamics.event_names:
+            return said if bad.any() else ""
+        times = t0 + jnp.arange(len(controls)) * dynamics.dt
+        fault = dynamics.describe_fault(times, run.states[:-1], controls, w)
+        return fault or (said if bad.any() else "")
+
+    return raise_on_failure(run, where, it=None, facts=facts).states
+
+
+class _Run(NamedTuple):
+    states: Array
+    result: Result
 
 
 @eqx.filter_jit
@@ -239,8 +274,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
     states = stack_steps(parts, size, last)
     finite = jnp.all(jnp.isfinite(states))
     end = choose(finite, RESULTS.successful, RESULTS.diverged)
-    result = first_failure(first_of(results), end)
-    return result.error_if(states, result != RESULTS.successful)
+    return _Run(states, first_failure(first_of(results), end))
 
 
 def _forwarded(name: str) -> Any:

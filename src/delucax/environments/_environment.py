@@ -78,6 +78,10 @@ def _as_horizon(value: Any) -> int:
     return check_count(value, "horizon", "Environment")
 
 
+def _identity(y: Any) -> Any:
+    return y
+
+
 class Environment(eqx.Module):
     """A control task: dynamics, a cost, disturbances, bounds, an initial state and a
     condition of termination.
@@ -149,9 +153,9 @@ class Environment(eqx.Module):
         "Environment", "control_bounds", default=None
     )
     horizon: int = eqx.field(static=True, default=200, converter=_as_horizon)
-    terminated: Callable[[Time, State], Array] | None = function_field(None)
+    terminated: Callable[[Time, State], Array] | None = function_field(None, of="t, x")
     actions: RealOrNone = parameter(None)
-    encode: Callable[[Observation], Vector] = function_field(None)
+    encode: Callable[[Observation], Vector] = function_field(_identity, of="y")
     observation_bounds: BoundsOrNone = bounds_field(
         "Environment", "observation_bounds", default=None
     )
@@ -164,8 +168,6 @@ class Environment(eqx.Module):
             self.disturbance = default_disturbance(self.dynamics)
         if self.initial_state is None:
             self.initial_state = jnp.array(np.zeros(self.dynamics.state_size))
-        if self.encode is None:
-            self.encode = _identity
 
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
@@ -178,7 +180,7 @@ class Environment(eqx.Module):
         if self.sensor_noise is not None:
             check_signal(self.sensor_noise, dynamics.observation_size, "sensor_noise")
         check_parameters(self)
-        check_function(self.encode, "encode", where)
+        check_function(self.encode, "encode", where, "y")
         if not callable(self.initial_state):
             x0 = as_vector(self.initial_state, n, "initial_state", where)
             check_finite(x0, "initial_state", where)
@@ -410,7 +412,3 @@ class Environment(eqx.Module):
                     f"{terminated.shape} and dtype {terminated.dtype}."
                 )
         return Step(x_next, u, cost, terminated, result), *events
-
-
-def _identity(y: Any) -> Any:
-    return y

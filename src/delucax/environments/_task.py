@@ -90,7 +90,7 @@ class StateFeatures(eqx.Module):
     function would read entries that do not exist.
     """
 
-    function: Callable[[State], Vector] = function_field()
+    function: Callable[[State], Vector] = function_field(of="x")
     state_names: tuple[str, ...] = eqx.field(static=True)
 
     __repr__ = shown

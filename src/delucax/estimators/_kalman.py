@@ -106,7 +106,7 @@ class KalmanFilter(AbstractGaussianFilter):
     y_ref: Float[Array, " p"] | None = parameter()
     L: Float[Array, "n p"] | None = weight()
     updated_covariance: Float[Array, "n n"] | None = parameter()
-    observation_difference: Difference | None = function_field()
+    observation_difference: Difference | None = function_field(of="a, b")
 
     def __init__(
         self,
@@ -283,7 +283,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     _: KW_ONLY
     mean: Float[Array, " n"] = parameter(None)
     covariance: Float[Array, "n n"] = parameter(None)
-    observation_difference: Difference | None = function_field(None)
+    observation_difference: Difference | None = function_field(None, of="a, b")
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
@@ -368,7 +368,7 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
     alpha: Real = parameter(1.0, constraint=positive)
     beta: Real = parameter(2.0)
     kappa: Real = parameter(0.0)
-    observation_difference: Difference | None = function_field(None)
+    observation_difference: Difference | None = function_field(None, of="a, b")
 
     def __check_init__(self):
         where = "UnscentedKalmanFilter"

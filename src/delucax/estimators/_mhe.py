@@ -130,7 +130,7 @@ class MHE(AbstractEstimator):
     parameters: dict[str, RandomWalk] = eqx.field(default_factory=dict)
     robust: RealOrNone = parameter(None, constraint=positive)
     iterations: int = eqx.field(default=1, static=True)
-    observation_difference: Difference | None = function_field(None)
+    observation_difference: Difference | None = function_field(None, of="a, b")
 
     def __post_init__(self):
         where = "MHE"

@@ -165,7 +165,10 @@ class Constraints(eqx.Module):
             raise ValueError("Constraints: at least one constraint must be given.")
         for field in _FUNCTIONS:
             for name, function in self.named(field).items():
-                check_function(function, name, where)
+                is_soft = isinstance(function, SoftConstraint)
+                inner = function.function if is_soft else function
+                of = "t, x" if field.startswith("final") else "t, x, u"
+                check_function(inner, name, where, of)
         for start in ("", "final_"):
             pair = (self.named(f"{start}{kind}") for kind in ("inequality", "equality"))
             if twice := set.intersection(*map(set, pair)):

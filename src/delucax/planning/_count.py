@@ -72,7 +72,7 @@ def count_evaluations(
     """
     where = "count_evaluations"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
-    check_function(function, "function", where)
+    check_function(function, "function", where, "dynamics")
     reports: SimpleQueue[tuple[str, int]] = SimpleQueue()
     out = function(_Counted(dynamics, reports))
     jax.block_until_ready(eqx.filter(out, eqx.is_array))

@@ -103,7 +103,7 @@ class Plan(AbstractController):
     dt: Array = parameter()
     low: Array | None = parameter()
     high: Array | None = parameter()
-    difference: Callable[[Any, Any], Any] | None = function_field()
+    difference: Callable[[Any, Any], Any] | None = function_field(of="a, b")
     parameters: dict[str, Array] | None = None
 
     def __check_init__(self):

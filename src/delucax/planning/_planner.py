@@ -250,7 +250,7 @@ class AbstractPlanner(eqx.Module):
             size = dynamics.disturbance_size
             w = finite_rows(w, size, "w", where, start.horizon)
         if difference is not None:
-            check_function(difference, "difference", where)
+            check_function(difference, "difference", where, "a, b")
         if constraints is not None:
             hint = " (`delucax.planning.Constraints`)"
             check_instance(constraints, Constraints, "constraints", where, hint)

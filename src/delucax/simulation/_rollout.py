@@ -257,6 +257,10 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         advance = dynamics.advance_with_events if records else dynamics.advance
         step, *events = env._advance_by(advance, t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
+        if is_action and env.actions is not None:
+            is_known = (jnp.asarray(u) >= 0) & (u < len(env.actions))
+            known = choose(is_known, RESULTS.successful, RESULTS.unknown_action)
+            result = first_failure(known, result)
         applied = step.control
         # Checked, because broadcasting may give the next state another shape.
         if x_next.shape != x.shape:

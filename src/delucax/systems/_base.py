@@ -151,7 +151,8 @@ class AbstractPlant(eqx.Module):
 
 
 def check_names(plant: AbstractPlant) -> None:
-    """Raise unless the names of a plant are tuples, and its angles are states."""
+    """Raise unless the names of a plant are tuples of different names, and its angles
+    are states."""
     where = type(plant).__name__
     for kind in ("state", "angle", "control", "disturbance"):
         names = getattr(plant, f"{kind}_names")
@@ -160,6 +161,8 @@ def check_names(plant: AbstractPlant) -> None:
                 f"{where}: {kind}_names must be a tuple of strings, such as "
                 f"('angle', 'velocity'), got {names!r}."
             )
+        if len(set(names)) < len(names):
+            raise ValueError(f"{where}: {kind}_names must differ, got {names}.")
     if not plant.state_names:
         raise ValueError(f"{where}: state_names must not be empty.")
     if not set(plant.angle_names) <= set(plant.state_names):

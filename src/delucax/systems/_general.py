@@ -158,7 +158,7 @@ class FunctionSystem(AbstractSystem):
         ```
     """
 
-    function: Callable[..., Array] = function_field()
+    function: Callable[..., Array] = function_field(of="t, x, u, w")
     state_names: tuple[str, ...] = eqx.field(static=True, converter=_as_tuple)
     control_names: tuple[str, ...] = eqx.field(static=True, converter=_as_tuple)
     _: KW_ONLY
@@ -210,7 +210,7 @@ def system(
         Array([0.5, 2. ], dtype=float32)
         ```
     """
-    check_function(f, "f", "system", " of (t, x, u, w)")
+    check_function(f, "f", "system", "t, x, u, w")
     return FunctionSystem(
         f,
         names_of(states, "x", "states", "system"),

@@ -62,7 +62,7 @@ class PlanarQuadrotor(AbstractSystem):
     mass: Real = parameter(0.1, constraint=positive)
     length: Real = parameter(0.2, constraint=positive)
     gravity: Real = parameter(9.81)
-    wind: Callable[..., Array] | None = function_field(None)
+    wind: Callable[..., Array] | None = function_field(None, of="t, x")
 
     state_names = ("x", "y", "angle", "vx", "vy", "rate")
     state_units = ("m", "m", "rad", "m/s", "m/s", "rad/s")

@@ -202,7 +202,13 @@ def fit(
         Array(1.5, dtype=float32, weak_type=True)
         ```
     """
-    check_function(loss, "loss", _WHERE)
+    if isinstance(loss, AbstractSurrogate) and data is not None:
+        raise ValueError(
+            f"{_WHERE}: data must be None if the loss is a surrogate, because it makes "
+            "its own data."
+        )
+    of = "model, key" if data is None else "model, batch, key"
+    check_function(loss, "loss", _WHERE, of)
     if not isinstance(optimiser, optax.GradientTransformation):
         raise ValueError(
             f"{_WHERE}: optimiser must be an Optax optimiser such as optax.adam(1e-3), "
@@ -214,11 +220,6 @@ def fit(
     model, data = _as_jax(model), _as_jax(data)
     seeds = _checked_seeds(key, model)
     size, batch_size = _checked_data(data, batch_size)
-    if isinstance(loss, AbstractSurrogate) and data is not None:
-        raise ValueError(
-            f"{_WHERE}: data must be None if the loss is a surrogate, because it makes "
-            "its own data."
-        )
     if not isinstance(callbacks, tuple | list) or not all(map(callable, callbacks)):
         raise ValueError(
             f"{_WHERE}: callbacks must be a sequence of functions of (step, metrics), "

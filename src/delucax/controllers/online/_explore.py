@@ -106,7 +106,7 @@ class Explore(AbstractController):
         ```
     """
 
-    build: Callable[[LinearDynamics], AbstractController] = function_field()
+    build: Callable[[LinearDynamics], AbstractController] = function_field(of="model")
     K: Array = parameter()
     steps: int = eqx.field(static=True)
     _: KW_ONLY

@@ -115,7 +115,7 @@ class OnlineLearner(AbstractLearner):
     """
 
     loop: ClosedLoop
-    cost: Callable[..., Array] = function_field()
+    cost: Callable[..., Array] = function_field(of="t, y, u")
     policy: AbstractPolicy
     learning_rate: Real = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
@@ -285,8 +285,7 @@ def base_for(
         ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
     )
     check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
-    of = " of (t, y, u), such as one of delucax.costs"
-    check_function(cost, "cost", where, of)
+    check_function(cost, "cost", where, "t, y, u")
     check_scalar_cost(cost, dynamics, where)
     if base is not None:
         return base

@@ -207,9 +207,10 @@ def register_drawing(
             "register_drawing: system_class must be a subclass of AbstractSystem or "
             f"AbstractDynamics, got {system_class!r}."
         )
-    for name, given in (("draw", draw), ("setup", setup)):
-        if given is not None or name == "draw":
-            check_function(given, name, "register_drawing")
+    check_function(draw, "draw", "register_drawing")
+    if setup is not None:
+        of = "ax, environment, trajectory"
+        check_function(setup, "setup", "register_drawing", of)
 
     def set_up(canvas: Canvas, episode: Episode) -> Drawing:
         if setup is None:

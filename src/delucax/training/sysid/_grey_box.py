@@ -18,7 +18,7 @@ from ..._check import (
     check_key,
     check_positive,
 )
-from ..._results import Result, RESULTS
+from ..._results import error_if, Result, RESULTS
 from ..._typing import PRNGKey
 from ...dynamics import Discretized
 from ...systems import Corrected
@@ -182,7 +182,7 @@ def grey_box(
     physics = physical(dynamics, record, parameters, **given)
     result: Any = physics.result
     failed = (result != RESULTS.successful) & (result != RESULTS.unexciting)
-    physics = result.error_if(physics, failed)
+    physics = error_if(result, physics, failed, lambda why: f"{_WHERE}: {why}")
 
     plain: Any = physics.model
     sampling, groups, rows = sampling_of(plain, records, _WHERE)

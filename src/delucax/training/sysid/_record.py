@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import (
+    as_number,
     check_bool,
     check_choice,
     check_instance,
@@ -162,8 +163,13 @@ class Record(eqx.Module):
 
         **Returns:** two records.
 
-        **Raises:** `ValueError` if a part has fewer than 2 samples.
+        **Raises:** `ValueError` if `share` is not between 0 and 1, or a part has fewer
+        than 2 samples.
         """
+        if not 0 < as_number(share, "share", "Record.split") < 1:
+            raise ValueError(
+                f"Record.split: share must be between 0 and 1, got {share}."
+            )
         at = round(float(share) * len(self))
         return self[:at], self[at:]
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..._check import check_at_most, check_bool, check_count
 from ..._module import shown
-from ..._results import choose, first_failure, Result, RESULTS
+from ..._results import choose, first_failure, raise_on_failure, Result, RESULTS
 from ...dynamics import LinearDynamics
 from ._hankel import Realised, realised, Units
 from ._record import grouped, Record, Records, uniform_records
@@ -180,13 +180,11 @@ def subspace(
     units, known = realised(groups, order, horizon, affine)
     matrices: Any
     matrices, rest = _regressed(known, units, groups, affine)
-    result: Any = rest["result"]
-    if throw:
-        matrices = result.error_if(matrices, result != RESULTS.successful)
     if isinstance(record, Record):
         rest["x0"] = rest["x0"][0]
     model = LinearDynamics(dt=records[0].dt, **matrices)
-    return Subspace(model, singular_values=known.singular_values, **rest)
+    fit = Subspace(model, singular_values=known.singular_values, **rest)
+    return raise_on_failure(fit, _WHERE, throw, "the fit")
 
 
 def _checked_horizon(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..._check import check_count, check_instance
 from ..._check_models import check_forward_mode
-from ..._results import first_failure, promote, RESULTS
+from ..._results import error_if, first_failure, promote, RESULTS
 from ...dynamics import AbstractDynamics
 from ._record import Record, Records, records_of
 from ._sampled import Sampling, sampling_of
@@ -166,9 +166,9 @@ def validate(
     given = model, sampling, guesses, groups, rows, start, ahead, lags
     runs, summary, failure = _validated(*given)
     free = tuple(run for group in runs for run in group)
-    result: Any = failure
     validation = Validation(free, *summary)
-    return result.error_if(validation, result != RESULTS.successful)
+    failed = failure != RESULTS.successful
+    return error_if(failure, validation, failed, lambda why: f"{where}: {why}")
 
 
 @eqx.filter_jit
