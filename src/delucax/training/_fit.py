@@ -202,13 +202,14 @@ def fit(
         Array(1.5, dtype=float32, weak_type=True)
         ```
     """
-    if isinstance(loss, AbstractSurrogate) and data is not None:
+    is_surrogate = isinstance(loss, AbstractSurrogate)
+    if is_surrogate and data is not None:
         raise ValueError(
             f"{_WHERE}: data must be None if the loss is a surrogate, because it makes "
             "its own data."
         )
-    of = "model, key" if data is None else "model, batch, key"
-    check_function(loss, "loss", _WHERE, of)
+    given = "memory, " if is_surrogate else "" if data is None else "batch, "
+    check_function(loss, "loss", _WHERE, f"model, {given}key")
     if not isinstance(optimiser, optax.GradientTransformation):
         raise ValueError(
             f"{_WHERE}: optimiser must be an Optax optimiser such as optax.adam(1e-3), "
