@@ -74,8 +74,8 @@ _NUMERIC_CELL = re.compile(rf"[*<>=~≤≥ ]*{_NUMBER}")
 _ROW = re.compile(r"^\|.*\|[ ]*$", re.MULTILINE)
 _HEAD = re.compile(r"^\|.*\|[ ]*\n\|[ :|-]+\|[ ]*$", re.MULTILINE)
 _FENCED = re.compile(
-    r"^(?:<!-- (?P<mark>raises|notest)[^\n]*-->\n)?```(?P<language>\w*)[^\n]*\n"
-    r"(?P<code>.*?)^```$",
+    r"^(?:<!-- (?P<mark>raises|notest|elsewhere)[^\n]*-->\n)?"
+    r"```(?P<language>\w*)[^\n]*\n(?P<code>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
 # What no reader takes for a statement: code, comments, equations, addresses.

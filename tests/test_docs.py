@@ -1,17 +1,24 @@
 """Every Python block of the pages and of the README runs, page by page, except those
-marked `notest`.
+marked `notest`, which need what is not there.
 
-The blocks of a page share one namespace. A `text` block right under one is what it
-shows, as under the cell of a notebook. A comment `<!-- raises -->` before a block says
-that it raises the error that the `text` block after it shows, and `<!-- notest: why
--->`, or `notest` after the language, that it is left out.
+A `text` block right under a block is what it shows, as under the cell of a notebook. A
+comment `<!-- raises -->` before a block says that it raises the error that the `text`
+block after it shows; `<!-- elsewhere: file -->` that another test runs it, in another
+precision or in part; and `<!-- notest: why -->` that it is left out.
+
+The blocks of a page share one namespace. The outputs have a test of their own, with the
+blocks that they need and no others, so that a writer need not wait for the rest.
 """
 
+import ast
 import importlib.util
 import itertools
 import re
+import symtable
 from pathlib import Path
+from typing import NamedTuple
 
+import jax
 import pytest
 from examples import check_output, output_of
 from helpers import as_a_user, has_compiler, name_of, pages_of
@@ -22,20 +29,26 @@ import delucax as dlx
 ROOT = Path(__file__).parents[1]
 PAGES = pages_of(ROOT)
 BLOCK = re.compile(
-    r"^(?:<!-- (?P<mark>notest|raises)[^\n]*-->\n)?"
-    r"```(?P<language>python|text)(?P<rest>[^\n]*)\n(?P<code>.*?)^```$",
+    r"^(?:<!-- (?P<mark>notest|elsewhere|raises)(?:: )?(?P<why>[^\n]*?) -->\n)?"
+    r"```(?P<language>python|text)[^\n]*\n(?P<code>.*?)^```$",
     re.DOTALL | re.MULTILINE,
 )
 
 
+class Block(NamedTuple):
+    line: int
+    code: str
+    shown: str | None
+    raises: bool
+
+
 def _blocks(page):
-    """`(line, code, shown, raises)` of each Python block that is to run."""
+    """The Python blocks of a page that are to run."""
     text = page.read_text()
-    line_of = lambda match: text.count("\n", 0, match.start("code"))
     blocks = list(BLOCK.finditer(text))
     for block, after in itertools.zip_longest(blocks, blocks[1:]):
-        mark = block.group("mark") or block.group("rest").strip()
-        if block.group("language") != "python" or mark == "notest":
+        mark = block.group("mark")
+        if block.group("language") != "python" or mark in MARKS:
             continue
         shown = None
         if after is not None and after.group("language") == "text":
@@ -43,28 +56,72 @@ def _blocks(page):
             shown = None if between.strip() else after.group("code")
         raises = mark == "raises"
         assert shown or not raises, f"{page.name}: no message is shown"
-        yield line_of(block), block.group("code"), shown, raises
+        line = text.count("\n", 0, block.start("code"))
+        yield Block(line, block.group("code"), shown, raises)
 
 
-RUNNABLE = [page for page in PAGES if list(_blocks(page))]
+def _names(code):
+    """The names that a block takes from others, that it sets, and whose value it may
+    change, as in `env.reset()`."""
+    taken, made, changed = set(), set(), set()
+    for statement in ast.parse(code).body:
+        tables = [symtable.symtable(ast.unparse(statement), "block", "exec")]
+        for table in tables:
+            tables.extend(table.get_children())
+        for table, symbol in ((t, s) for t in tables for s in t.get_symbols()):
+            is_top, name = table is tables[0], symbol.get_name()
+            if symbol.is_referenced() and (is_top or symbol.is_global()):
+                taken |= {name} - made
+        symbols = tables[0].get_symbols()
+        made |= {s.get_name() for s in symbols if s.is_assigned() or s.is_imported()}
+        match statement:
+            case ast.Expr(ast.Call(ast.Attribute(ast.Name(name)))):
+                changed.add(name)
+            case ast.Assign([ast.Subscript(ast.Name(name))]):
+                changed.add(name)
+    return taken, made, changed
 
 
-def test_pages_are_found():
-    names = {name_of(ROOT, page) for page in RUNNABLE}
-    assert {"index.md", "first_system.md", "gradients.md"} <= names
-    assert {"errors.md", "troubleshooting.md", "coming_from/diffrax.md"} <= names
+def _with_needed(blocks, queue):
+    """The blocks in the queue and those that they need, in the order of the page."""
+    names = [_names(block.code) for block in blocks]
+    queue, found = list(queue), set()
+    while queue:
+        i = queue.pop()
+        found.add(i)
+        for name in names[i][0]:
+            for k in reversed(range(i)):
+                _, made, changed = names[k]
+                if name in made | changed and k not in found:
+                    queue.append(k)
+                if name in made:
+                    break
+    return [blocks[i] for i in sorted(found)]
 
 
-@pytest.mark.parametrize(
-    "page", [pytest.param(p, id=name_of(ROOT, p)) for p in RUNNABLE]
-)
-def test_page_runs(page, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MPLBACKEND", "agg")
+def _parts(page):
+    """The blocks that show something, with those that they need; and the others."""
+    blocks = list(_blocks(page))
+    shown = [i for i, block in enumerate(blocks) if block.shown is not None]
+    first = _with_needed(blocks, shown)
+    others = [i for i, block in enumerate(blocks) if block not in first]
+    return first, _with_needed(blocks, others)
+
+
+MARKS = ("notest", "elsewhere")
+
+
+def _cases(part):
+    parts = {name_of(ROOT, page): (page, _parts(page)[part]) for page in PAGES}
+    return [pytest.param(*p, id=name) for name, p in parts.items() if p[1]]
+
+
+def _run(page, blocks):
     namespace = {"__name__": "page"}
-    if not has_compiler and "export.load" in page.read_text():
+    compiles = re.compile(r"export\.load|backend=\"c\"")
+    if not has_compiler and any(compiles.search(block.code) for block in blocks):
         pytest.skip("no C compiler is there")
-    for line, code, shown, raises in _blocks(page):
+    for line, code, shown, raises in blocks:
         # Padded, so that a traceback names the line of the page.
         code = "\n" * line + code
         if not raises:
@@ -75,8 +132,39 @@ def test_page_runs(page, tmp_path, monkeypatch):
         # Not B017: which error it must be is said by the message.
         with as_a_user(), pytest.raises(Exception) as raised:  # noqa: B017
             exec(compile(code, str(page), "exec"), namespace)
-        message = f"{raised.type.__name__}: {raised.value}"
-        assert message.split() == shown.split()
+        check_output(f"{raised.type.__name__}: {raised.value}", shown)
+
+
+def test_blocks_that_are_left_out_need_what_is_not_there():
+    marks = [m for page in PAGES for m in BLOCK.finditer(page.read_text())]
+    why = {kind: [m["why"] for m in marks if m["mark"] == kind] for kind in MARKS}
+    assert all(re.match("(needs|takes) ", reason) for reason in why["notest"])
+    assert all((ROOT / file).is_file() for file in why["elsewhere"])
+
+
+def test_pages_are_found():
+    names = {case.id for case in _cases(0)}
+    assert {"index.md", "first_system.md", "gradients.md"} <= names
+    assert {"errors.md", "troubleshooting.md", "coming_from/diffrax.md"} <= names
+
+
+@pytest.fixture
+def in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    precision = jax.config.jax_enable_x64
+    yield
+    jax.config.update("jax_enable_x64", precision)
+
+
+@pytest.mark.parametrize("page, blocks", _cases(0))
+def test_outputs_are_shown(page, blocks, in_a_folder):
+    _run(page, blocks)
+
+
+@pytest.mark.parametrize("page, blocks", _cases(1))
+def test_other_blocks_run(page, blocks, in_a_folder):
+    _run(page, blocks)
 
 
 def test_wheels_have_the_name_of_this_version():

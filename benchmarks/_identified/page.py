@@ -98,7 +98,7 @@ and prints the errors of the models. The names of the columns begin with `u` for
 and with `y` for outputs. This code writes such files for another data set of
 nonlinearbenchmark.org:
 
-<!-- notest: downloads the data -->
+<!-- notest: needs a download -->
 ```python
 import nonlinear_benchmarks
 import pandas as pd

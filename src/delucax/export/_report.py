@@ -51,13 +51,13 @@ class Report(NamedTuple):
 
     def __repr__(self):
         rows = [
-            ("constants", f"{self.constants} bytes"),
-            ("state", f"{self.state} bytes"),
-            ("stack", f"{self.stack} bytes"),
-            ("operations", f"{self.operations} a call"),
-            ("lines of C", str(self.lines)),
+            ("constants", f"{self.constants:,} bytes"),
+            ("state", f"{self.state:,} bytes"),
+            ("stack", f"{self.stack:,} bytes"),
+            ("operations", f"{self.operations:,} a call"),
+            ("lines of C", f"{self.lines:,}"),
             *(
-                (f"loop at {line}" if line else "loop", f"{n} rounds")
+                (f"loop at {line}" if line else "loop", f"{n:,} rounds")
                 for line, n in self.bounds
             ),
         ]
