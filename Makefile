@@ -84,6 +84,10 @@ thorough: $(VENV)/.tests ## the few tests that take minutes by their nature
 	JAX_ENABLE_X64=0 $(pytest) -m minutes $(PYTEST_ARGS)
 	JAX_ENABLE_X64=1 $(pytest) -m minutes $(no_examples) $(PYTEST_ARGS)
 
+.PHONY: outputs
+outputs: $(VENV)/.tests ## the outputs under the code of the pages; `test` runs all of the code
+	$(lightly) JAX_ENABLE_X64=0 $(pytest) tests/test_docs.py --only-outputs $(PYTEST_ARGS)
+
 .PHONY: test-oldest
 test-oldest: $(VENV)-oldest/.tests ## the spine, with the oldest Python and dependencies allowed
 	$(lightly) JAX_ENABLE_X64=0 $(one_thread) $(VENV)-oldest/bin/python -m pytest \

@@ -20,6 +20,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 gc.set_threshold(200_000, 50, 100)
 
 
+def pytest_addoption(parser):
+    words = "of the pages, run only the blocks that show something, and their needs"
+    parser.addoption("--only-outputs", action="store_true", help=words)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def kept_programs():
     from delucax._programs import keep_programs

@@ -6,8 +6,8 @@ comment `<!-- raises -->` before a block says that it raises the error that the 
 block after it shows; `<!-- elsewhere: file -->` that another test runs it, in another
 precision or in part; and `<!-- notest: why -->` that it is left out.
 
-The blocks of a page share one namespace. The outputs have a test of their own, with the
-blocks that they need and no others, so that a writer need not wait for the rest.
+The blocks of a page share one namespace. With `--only-outputs` those run that show
+something, and those that they need, so that a writer need not wait for the rest.
 """
 
 import ast
@@ -99,21 +99,10 @@ def _with_needed(blocks, queue):
     return [blocks[i] for i in sorted(found)]
 
 
-def _parts(page):
-    """The blocks that show something, with those that they need; and the others."""
-    blocks = list(_blocks(page))
-    shown = [i for i, block in enumerate(blocks) if block.shown is not None]
-    first = _with_needed(blocks, shown)
-    others = [i for i, block in enumerate(blocks) if block not in first]
-    return first, _with_needed(blocks, others)
-
-
 MARKS = ("notest", "elsewhere")
 
 
-def _cases(part):
-    parts = {name_of(ROOT, page): (page, _parts(page)[part]) for page in PAGES}
-    return [pytest.param(*p, id=name) for name, p in parts.items() if p[1]]
+RUNNABLE = [page for page in PAGES if list(_blocks(page))]
 
 
 def _run(page, blocks):
@@ -143,7 +132,7 @@ def test_blocks_that_are_left_out_need_what_is_not_there():
 
 
 def test_pages_are_found():
-    names = {case.id for case in _cases(0)}
+    names = {name_of(ROOT, page) for page in RUNNABLE}
     assert {"index.md", "first_system.md", "gradients.md"} <= names
     assert {"errors.md", "troubleshooting.md", "coming_from/diffrax.md"} <= names
 
@@ -157,13 +146,14 @@ def in_a_folder(tmp_path, monkeypatch):
     jax.config.update("jax_enable_x64", precision)
 
 
-@pytest.mark.parametrize("page, blocks", _cases(0))
-def test_outputs_are_shown(page, blocks, in_a_folder):
-    _run(page, blocks)
-
-
-@pytest.mark.parametrize("page, blocks", _cases(1))
-def test_other_blocks_run(page, blocks, in_a_folder):
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, id=name_of(ROOT, p)) for p in RUNNABLE]
+)
+def test_page_runs(page, in_a_folder, pytestconfig):
+    blocks = list(_blocks(page))
+    if pytestconfig.getoption("only_outputs"):
+        shown = [i for i, block in enumerate(blocks) if block.shown is not None]
+        blocks = _with_needed(blocks, shown)
     _run(page, blocks)
 
 
