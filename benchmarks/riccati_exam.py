@@ -42,9 +42,9 @@ Does a solver find the right solution of your Riccati equation? This page compar
 and delucax on published test systems. `python -m benchmarks.riccati_exam` makes it.
 
 There are 39 systems: the 20 continuous and 15 discrete systems of the collections CAREX
-and DAREX (P. Benner, A. J. Laub and V. Mehrmann, 1995), with the data of SciPy's own
-tests, and four systems that users of SciPy reported. The second table varies the
-parameters of some of these systems.
+and DAREX (Benner, Laub and Mehrmann, 1995), and four systems that users of SciPy
+reported. The data of the collections are those of SciPy's own tests. In the second
+table, some of these systems have other values of their parameters.
 
 How to read the first table:
 
@@ -60,9 +60,9 @@ How to read the first table:
   plant.
 - **result**: the status of the solution that delucax returns.
 - **float32**, **its result**: the residual and the status of delucax in single
-  precision. The data are rounded to single precision first, and an equation counts as
-  solved at 1e-5 instead of 1e-12. If single precision is not enough, the status of the
-  solution says so.
+  precision. The data are rounded to single precision first. An equation counts as
+  solved if the residual is at most 1e-5, instead of 1e-12. If single precision is not
+  enough for an equation, the status of the solution shows this.
 
 The closed loop of the system CAREX 11 is on the boundary of stability.
 
@@ -174,9 +174,10 @@ def page(rows: list[dict[str, Any]], families: list[dict[str, Any]]) -> str:
         )
     lines.append("\n## Families\n")
     lines.append(
-        "A family varies the parameters of a system. The columns SciPy and delucax "
-        "show how many members of the family the solver solves. A member counts as "
-        "solved at 1e-12, and for delucax the solution must also be certified as "
+        "The members of a family are one system with different values of its "
+        "parameters. The columns SciPy and delucax show how many members of the "
+        "family the solver solves. A member counts as solved if the residual is at "
+        "most 1e-12. For delucax, the solution must also be certified as "
         "stabilising. The next two columns show the largest residual of each solver. "
         "The last two columns are for delucax in float32: the number of members that "
         "are certified, and the largest residual of the certified members.\n"

@@ -61,10 +61,11 @@ def example(board: Board, plain: str = "van_der_pol", offset: str = "neural") ->
         said += [_number(board.cost_of_zero(task)), percent(board.excess(task, method))]
     best, cost, _, excess, best_2, cost_2, zero_2, excess_2 = said
     return (
-        f"On `{plain}` the best known costs {best} and LQR {cost}: {excess}. On "
-        f"`{offset}` the best known costs {best_2} and zero control {zero_2}. MPC "
-        f"costs {cost_2} there, which looks nearly perfect, but it misses part of what "
-        f"the best known saves: {excess_2}.\n"
+        f"On `{plain}` the best known cost is {best} and LQR costs {cost}, so the "
+        f"score of LQR is {excess}. On `{offset}` the best known cost is {best_2} and "
+        f"zero control costs {zero_2}. MPC costs {cost_2} on `{offset}`, which looks "
+        "nearly perfect. But MPC misses part of what the best known saves against "
+        f"zero control, so the score of MPC is {excess_2}.\n"
     )
 
 
@@ -110,9 +111,9 @@ def tables(board: Board) -> str:
         made.append(f"### {name}: cost\n")
         made.append(_by_task(board, family, board.cost, show, best=True))
     made.append(
-        "## Time\n\nThe tables show microseconds per step for each member of a batch "
-        "of 8, including the controller. Two processes ran at the same time, on the "
-        "two threads of one core.\n"
+        "## Time\n\nThe tables show the microseconds per step for each member of a "
+        "batch of 8, for the plant and the controller together. Two processes ran at "
+        "the same time, on the two threads of one core.\n"
     )
     timed = {method for _, method in board.speeds}
     for name, family in _families(board):

@@ -85,7 +85,8 @@ THINGS = {
         adjoint=diffrax.BacksolveAdjoint(solver=diffrax.Dopri5()),
     ),
     "linear dynamics": lambda: dlx.linearize(dlx.Discretized(PENDULUM, 0.05)),
-    "system of a function": lambda: dlx.system(dlx.math.wrap, states=1, controls=1),
+    # Any function of four arguments, from a module that is trusted.
+    "system of a function": lambda: dlx.system(dlx.open_loop, states=1, controls=1),
     "cost with a bound method": lambda: dlx.costs.Quadratic(
         jnp.eye(2), jnp.eye(1), difference=PENDULUM.difference
     ),

@@ -21,34 +21,35 @@ python -m benchmarks.identification --data DIR --again   # fits all anew: over a
 ```
 
 `DIR` is a folder with the data files that this page names. delucax does not include
-these files, because they have no licence that allows it.
+these files, because they have no licence that allows us to distribute them.
 
-Each model is fitted to the estimation half of the data alone, in double precision. On
-the test data the model is simulated: it gets the recorded input and a state that is
-estimated from the first 50 samples. The error is the root mean square error over the
-samples after the first 50. Networks are trained from ten seeds, and the table shows the
-median, the smallest and the largest error.
+Each model is fitted only to the estimation data, in double precision. The model is then
+simulated on the test data with the recorded input, from a state that is estimated from
+the first 50 samples. The error is the root mean square error over the samples after the
+first 50. Networks are trained from ten seeds, and the table shows the median, the
+smallest and the largest error.
 
 - **linear** is `subspace` with an offset.
 - **physics** fits only the parameters of the physical equations, and **grey box** also
-  fits a network that is added to the derivatives of the states. The allowed size of the
-  correction by the network is chosen on the last quarter of the estimation half. For
-  Bouc-Wen it has a fixed value.
+  fits a network that is added to the derivatives of the states. The size that the
+  correction by the network may have is chosen by a simulation of the last quarter of
+  the estimation data. For Bouc-Wen this size is fixed.
 - **neural state space** is `state_space` with its defaults and an encoder of 20
   samples. This model uses no physics, and none of its settings are tuned.
 
-The equations, the sizes of the networks and the windows of the grey boxes were set by
-hand while the models were written. Two things were changed after test errors were
-known, both for Bouc-Wen:
+We chose the equations, the sizes of the networks and the windows of the grey boxes by
+hand while we developed the models. After we had seen test errors, we changed two
+things, both for Bouc-Wen:
 
 - The first fits stopped after 50 iterations, before they had converged, with an error
   of 19 um on the multisine. Now these fits may take 150 iterations.
-- Our first data generator applied the input half a step of the simulation late. The
-  grey box then had 9.2 um on the multisine and 6.2 um on the sweep, and the fit of the
-  published equations 3.6 and 3.1 um. After the correction all models were fitted again.
+- Our first data generator applied the input too late, by half a step of the simulation.
+  With these wrong data, the errors of the grey box were 9.2 um on the multisine and 6.2
+  um on the sweep, and those of the fit of the published equations were 3.6 and 3.1 um.
+  After we had corrected the generator, all models were fitted again.
 
 The data are split into estimation and test data as in the package
-`nonlinear_benchmarks` 1.0.1. Older published results may use other splits.
+`nonlinear_benchmarks` 1.0.1. Older published results may split the data in another way.
 """
 _TITLES = {
     "tanks": (
@@ -64,27 +65,30 @@ _TITLES = {
     ),
     "silverbox": (
         "Silverbox",
-        "The Silverbox is an electronic oscillator with a cubic spring. The data are "
-        "from [nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) (Wigren "
-        "and Schoukens, 2013). The file is `SNLS80mV.csv` of the archive on that site, "
-        "with the columns `V1` and `V2`, compressed as `silverbox/SNLS80mV.csv.gz`. "
-        "There are three tests: the last quarter of the multisine signal, the whole "
-        "arrow-shaped signal, and the part of the arrow whose amplitudes also occur in "
-        "the estimation half. The error is in mV. Our models are fitted to "
-        "the first 16,000 of the 65,062 samples.",
+        "The Silverbox is an electronic circuit that behaves like an oscillator with a "
+        "cubic spring. The data are from "
+        "[nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) (Wigren and "
+        "Schoukens, 2013). The file is `SNLS80mV.csv` from the archive on that site, "
+        "with the columns `V1` and `V2`. Compress this file, and store it as "
+        "`silverbox/SNLS80mV.csv.gz`. There are three tests: the last quarter of the "
+        'multisine signal, the whole arrow-shaped signal ("arrow"), and the part of '
+        "the arrow-shaped signal whose amplitudes also occur in the estimation data "
+        '("inside"). The error is in mV. Our models are fitted to the first 16,000 of '
+        "the 65,062 samples.",
     ),
     "bouc_wen": (
         "Bouc-Wen",
         "Bouc-Wen is an oscillator with a hysteretic force (Noël and Schoukens, 2016). "
-        "The data are generated here from the published equations, constants and "
-        "signals, and no file is needed. The random phases and "
-        "the integrator are our own, so the test records are not the official ones. "
-        "The physical model contains the oscillator and one hidden state for the "
-        "hysteretic force. A network learns the derivative of that force. In the row "
-        '"physics" this derivative is proportional to the velocity. So this model is '
-        'linear, with fewer parameters than the model of the row "linear". The error '
-        "is in micrometres, and the noise of the estimation data is 8 micrometres. Our "
-        "models are fitted to the first 8,192 of the 40,960 samples.",
+        "Our program generates the data from the published equations, constants and "
+        "signals, so no file is needed. Our test records differ from the official "
+        "ones, because the random phases and the integrator are our own. The physical "
+        "model contains the oscillator and one hidden state for the hysteretic force. "
+        'A network learns the derivative of the hysteretic force. In the row "physics" '
+        "the derivative of the hysteretic force is proportional to the velocity. The "
+        'model of the row "physics" is therefore linear, and has fewer parameters than '
+        'the model of the row "linear". The error is in micrometres, and the noise of '
+        "the estimation data is 8 micrometres. Our models are fitted to the first "
+        "8,192 of the 40,960 samples.",
     ),
 }
 
@@ -92,11 +96,11 @@ _TITLES = {
 _BEST_SWEEP = min(errors.get("sweep", 9e9) for _, errors, _ in PUBLISHED["bouc_wen"])
 _OTHERS = """## Your own files
 
-With `--part others` the command fits the two models that need no physics to every
-folder `DIR/others/NAME` that has a file `estimation.csv` and one or more test files,
-and prints the errors of the models. The names of the columns begin with `u` for inputs
-and with `y` for outputs. This code writes such files for another data set of
-nonlinearbenchmark.org:
+With `--part others` the command fits the two models that need no physics to your own
+data, and prints the errors of the models. Each data set is a folder `DIR/others/NAME`
+with a file `estimation.csv` and one or more test files. The names of the columns begin
+with `u` for inputs and with `y` for outputs. This code writes such files for another
+data set of nonlinearbenchmark.org:
 
 <!-- notest: needs a download -->
 ```python
@@ -150,9 +154,10 @@ def _summary(stored: dict[str, Any]) -> str:
         f"the sweep of Bouc-Wen the error of the grey box is "
         f"{median['bouc_wen', 'sweep']:.1f} um, "
         f"{median['bouc_wen', 'sweep'] / _BEST_SWEEP:.1f} times that of the published "
-        "fit that uses the equation of the hysteresis. With this equation, our own fit "
-        f"has {known['multisine']['median']:.2f} um and {known['sweep']['median']:.2f} "
-        "um."
+        "fit that uses the equation of the hysteresis. With the equation of the "
+        "hysteresis, our own fit has an error of "
+        f"{known['multisine']['median']:.2f} um on the multisine and "
+        f"{known['sweep']['median']:.2f} um on the sweep."
     )
 
 
@@ -190,18 +195,21 @@ def _coverage(rows: list[dict[str, Any]]) -> str:
         "The table shows how often intervals of 95% contain the true parameters, on "
         f"{rows[0]['records']:,} simulated records of each plant. Each plant has a "
         "hidden state, and each record has 200 samples. The initial guess of each "
-        "parameter is 20% off. A fit fails if it reports that it did not converge, or "
-        "that the data do not determine a parameter. A failed fit has no intervals.",
+        "parameter is 20% off the true value. A fit counts as failed if it reports "
+        "that it did not converge, or that the data do not determine a parameter. A "
+        "failed fit has no intervals.",
         "",
-        "The window of a fit matters. A longer window gives more information about a "
-        "hidden state. In a shorter window, a simulation with wrong parameters stays "
-        "closer to the record. Here the longer windows, which were chosen for each "
-        "plant, are at least as good: on no plant do more fits fail than with the "
-        "default window. The first three rows show them. The limits for these rows "
-        "are 92.5 to 97.5% covered and at most 1% failures. The rows with the default "
-        "window show the result of a first try without tuning. In the first row of the "
-        "tanks the upper tank overflows in each record. In the last row it seldom "
-        "overflows, and the data then say less about the level of the upper tank.",
+        "The length of the window matters. A longer window gives more information "
+        "about a hidden state. In a shorter window, a simulation with wrong "
+        "parameters stays closer to the record. In this test the longer windows, which "
+        "were chosen for each plant, are at least as good as the default window: for "
+        "no plant do more fits fail. The first three rows of the table show the longer "
+        "windows. In the first three rows, 92.5 to 97.5% of the intervals must contain "
+        "the true parameters, and at most 1% of the fits may fail. The rows with the "
+        "default window show what you get if you do not tune the window. In the row "
+        '"tanks" the upper tank overflows in each record. In the row "tanks, seldom '
+        'full" the upper tank seldom overflows, so the data contain less information '
+        "about its level.",
         "",
         "| plant | window | covered, % | by parameter, % | failures, % |",
         "|---|---|---|---|---|",

@@ -60,26 +60,26 @@ RESULTS: dict[str, list[tuple[str, dict[str, float], str]]] = {
 
 SOURCES = {
     CHAMPNEYS: "Baseline results for selected nonlinear system identification "
-    "benchmarks, arXiv 2405.10779. Our table takes its numbers from a "
-    "transcription.",
+    "benchmarks, arXiv 2405.10779. Our table takes the errors from a "
+    "transcription of this paper.",
     BEINTEMA: "Nonlinear state-space identification using deep encoder networks, L4DC.",
     PADUART: "Identification of nonlinear systems using polynomial nonlinear state "
-    "space models, Automatica 46. The errors are those that later papers quote, and "
-    "the models were fitted to other samples than ours.",
-    WORDEN: "the errors are those that the authors of the baselines quote.",
+    "space models, Automatica 46. We quote the errors from later papers. The "
+    "models of this paper were fitted to other samples than our models.",
+    WORDEN: "we quote the errors from the paper of Champneys et al., 2024.",
     RELAN: "An unstructured flexible nonlinear model for the cascaded water-tanks "
     "benchmark, IFAC-PapersOnLine 50-1.",
     BRUNOT: "Continuous-time nonlinear systems identification with output error method "
     "based on derivative-free optimisation, IFAC-PapersOnLine 50-1. The paper "
-    "gives percentages, which are converted here.",
+    "gives the errors in percent, and we converted them to the units of our tables.",
     KERNELS: "Kernel-based methods for Volterra series identification, Automatica 129.",
     VOLTERRA: "Efficient multidimensional regularization for Volterra series "
     "estimation, Mechanical Systems and Signal Processing 104.",
     NOEL: "A nonlinear state-space approach to hysteresis identification, Mechanical "
-    "Systems and Signal Processing 84. The test signal is another multisine than "
-    "ours.",
+    "Systems and Signal Processing 84. The multisine of the test in this paper is "
+    "not the same as our multisine.",
     SCHOUKENS: "Improved initialization of state-space artificial neural networks, "
-    "ECC. Later papers quote errors between 7.16 and 7.53.",
+    "ECC. Later papers quote errors between 7.16 and 7.53 for this model.",
     IACOB: "Koopman identification with a deep encoder.",
     MANIFOLD: "Manifold meta-learning for reduced-complexity neural system "
     "identification.",

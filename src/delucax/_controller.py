@@ -22,13 +22,14 @@ class AbstractController(eqx.Module):
 
     $$(u_k, s_{k+1}) = \pi(t_k, y_k, s_k)$$
 
-    Subclass it and write `__call__`. Trained weights are fields. What the controller
-    learns or remembers during an episode is its state $s$, a pytree of arrays, which
-    starts with `init`.
+    Subclass it and write `__call__`. Trained weights are fields. Everything that the
+    controller learns or remembers during an episode is in its state $s$, a pytree of
+    arrays. `init` returns the state at the start of an episode.
 
-    At each step [`delucax.rollout`][] makes these calls: `__call__` acts on the
-    observation; the environment clips the control and steps; `applied` gets the clipped
-    control and its cost.
+    At each step, [`delucax.rollout`][] first calls `__call__` with the observation.
+    Then the environment clips the control and takes a step. Finally
+    [`delucax.rollout`][] calls `applied` with the clipped control and the cost of this
+    control.
 
     A controller that draws random numbers at each step keeps a random key in its state.
     `init` stores the key in the state, and each call splits the key. A controller that
@@ -141,8 +142,8 @@ class AbstractController(eqx.Module):
 class AbstractLearner(AbstractController):
     """A controller that learns online, with a counterfactual loss of its policy.
 
-    A counterfactual loss is the cost that the current policy would have had if it had
-    also acted in the past steps. Meta-controllers such as
+    The counterfactual loss is the cost that the past steps would have had if the
+    current policy had already acted in them. Meta-controllers such as
     [`delucax.controllers.Adaptive`][] call `loss` and `fresh`. [`delucax.rollout`][]
     does not.
 
@@ -193,7 +194,7 @@ class AbstractLearner(AbstractController):
 
 
 class AbstractStochasticPolicy(AbstractController):
-    """A stochastic policy whose log-probability can be computed.
+    """A stochastic policy that can compute the log-probability of its controls.
 
     [`delucax.training.PPO`][], [`delucax.training.LikelihoodRatio`][] and
     [`delucax.training.scored_cost`][] train stochastic policies.
@@ -268,12 +269,14 @@ class Tally(eqx.Module):
     """A counter of incidents in a controller, such as failed plans.
 
     Keep it in the controller's state. After each step, [`delucax.rollout`][] finds all
-    tallies in the state, so wrappers of controllers need not forward them.
-    `trajectory.incidents` records the steps at which a count rose.
+    tallies in the state of the controller, so a controller that wraps another one need
+    not pass them on. `trajectory.incidents` records at which steps the count of a tally
+    increased.
 
     **Arguments:**
 
-    - `name`: what is counted, in the singular, such as `"failed_plan"`.
+    - `name`: the name of the incident that is counted, in the singular, for example
+      `"failed_plan"`.
 
     **Attributes:**
 

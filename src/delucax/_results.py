@@ -24,7 +24,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     `RESULTS[result]`; it is empty for a success.
 
     `delucax.RESULTS` extends `diffrax.RESULTS`, which extends the `RESULTS` of
-    Optimistix and Lineax, so that the message of a nested failure is kept.
+    Optimistix and Lineax, so that the message is kept if a solver of one of these
+    libraries fails.
     """
 
     diverged = "The states or costs became NaN or infinite."

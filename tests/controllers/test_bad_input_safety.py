@@ -41,7 +41,11 @@ NAMES = {"angle": INSIDE, "speed": lambda t, x: 2 - x[1]}
         (lambda: made(plant=3), "plant must be an AbstractSystem"),
         (lambda: made(barriers=3), r"barriers\['barrier'\] must be a function"),
         (lambda: made(barriers={}), "barriers must not be empty"),
-        (lambda: made(barriers={"a": len}), r"\['a'\] fails when .* \(t, x\)"),
+        (lambda: made(barriers={"a": len}), r"\['a'\] must be .* \(t, x\), got len"),
+        (
+            lambda: made(barriers={"a": lambda t, x: x[0, 0]}),
+            r"\['a'\] fails when .* \(t, x\)",
+        ),
         (
             lambda: made(barriers={"a": lambda t, x: x[None]}),
             "'a'.* number or a vector",

@@ -348,7 +348,7 @@ def test_bad_input():
         with user_error(match=r"limit must return a number or a vector"):
             solve(Constraints({"limit": wrong}))
     with user_error(match="limit fails when it is called"):
-        solve(Constraints({"limit": lambda t, x: x}))
+        solve(Constraints({"limit": lambda t, x, u: len(t)}))
     with user_error(match="entry 0 at stage 0 must be at least 9.0 and at most 8.0"):
         far = Constraints(controls=(9.0, 10.0))
         SQP()(dynamics, cost, x0, U, bounds=(-8.0, 8.0), constraints=far)

@@ -405,6 +405,7 @@ def test_evolution_strategies_train():
 @once
 def test_wrong_arguments_are_named():
     data = jnp.ones((4, 2))
+    of_data = lambda model, batch, key: model.slope
     for match, change in (
         ("optimiser must be an Optax optimiser such as optax.adam", {"optimiser": 0.1}),
         ("steps must be a whole number of at least 1, got 0", {"steps": 0}),
@@ -414,9 +415,13 @@ def test_wrong_arguments_are_named():
         ("block must be at most 1000, got 2000", {"block": 2000}),
         ("gradient must be an estimator", {"gradient": 3}),
         ("batch_size needs data", {"batch_size": 2}),
-        ("at most the 4 rows of data, got 5", {"data": data, "batch_size": 5}),
-        ("common leading axis", {"data": (data, jnp.ones(3))}),
-        ("common leading axis", {"data": (data, 3.0)}),
+        (
+            "at most the 4 rows of data, got 5",
+            dict(loss=of_data, data=data, batch_size=5),
+        ),
+        ("common leading axis", dict(loss=of_data, data=(data, jnp.ones(3)))),
+        ("common leading axis", dict(loss=of_data, data=(data, 3.0))),
+        (r"a function of \(model, key\), got <lambda>", {"loss": of_data}),
         ("callbacks must be a sequence", {"callbacks": print}),
         ("checkpoint_every needs checkpoint", {"checkpoint_every": 3}),
     ):

@@ -319,7 +319,7 @@ def test_evolution_trains_weights_and_the_gradient_also_scales():
 
 
 def test_an_interrupt_keeps_the_rounds_so_far(monkeypatch):
-    search = PolicySearch(env(), None, KEY, 10.0, progress=False)
+    search = PolicySearch(env(), None, KEY, 1e4, progress=False)
     better, rounds = dlx.controllers.Constant([1.0]), []
 
     def trained(self, line, method):

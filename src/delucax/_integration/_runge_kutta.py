@@ -22,13 +22,14 @@ from .._typing import RealScalar
 class RK4(diffrax.AbstractERK):
     """The classical Runge-Kutta method of order 4, as a Diffrax solver.
 
-    The method has no error estimate, so it takes fixed steps. For dense output it uses
-    cubic Hermite interpolation.
+    The method has no error estimate, so it takes fixed steps. For dense output the
+    method uses cubic Hermite interpolation.
 
     **Arguments:**
 
-    - `scan_kind`: how Diffrax loops over the stages when it takes the steps itself, as
-        for every `diffrax.AbstractERK`; `None` by default. Leave it out.
+    - `scan_kind`: how Diffrax loops over the stages of a step, as in every
+        `diffrax.AbstractERK`; `None` by default. The argument only matters if Diffrax
+        itself takes the steps. Leave it out.
 
     Source: Kutta, 1901.
 

@@ -208,18 +208,19 @@ def parameter(
 ) -> Any:
     """Declare a field that holds a physical constant.
 
-    A number in such a field becomes a floating-point array leaf. You can differentiate
-    with respect to this leaf, batch it under `jax.vmap`, and change it without
-    compiling again. A plain `float` field would be static under `eqx.filter_jit`: each
-    new value would compile again, and its gradient would be `None`.
+    If the value of the field is a number, delucax converts it to a floating-point
+    array. You can differentiate with respect to this array, batch it under `jax.vmap`,
+    and change its value without compiling again. A plain `float` field would be static
+    under `eqx.filter_jit`: JAX would compile again for each new value, and the gradient
+    of the field would be `None`.
 
     **Arguments:**
 
     - `default`: the default value, a number or an array. Without it, the field is
         required.
     - `constraint`: the valid values, [`delucax.positive`][] or a [`delucax.bounded`][];
-        none by default. The constraint is checked when a module is constructed, and
-        [`delucax.training.fit`][] keeps to it.
+        none by default. delucax checks the constraint when a module is constructed, and
+        [`delucax.training.fit`][] never violates the constraint.
 
     **Returns:** a dataclass field.
 
@@ -253,7 +254,8 @@ def weight(
 ) -> Any:
     """Declare a field that holds trainable weights: an array, a number, or a network.
 
-    By default, `delucax.training.fit` changes these fields and no others.
+    By default, `delucax.training.fit` trains only the fields that are declared with
+    `weight`.
 
     **Arguments:**
 

@@ -90,16 +90,18 @@ def by_path(flat: Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Arr
 def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     """Copy a `tree` with new values for the leaves at given paths.
 
-    Compiled functions do not compile again, because a number that replaces a
-    [`delucax.parameter`][] becomes the same kind of leaf. If you replace the dynamics
-    of an environment, the fields that were derived from the old dynamics are derived
-    again: its default disturbance, and an initial state of zeros.
+    A function that was compiled for `tree` does not compile again for the copy, because
+    a number that replaces a [`delucax.parameter`][] is converted to the same kind of
+    array. If you replace the dynamics of an environment, delucax also replaces the
+    default disturbance and an initial state of zeros, because they belong to the old
+    dynamics.
 
     After all changes, every module that contains a changed leaf runs the checks of its
     constructor. If several new values are valid only together, pass them in one call.
-    In a batch from `jax.vmap`, every member is checked. In a batch of more than 4096,
-    only a sample is checked, with a warning: the members with extreme numbers, and
-    others spread evenly. For traced values, only shapes are checked.
+    In a batch from `jax.vmap`, the checks run for every member of the batch. If the
+    batch has more than 4096 members, the checks run only for some members, with a
+    warning: for the members with extreme numbers, and for others that are spread evenly
+    over the batch. For traced values, only shapes are checked.
 
     **Arguments:**
 
@@ -110,8 +112,8 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path does not exist or is part of another path, or if
-    the values are not valid.
+    **Raises:** `ValueError` if a path does not exist, if a path is part of another
+    path, or if the values are not valid.
 
     !!! example
 

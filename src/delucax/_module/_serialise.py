@@ -40,7 +40,7 @@ _PARTIALS: dict[str, Any] = {
 def save(path: str | os.PathLike, obj: Any) -> None:
     """Save a module, a trajectory, or any pytree of modules and trajectories to a file.
 
-    The file holds the name of the class of every module, its fields, and the bytes of
+    For every module, the file holds the name of its class, its fields, and the bytes of
     its arrays. Functions are saved by name. If writing fails, no partial file is left.
 
     **Arguments:**
@@ -50,7 +50,8 @@ def save(path: str | os.PathLike, obj: Any) -> None:
         dictionary of these.
 
     **Raises:** `ValueError` if a function or class in `obj` has no name, such as a
-    lambda; the message says where it is. `OSError` if the file cannot be written.
+    lambda. The error message says where in `obj` this function or class is. `OSError`
+    if the file cannot be written.
 
     !!! example
 
@@ -85,25 +86,27 @@ def save(path: str | os.PathLike, obj: Any) -> None:
 def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     """Load what [`delucax.save`][] wrote.
 
-    Loading runs no code from the file: classes and functions are looked up by name, and
-    only in trusted packages. But the loaded object calls the functions that are named
-    in the file. Only load files from sources that you trust.
+    Loading runs no code from the file, because the file contains classes and functions
+    only by name. `load` looks up these names, and only in trusted packages. But the
+    loaded object calls the functions that the file names when you use this object. Only
+    load files from sources that you trust.
 
     **Arguments:**
 
     - `path`: the file to read.
     - `trust`: names of additional packages or modules whose classes and functions the
-        file may use; none by default. Always trusted are delucax, Diffrax, Equinox,
-        Lineax, Optax, Optimistix, the public functions of JAX and NumPy, and what you
-        defined in the running notebook or script.
+        file may use; none by default. delucax, Diffrax, Equinox, Lineax, Optax,
+        Optimistix, the public functions of JAX and NumPy, and everything that you
+        defined in the running notebook or script are always trusted.
 
     **Returns:** the object, with the same structure. A function that was compiled for
     the saved object does not compile again for the loaded object. If JAX is in single
     precision, arrays in double precision are rounded, with a warning.
 
-    **Raises:** `ValueError` if the file is damaged, not from delucax or from a newer
-    version, or if the file names a class or function that is not trusted, does not
-    exist or has other fields now. `OSError` if it cannot be read.
+    **Raises:** `ValueError` if the file is damaged, if the file is not from delucax or
+    is from a newer version, or if the file names a class or function that is not
+    trusted, that does not exist, or whose fields have changed. `OSError` if it cannot
+    be read.
 
     !!! example
 

@@ -22,8 +22,8 @@ def stack(trees: Iterable[Any]) -> Any:
 
     **Returns:** the stacked module.
 
-    **Raises:** `ValueError` if `trees` is empty, or if they differ in their structures
-    or in a number that is no array.
+    **Raises:** `ValueError` if `trees` is empty, or if the modules have different
+    structures or different numbers in a field that is not an array.
 
     !!! example
 

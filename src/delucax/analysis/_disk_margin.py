@@ -65,24 +65,26 @@ def disk_margin(
     \left\| S(j\omega) + \tfrac{\sigma - 1}{2} I \right\|,
     \qquad S = (I + L)^{-1}$$
 
-    with the skew $\sigma$ and the largest singular value as the norm. The closed loop
-    stays stable if the loop gain is multiplied by any complex factor
+    where $\sigma$ is the skew, and the norm is the largest singular value. The closed
+    loop stays stable if the loop gain is multiplied by any complex factor
 
     $$\frac{2 + (1 - \sigma)\, \delta}{2 - (1 + \sigma)\, \delta}, \qquad
     |\delta| < \alpha.$$
 
-    The loop $L$ is the linear model from $u$ to $y$, closed by $u = -y$. Several
-    channels are perturbed at once, by one full matrix $\delta$. The disk margin is
-    conservative if each channel is perturbed by an independent factor.
+    The open loop $L$ is the linear model from $u$ to $y$, and the feedback $u = -y$
+    closes this loop. If the loop has several channels, a full matrix $\delta$ perturbs
+    all of them at once. If in reality each channel is perturbed by its own factor, the
+    disk margin is conservative.
 
     **Arguments:**
 
     - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][], with as many controls as outputs.
-    - `skew`: $\sigma$, a number. 0 (default) balances the sensitivity $S$ and the
-        complementary sensitivity $T = I - S$. 1 uses $S$, and -1 uses $T$.
-    - `channel`: the index of the channel that is perturbed, while the other channels
-        stay closed without a perturbation. By default all channels are perturbed.
+    - `skew`: the skew $\sigma$, a number, 0 by default. With 0 the margin takes the
+        sensitivity $S$ and the complementary sensitivity $T = I - S$ into account
+        equally. With 1 the margin is that of $S$, and with -1 that of $T$.
+    - `channel`: the index of the only channel that is perturbed. The other channels
+        stay closed and are not perturbed. By default all channels are perturbed.
     - `throw`: raise an error if the search does not converge (default). If false, check
         `result`.
 

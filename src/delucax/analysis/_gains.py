@@ -36,8 +36,8 @@ def frequency_response(
 
     $$G(s) = C (s I - A)^{-1} B$$
 
-    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. The response is
-    infinite at a frequency at which the model has a pole. The response is
+    where $s = j \omega$, or $s = e^{j \omega \Delta t}$ in discrete time. The response
+    is infinite at a frequency at which the model has a pole. The response is
     differentiable with respect to the model and to `omega`.
 
     **Arguments:**
@@ -45,7 +45,8 @@ def frequency_response(
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
     - `omega`: angular frequencies $\omega$, in radians per unit of time, any shape.
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
 
     **Returns:** a complex array, with the shape of `omega` followed by `(p, m)`.
 
@@ -99,7 +100,8 @@ def dcgain(
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][]. It need not be stable.
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
     - `throw`: raise an error if the model has an integrator, which is a pole at
         frequency zero (default). If false, return infinity.
 
@@ -198,7 +200,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
     $$\sqrt{\mathrm{tr}(C W C^\top)}$$
 
     with the controllability Gramian $W$. The square of the norm is also the energy of
-    the outputs after a unit impulse, summed over the inputs. The norm is infinite if
+    the impulse response, summed over all inputs and outputs. The norm is infinite if
     the model is not stable. The norm is differentiable to any order, in forward and
     reverse mode.
 
@@ -206,9 +208,11 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
 
-    **Returns:** the norm, a scalar; NaN if a number of a traced model is not finite.
+    **Returns:** the norm, a scalar. The norm is NaN if a traced model contains a number
+    that is not finite.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown.
@@ -251,28 +255,31 @@ def hinf_norm(
 
     $$\max_\omega \; \sigma_{\max} \left( C (s I - A)^{-1} B \right)$$
 
-    at $s = j \omega$, or in discrete time at $e^{j \omega \Delta t}$. The norm is
+    where $s = j \omega$, or $s = e^{j \omega \Delta t}$ in discrete time. The norm is
     infinite if the model is not stable.
 
     The frequencies at which the gain crosses a level are eigenvalues of a Hamiltonian
     matrix. The search sets a level just above the largest gain found so far, and
-    evaluates the gain at the midpoints between the crossings of this level. It stops
-    when the gain does not cross the level. Newton steps then refine the peak.
+    evaluates the gain at the midpoints between the crossings of this level. The search
+    stops when the gain crosses the level at no frequency. Newton steps then refine the
+    peak.
 
-    The norm has first and second derivatives, in forward and reverse mode, if it is
-    attained at one frequency and in one direction only. If it is attained at several,
-    the derivatives belong to one of them.
+    The norm has first and second derivatives, in forward and reverse mode, if the
+    largest gain occurs at only one frequency and in only one direction of the inputs.
+    If the largest gain occurs at several frequencies or in several directions, the
+    derivatives are those of one of them.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
     - `throw`: raise an error if the search does not converge (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.analysis.PeakGain`][]. If a number of a traced model is not
-    finite, the gain is NaN and `result` is `RESULTS.ill_posed`.
+    **Returns:** a [`delucax.analysis.PeakGain`][]. If a traced model contains a number
+    that is not finite, the gain is NaN and `result` is `RESULTS.ill_posed`.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown. With `throw`, an error at run time if the search does not converge.

@@ -18,14 +18,15 @@ def controllability_matrix(
     r"""The controllability matrix $[B,\; A B,\; \dots,\; A^{n-1} B]$.
 
     The rank of the matrix is the dimension of the controllable subspace. With more than
-    a few states the matrix is ill-conditioned: to test controllability, use
-    [`delucax.analysis.is_controllable`][], which tests each mode.
+    a few states the matrix is ill-conditioned. To test controllability, use
+    [`delucax.analysis.is_controllable`][] instead, which tests each mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
 
     **Returns:** the matrix, shape `(n, n m)`.
 
@@ -54,8 +55,8 @@ def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
     r"""The observability matrix $[C;\; C A;\; \dots;\; C A^{n-1}]$.
 
     The rank of the matrix is $n$ if the model is observable. With more than a few
-    states the matrix is ill-conditioned: use [`delucax.analysis.is_observable`][]
-    instead.
+    states the matrix is ill-conditioned. To test observability, use
+    [`delucax.analysis.is_observable`][] instead.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
     [`delucax.LinearDynamics`][].
@@ -98,18 +99,19 @@ def controllability_gramian(
     W = \sum_{k=0}^{T-1} A^k B B^\top (A^\top)^k$$
 
     The horizon $T$ is infinite by default. The white noise acts at the inputs and has
-    unit intensity (unit covariance in discrete time). The minimal energy of inputs that
-    reach $x$ from rest is $x^\top W^{-1} x$. $W$ is differentiable to any order, in
-    forward and reverse mode.
+    unit intensity (unit covariance in discrete time). To drive the state from zero to
+    $x$, the inputs need at least the energy $x^\top W^{-1} x$. $W$ is differentiable to
+    any order, in forward and reverse mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `horizon`: $T$: in continuous time a positive number, in units of time; in
-        discrete time a number of steps. By default the horizon is infinite, which
+    - `horizon`: the horizon $T$, in units of time for a model in continuous time, and
+        in steps for a model in discrete time. By default the horizon is infinite, which
         requires a stable model.
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
     - `throw`: raise an error if `horizon` is not given and the model is not stable
         (default). If false, return infinity.
 
@@ -149,16 +151,16 @@ def observability_gramian(
     \text{or in discrete time} \quad
     W = \sum_{k=0}^{T-1} (A^\top)^k C^\top C A^k$$
 
-    The horizon $T$ is infinite by default. From the state $x$ and without inputs, the
-    energy of the outputs is $x^\top W x$. $W$ is differentiable to any order, in
-    forward and reverse mode.
+    The horizon $T$ is infinite by default. If the model starts at the state $x$ and its
+    inputs are zero, the energy of the outputs is $x^\top W x$. $W$ is differentiable to
+    any order, in forward and reverse mode.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `horizon`: $T$: in continuous time a positive number, in units of time; in
-        discrete time a number of steps. By default the horizon is infinite, which
+    - `horizon`: the horizon $T$, in units of time for a model in continuous time, and
+        in steps for a model in discrete time. By default the horizon is infinite, which
         requires a stable model.
     - `throw`: raise an error if `horizon` is not given and the model is not stable
         (default). If false, return infinity.

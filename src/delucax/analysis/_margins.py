@@ -37,10 +37,10 @@ class Margins(eqx.Module):
     - `disk`, `disk_s`, `disk_t`: the disk margins, each a
         [`delucax.analysis.DiskMargin`][]. `disk_s` is the margin of the sensitivity
         $S = 1 / (1 + L)$, `disk_t` is the margin of the complementary sensitivity
-        $T = L / (1 + L)$, and `disk` balances $S$ and $T$.
-    - `is_stable`: whether the closed loop is stable. If it is not stable, `gain_margin`
-        and `gain_reduction` are 1, the other margins are 0, and the frequencies are
-        NaN.
+        $T = L / (1 + L)$, and `disk` takes $S$ and $T$ into account equally.
+    - `is_stable`: whether the closed loop is stable. If the closed loop is not stable,
+        `gain_margin` and `gain_reduction` are 1, the other margins are 0, and the
+        frequencies are NaN.
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     All attributes except `is_stable` and `result` are differentiable.
@@ -85,14 +85,15 @@ class Margins(eqx.Module):
 def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     r"""The gain, phase, delay and disk margins of a loop with one input and one output.
 
-    The loop $L$ is the linear model from $u$ to $y$, closed by $u = -y$. For a state
-    feedback $u = -K x$, take $A$ and $B$ of the plant and $C = K$.
+    The open loop $L$ is the linear model from $u$ to $y$, and the feedback $u = -y$
+    closes this loop. To analyse a state feedback $u = -K x$, pass a model with $A$ and
+    $B$ of the plant and with $C = K$.
 
     The frequencies at which $L$ is real or $|L| = 1$ are computed as eigenvalues of
     matrices. Sign changes of $\operatorname{Im} L$ and of $\log |L|$ show which of
-    these frequencies are crossings, and each crossing is refined to rounding error. The
-    margins have first and second derivatives in forward and reverse mode, which are the
-    derivatives at the critical crossing.
+    these frequencies are crossings, and each crossing is then computed to the accuracy
+    of rounding. The margins have first and second derivatives in forward and reverse
+    mode. The derivatives are those at the critical crossing.
 
     **Arguments:**
 

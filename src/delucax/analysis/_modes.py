@@ -21,11 +21,12 @@ class ModalTest(eqx.Module):
 
     - `modes`: the eigenvalues $\lambda$ of $A$, shape `(n,)`, complex.
     - `distances`: the smallest singular value of $[(A - \lambda I) / |A|,\; B / |B|]$
-        for each mode, shape `(n,)`. For observability $A^\top$ and $C^\top$ take the
-        place of $A$ and $B$. The distance is the smallest relative change of the
-        matrices that makes the mode uncontrollable, so it is zero for a mode that is
-        uncontrollable already.
-    - `unstable`: which modes are on or outside the boundary of stability, shape `(n,)`.
+        for each mode, shape `(n,)`. In a test of observability, $A^\top$ and $C^\top$
+        take the place of $A$ and $B$. The distance is the smallest relative change of
+        the matrices that makes the mode uncontrollable, so it is zero for a mode that
+        is uncontrollable already.
+    - `unstable`: whether each mode is on or outside the boundary of stability, shape
+        `(n,)`.
     - `tolerance`: a distance up to this number is treated as zero.
 
     The measurements have no gradient.
@@ -94,7 +95,8 @@ def modal_controllability(
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
     - `tolerance`: a relative distance up to this number is treated as zero; by default
         `10 n` times machine epsilon.
 
@@ -285,9 +287,9 @@ def poles(model: LinearModel) -> Complex[Array, " n"]:
     r"""The poles of a linear model: the eigenvalues of $A$.
 
     A [`delucax.systems.LinearSystem`][] is stable if all poles have a negative real
-    part. [`delucax.LinearDynamics`][] are stable if all poles have a modulus below 1.
-    Simple poles have first derivatives, in forward and reverse mode. The order of the
-    poles is not defined.
+    part. [`delucax.LinearDynamics`][] are stable if all poles have a modulus below 1. A
+    pole that occurs only once has first derivatives, in forward and reverse mode. The
+    poles are in no particular order.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
     [`delucax.LinearDynamics`][].

@@ -66,7 +66,8 @@ class PeriodicOrbit(eqx.Module):
     - `jacobian`: the Jacobian of the map from event to event, shape `(n, n)`.
     - `multipliers`: the eigenvalues of `jacobian`, shape `(n,)`, complex, the largest
         first. The orbit is stable if all multipliers are inside the unit circle. At
-        least one multiplier is zero, because every event happens on the same surface.
+        least one multiplier is zero, because the state lies on the same surface at
+        every event.
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     !!! example
@@ -101,10 +102,10 @@ def poincare_map(
 ) -> Return:
     """The Poincare map: from the state after one event to the state after the next.
 
-    Other events that fire before the next one are applied too. The system is integrated
-    by `dynamics` in intervals of `dt`, with the same control in all intervals. The
-    event may be at any time within an interval. The map is differentiable with respect
-    to every array.
+    If other events fire before the next event `event`, the map applies them too. The
+    system is integrated by `dynamics` in intervals of `dt`, with the same control in
+    all intervals. The event may be at any time within an interval. The map is
+    differentiable with respect to every array.
 
     **Arguments:**
 

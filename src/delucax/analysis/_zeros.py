@@ -25,19 +25,20 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
     $$\begin{bmatrix} A - z I & B \\ C & 0 \end{bmatrix}$$
 
     The algorithm first balances the matrices, so the units of the plant hardly matter.
-    It removes the states that the outputs observe directly. Then it applies this step
-    to the transposed system. The poles of the remaining system are the zeros.
-    The number of zeros depends on the values of the matrices, so the matrices cannot be
-    traced.
+    Then the algorithm removes the states that the outputs observe directly, first from
+    the system and then from the transposed system. The poles of the remaining system
+    are the zeros. The number of zeros depends on the values of the matrices, so the
+    matrices cannot be traced.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `inputs`: `"controls"` (default), or `"disturbances"` for $E$ instead of $B$.
+    - `inputs`: the inputs of the model, `"controls"` (default) with the matrix $B$, or
+        `"disturbances"` with the matrix $E$.
 
-    **Returns:** the zeros, complex, shape `(number of zeros,)`. A zero that is also a
-    pole is not cancelled.
+    **Returns:** the zeros, complex, shape `(number of zeros,)`. A zero stays in the
+    result even if it is also a pole.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, if `inputs` is
     unknown, or if the model is traced by `jax.jit`, `jax.vmap` or `jax.grad`.

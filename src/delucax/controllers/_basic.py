@@ -55,7 +55,7 @@ class Zero(AbstractController):
 class Constant(AbstractController):
     """A constant control, $u = v$.
 
-    **Arguments:** `value`: $v$, shape `(m,)`; trainable.
+    **Arguments:** `value`: the control $v$, shape `(m,)`; trainable.
 
     **Raises:** `ValueError` if `value` is not a finite vector.
 
@@ -93,10 +93,11 @@ class Random(AbstractController):
     **Arguments:**
 
     - `std`: the standard deviation $\sigma$, shape `(m,)`.
-    - `mean`: $\mu$, a number or of shape `(m,)`; 0 by default.
+    - `mean`: the mean $\mu$, a number or an array of shape `(m,)`; 0 by default.
 
-    **Raises:** `ValueError` if `std` is not a vector of finite numbers of at least 0,
-    or `mean` has the wrong shape; at run time, if there is no random key.
+    **Raises:** `ValueError` if `std` is not a vector of finite numbers that are not
+    negative, or `mean` has the wrong shape; at run time, if `init` did not get a random
+    key.
 
     !!! example
 
@@ -173,7 +174,8 @@ class OpenLoop(AbstractController):
 
     After the last step of the sequence, the controller keeps applying the last control.
 
-    **Arguments:** `values`: $v$, shape `(steps, m)`; trainable.
+    **Arguments:** `values`: the sequence $v$ of controls, shape `(steps, m)`;
+    trainable.
 
     **Raises:** `ValueError` if `values` is not a matrix of finite numbers with at least
     one row.

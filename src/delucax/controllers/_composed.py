@@ -26,15 +26,16 @@ class Scheduled(AbstractController):
     r"""A controller for each time step, $u_k = \pi_k(t_k, y_k)$.
 
     At time `t`, the controller with index `round(t / dt)` acts. After the end of the
-    sequence, the last controller acts. Before the start the control is NaN, which a
-    rollout reports. All controllers share one state, so the state must have the same
-    structure and meaning for all controllers.
+    sequence, the last controller continues to act. At a time before the first
+    controller, the control is NaN, and a rollout reports this. Each controller passes
+    its state to the next controller, so the state must have the same structure and
+    meaning for all controllers.
 
     **Arguments:**
 
     - `controllers`: one controller module whose arrays have a leading time axis, with
         one entry for each time step. `eqx.filter_vmap` makes such a module.
-    - `dt`: the time between one controller and the next.
+    - `dt`: the time for which each controller acts.
 
     **Raises:** `ValueError` if `controllers` is not a controller, if the leading axes
     of its arrays are missing or differ in length, or if `dt` is not positive.
@@ -125,19 +126,19 @@ class History(AbstractController):
     $$u_t = \pi(t, (z_t, z_{t-1}, \dots, z_{t-n}, u_{t-1}, \dots, u_{t-n})),
     \qquad z_t = \phi(y_t)$$
 
-    The past controls in the window are the applied controls, after clipping. At the
-    start of an episode, the past controls are zero and the past observations equal the
-    first one.
+    The past controls in the window are the controls after clipping, which the plant
+    received. At the start of an episode, all past controls in the window are zero, and
+    all past observations are equal to the first observation.
 
     **Arguments:**
 
-    - `base`: $\pi$, the controller that acts on the window. The observation of `base`
-        is a vector with `size * (n + 1) + controls * n` entries.
+    - `base`: the controller $\pi$ that acts on the window. The observation of `base` is
+        a vector with `size * (n + 1) + controls * n` entries.
     - `size`: the size of the features $z$.
     - `controls`: the number of controls.
-    - `length`: $n$, the number of past steps; 1 by default.
-    - `features`: $\phi$, a function of an observation, such as `env.encode`; the
-        observation itself by default.
+    - `length`: the number $n$ of past steps in the window; 1 by default.
+    - `features`: the function $\phi$ that computes the features of an observation, such
+        as `env.encode`. By default the features are the observation itself.
 
     **Raises:** `ValueError` if `base` is not a controller or a size is below 1; at run
     time, if the features do not have `size` entries.

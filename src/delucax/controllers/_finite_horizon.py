@@ -34,13 +34,14 @@ class FiniteHorizonLQR(AbstractController):
     e_T^\top Q_f e_T, \qquad e = \mathrm{difference}(x, r), \quad v = u - u_r$$
 
     The feed-forward control $\kappa$ takes the reference and the known disturbance of
-    all steps into account. The feed-forward is zero if the dynamics go from each $r_k$
-    to $r_{k+1}$ under $u_{r,k}$, for example along a planned trajectory.
+    all steps into account. If the reference is a trajectory of the dynamics, such as a
+    plan, the feed-forward is zero: the control $u_{r,k}$ then takes the state from
+    $r_k$ to $r_{k+1}$.
 
     **Arguments:**
 
-    - `dynamics`: linear dynamics that observe their state, time-invariant or
-        time-varying.
+    - `dynamics`: linear dynamics, time-invariant or time-varying, whose observation is
+        the state.
     - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`, or `(T, n, m)`; zero by default.
@@ -56,17 +57,17 @@ class FiniteHorizonLQR(AbstractController):
         function of time; none by default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
         subtraction by default.
-    - `parallel`: whether to solve the recursion in parallel over time, for
-        accelerators; false by default.
+    - `parallel`: whether to compute all steps of the Riccati recursion in parallel,
+        which is faster on accelerators; false by default.
 
     **Attributes:** `K`, the gains, trainable, shape `(T, m, n)`; `k`, the feed-forward
     $\kappa$, trainable, shape `(T, m)`; `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`,
-    the references $r$ and $u_r$, shapes `(T, n)` and `(T, m)`. Before step 0 and from
-    step `T` on the control is NaN, which a rollout reports.
+    the references $r$ and $u_r$, shapes `(T, n)` and `(T, m)`. The control is NaN
+    before step 0 and after the last step of the horizon, and a rollout reports this.
 
-    **Raises:** `ValueError` if `dynamics` is not linear or does not observe its state,
-    no horizon is known, or a weight or signal has the wrong shape; an error at run time
-    if the cost of a step has no minimum.
+    **Raises:** `ValueError` if `dynamics` is not linear or does not have its state as
+    the observation, the horizon is unknown, or a weight or signal has the wrong shape;
+    an error at run time if the cost of a step has no minimum.
 
     Source: Kalman, 1960; Anderson and Moore, 1990 (tracking).
 

@@ -30,38 +30,41 @@ class HInfinity(AbstractController):
     \right) \le \gamma^2 \sum_k w_k^\top w_k$$
 
     where $\delta x$ and $\delta u$ are the deviations from the operating point. The
-    sums run over all time, or over a finite horizon. With a horizon the gain varies in
-    time, and the left side includes the final cost.
+    sums run over all time, or over a finite horizon. With a finite horizon the gain
+    varies in time, and the left side of the inequality also contains the final cost.
 
     By default $\gamma$ is the smallest level that a controller can attain. A larger
     $\gamma$ improves the average performance at the expense of the worst case.
 
     **Arguments:**
 
-    - `dynamics`: linear dynamics that rest at their operating point and observe their
-        state, for example from [`delucax.linearize`][]. The disturbance enters through
-        their `E`. Time-varying dynamics have a finite horizon, and must go from each
-        operating point to the next.
-    - `Q`: state weight, shape `(n, n)`, symmetric; with a horizon also `(T, n, n)`.
-    - `R`: control weight, shape `(m, m)`, symmetric; with a horizon also `(T, m, m)`.
+    - `dynamics`: linear dynamics whose operating point is an equilibrium and whose
+        observation is the state, for example from [`delucax.linearize`][]. The
+        disturbance enters through their `E`. Time-varying dynamics have a finite
+        horizon, and each of their operating points must lead to the next one.
+    - `Q`: state weight, shape `(n, n)`, symmetric. With a finite horizon the shape may
+        also be `(T, n, n)`.
+    - `R`: control weight, shape `(m, m)`, symmetric. With a finite horizon the shape
+        may also be `(T, m, m)`.
     - `gamma`: the level $\gamma$, a positive number; by default the smallest level that
         a controller can attain.
-    - `horizon`: the number of steps `T`. By default the horizon is the length of
-        time-varying `dynamics`, and infinite for time-invariant `dynamics`.
-    - `final`: final weight, shape `(n, n)`, symmetric, only with a horizon; zero by
-        default.
+    - `horizon`: the number of steps `T`. By default the horizon is infinite if
+        `dynamics` is time-invariant. If `dynamics` is time-varying, the horizon is its
+        number of steps.
+    - `final`: final weight, shape `(n, n)`, symmetric, allowed only with a finite
+        horizon; zero by default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
         subtraction by default.
 
     **Attributes:** `K`, the gain, trainable, shape `(m, n)`, or `(T, m, n)`; `P`, the
     solution of the game, shape `(n, n)`, or `(T+1, n, n)`; `L`, the gain of the worst
     disturbance `w = L dx`, shape `(k, n)`, or `(T, k, n)`; `gamma`, the level; `x_ref`
-    and `u_ref`, the operating point. With a horizon the control is NaN before step 0
-    and from step `T` on, which a rollout reports.
+    and `u_ref`, the operating point. With a finite horizon the control is NaN before
+    step 0 and after the last step, and a rollout reports this.
 
-    **Raises:** `ValueError` if `dynamics` is not linear, does not rest at its operating
-    point or does not observe its state, or if an argument has the wrong shape or value;
-    an error at run time if no controller attains `gamma`.
+    **Raises:** `ValueError` if `dynamics` is not linear, if its operating point is not
+    an equilibrium, if its observation is not the state, or if an argument has the wrong
+    shape or value; an error at run time if no controller attains `gamma`.
 
     Source: Basar and Bernhard, 1995.
 

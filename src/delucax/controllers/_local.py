@@ -55,17 +55,19 @@ def local_model(
 ) -> LocalModel:
     """The linearised dynamics and the second-order cost of an environment.
 
-    Both the dynamics and the cost are expanded at the operating point of
-    `environment.trim()`. A linear design such as [`delucax.controllers.LQR`][] needs
-    this model.
+    The function linearises the dynamics and approximates the cost to second order, both
+    at the operating point from `environment.trim()`. A linear design such as
+    [`delucax.controllers.LQR`][] needs this model.
 
     Linear designs need a positive definite cost. If the cost is flat or concave in some
-    direction, that direction gets the weight `regularisation` times the largest weight.
+    direction, the function sets the weight of this direction to `regularisation` times
+    the largest weight.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `regularisation`: the smallest weight relative to the largest, 1e-4 by default.
+    - `regularisation`: the ratio of the smallest allowed weight to the largest weight,
+        1e-4 by default.
 
     **Returns:** a [`delucax.controllers.LocalModel`][].
 
@@ -128,13 +130,14 @@ def local_lqr(environment: Environment, *, regularisation: float = 1e-4) -> LQR:
     **Arguments:**
 
     - `environment`: the environment. Its observation must be its state.
-    - `regularisation`: the smallest weight relative to the largest, 1e-4 by default.
+    - `regularisation`: the ratio of the smallest allowed weight to the largest weight,
+        1e-4 by default.
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if the state is not observed, or for the same reasons as
-    [`delucax.controllers.local_model`][]; an error at run time if there is no
-    stabilising gain.
+    **Raises:** `ValueError` if the observation is not the state, or for the same
+    reasons as [`delucax.controllers.local_model`][]; an error at run time if there is
+    no stabilising gain.
 
     !!! example
 
@@ -164,20 +167,21 @@ def local_mpc(
 ) -> MPC:
     r"""The MPC of an environment, with the model, cost and bounds of the environment.
 
-    Differences of angles are wrapped, as `environment.dynamics.difference` does.
+    Differences of states come from `environment.dynamics.difference`, which wraps
+    angles.
 
-    With an `lqr`, the final cost of each plan is the cost to go of that regulator,
+    If you pass `lqr`, the final cost of each plan is the cost to go of this regulator,
     $\delta x^\top P\, \delta x$.
 
     **Arguments:**
 
     - `environment`: the environment. Its observation must be its state.
-    - `lqr`: the regulator whose cost to go is the final cost, for example from
-        [`delucax.controllers.local_lqr`][]. By default plans end with the final cost of
-        the environment.
+    - `lqr`: a linear-quadratic regulator, whose cost to go becomes the final cost, for
+        example from [`delucax.controllers.local_lqr`][]. By default each plan uses the
+        final cost of the environment.
     - `horizon`: the number of steps of a plan, 30 by default.
-    - `planner`: by default [`delucax.planning.ILQR`][] with at most 8 iterations, or
-        [`delucax.planning.SQP`][] with `real_time`.
+    - `planner`: the planner of the MPC. By default it is [`delucax.planning.ILQR`][]
+        with at most 8 iterations, or [`delucax.planning.SQP`][] if `real_time` is true.
     - `real_time`, `throw`: as in [`delucax.controllers.MPC`][].
 
     **Returns:** a [`delucax.controllers.MPC`][].

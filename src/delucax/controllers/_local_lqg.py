@@ -27,7 +27,7 @@ _LEAST = 1e-6
 def local_lqg(
     environment: Environment, *, key: PRNGKey, regularisation: float = 1e-4
 ) -> LQG:
-    r"""The LQG of an environment whose state need not be observed.
+    r"""The LQG of an environment, for an observation that need not be the full state.
 
     [`delucax.controllers.local_model`][] computes the linear-quadratic model. The
     covariances $W$ of a step and $V$ of a reading are estimated from random draws:
@@ -36,21 +36,22 @@ def local_lqg(
     V = \mathrm{E}[v v^\top] + 10^{-6}\, C\, \Sigma_0\, C^\top$$
 
     Here $w$ is the disturbance, $v$ is the sensor noise, and $\Sigma_0$ is the
-    covariance of the initial state, with a millionth of its largest variance added to
-    each variance. The terms with $\Sigma_0$ are there because a plant without noise
-    has no filter otherwise.
+    covariance of the initial state. A millionth of the largest variance of the initial
+    state is added to each variance in $\Sigma_0$. The terms with $\Sigma_0$ are needed
+    because without them a plant without noise would have no Kalman filter.
 
-    The filter estimates the state of the plant, with the steady-state gain at all
-    times. Its first estimate is the operating point. Differences of states are those of
-    `environment.dynamics.difference`, which wraps angles.
+    The Kalman filter estimates the state of the plant, and uses its steady-state gain
+    from the first step on. The first estimate of the filter is the operating point.
+    Differences of states come from `environment.dynamics.difference`, which wraps
+    angles.
 
     **Arguments:**
 
     - `environment`: the environment.
-    - `key`: a random key, for 1000 draws of the initial state and for 1000 steps of the
-        disturbance and of the sensor noise.
-    - `regularisation`: the smallest weight of the cost relative to the largest, 1e-4 by
-        default.
+    - `key`: a random key. With this key, the function draws 1000 initial states, and
+        1000 steps of the disturbance and of the sensor noise.
+    - `regularisation`: the ratio of the smallest allowed weight of the cost to the
+        largest weight, 1e-4 by default.
 
     **Returns:** a [`delucax.controllers.LQG`][].
 

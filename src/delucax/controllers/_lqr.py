@@ -50,19 +50,21 @@ class LQR(AbstractController):
     $$u_k = u_{r,k} - K\, \mathrm{difference}(x_k, r_k) -
     (R + B^\top P B)^{-1} B^\top \sum_{j \ge 0} ((A - B K)^\top)^j P\, d_{k+j}$$
 
-    Here $d_k = F(r_k, u_{r,k}, w_k) - r_{k+1}$ is the error of the reference after one
-    step $F$ of the linear dynamics. The feed-forward is optimal if the signals are
-    known `preview` steps ahead and are constant after that. The state reaches a
-    constant $r$ exactly only if $u_r$ holds it there, because the cost penalises any
-    control other than $u_r$. [`delucax.controllers.LQI`][] reaches it without knowing
-    $u_r$.
+    Here $F$ is one step of the linear dynamics. A plant that is at the reference $r_k$
+    misses the next reference $r_{k+1}$ by $d_k = F(r_k, u_{r,k}, w_k) - r_{k+1}$. The
+    feed-forward control is optimal if the reference and the other two signals are known
+    for the next `preview` steps and are constant after these steps. The state reaches a
+    constant reference $r$ exactly only if $u_r$ is the control that holds the plant at
+    $r$, because the cost penalises any other control. [`delucax.controllers.LQI`][]
+    reaches a constant reference without knowing $u_r$.
 
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
         and whose state is observed, for example from [`delucax.linearize`][]; or any
-        dynamics, if you give a `point`. The residual of the equilibrium must be below
-        1e-4 times $|A - I|\,|x_\mathrm{ref}| + |B|\,|u_\mathrm{ref}|$.
+        dynamics, if you give a `point`. The change of the state in one step from this
+        equilibrium must be below 1e-4 times
+        $|A - I|\,|x_\mathrm{ref}| + |B|\,|u_\mathrm{ref}|$.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
@@ -73,10 +75,12 @@ class LQR(AbstractController):
         by default.
     - `disturbance`: $w$, a disturbance known in advance, a vector of shape `(k,)` or a
         function of time; none by default.
-    - `preview`: the number of steps ahead at which the signals are known, 0 by default.
-    - `difference`: a function `(x, x_ref) -> deviation`, for example the `difference`
-        of the system that you linearised, to wrap angles. By default it is subtraction
-        or, with a `point`, the `difference` of nonlinear `dynamics`.
+    - `preview`: the number of future steps for which the controller knows `reference`,
+        `control_reference` and `disturbance`, 0 by default.
+    - `difference`: a function `(x, x_ref) -> deviation` that wraps angles, for example
+        the `difference` of the system that you linearised. By default the deviation is
+        `x - x_ref`, except if you give nonlinear `dynamics` and a `point`: then the
+        default is `dynamics.difference`.
     - `point`: the [`delucax.dynamics.OperatingPoint`][] about which to linearise
         `dynamics` at time 0, from [`delucax.trim`][]. Without it, `dynamics` must be
         linear.
@@ -204,7 +208,8 @@ class LQI(AbstractController):
 
     $$v^\top Q v + 2\, v^\top S\, \delta u + \delta u^\top R\, \delta u$$
 
-    where $v$ stacks the deviation of the state and the integral $z$.
+    where the vector $v$ consists of the deviation of the state, followed by the
+    integral $z$.
 
     If the applied control differs from the control that the regulator computed, for
     example because of clipping, then back-calculation sets the integral to the value
@@ -223,7 +228,8 @@ class LQI(AbstractController):
     - `reference`: $r$, a vector of shape `(p,)` or a function of time that returns such
         a vector; the outputs at the operating point by default.
     - `difference`: a function `(x, x_ref) -> deviation`, for example to wrap angles;
-        subtraction by default. The outputs are `C x_ref` plus $C$ times the deviation.
+        subtraction by default. The controller computes the outputs as `C x_ref` plus
+        $C$ times this deviation.
 
     **Attributes:** `K` and `Ki`, the gains, trainable, shapes `(m, n)` and `(m, p)`;
     `P`, the solution of the Riccati equation, shape `(n+p, n+p)`; `x_ref` and `u_ref`,

@@ -83,21 +83,24 @@ class MPC(AbstractController):
         in `incidents["failed_plan"]`,
     - `last`: the last plan, shifted by one step, a [`delucax.planning.Start`][].
 
-    After a rollout, `run.controller_state` is this state at the end, and
-    `run.incidents["failed_plan"]` is true at the steps whose plan was not successful.
-    Both are there if `keep` of [`delucax.rollout`][] holds `"controller_state"` and
-    `"incidents"`, as by default. The cost and the violation of the plans are not
-    stored: plan again from the times and states of the run, as in the example. These
-    plans do not start from the last plan, so they may end in another local minimum.
+    After a rollout, `run.controller_state` is the state of the controller at the end of
+    the run, and `run.incidents["failed_plan"]` is true at the steps whose plan was not
+    successful. The rollout stores both by default; if you pass `keep` to
+    [`delucax.rollout`][], it must hold `"controller_state"` and `"incidents"`. A
+    rollout does not store the costs of the plans and the violations of their
+    constraints. To get them, compute the plans again from the times and states of the
+    run, as in the example. The new plans do not start from the plan of the step before,
+    so they may end in another local minimum.
 
     If the planner runs out of iterations or finds no descent, the controller still uses
-    its plan, because it is the best plan so far. A plan is unusable if every start
-    diverges or the constraints cannot hold. `throw` and `fallback` decide what the
-    controller does without a usable plan.
+    its plan, because it is the best plan so far. A plan is unusable if the planner
+    diverges from every start, or if no plan can satisfy the constraints. `throw` and
+    `fallback` decide what the controller does without a usable plan.
 
-    **Real time.** With `real_time` the planner does not iterate until it converges.
-    Each step solves one quadratic program of [`delucax.planning.SQP`][] about the last
-    plan, shifted by one step, and takes the full step. `prepare` sets up the program
+    **Real time.** With `real_time` the planner does not iterate until it converges. At
+    each time step, [`delucax.planning.SQP`][] solves only one quadratic program, which
+    approximates the problem about the last plan, shifted by one step. The solution of
+    this program is the new plan, without a line search. `prepare` sets up the program
     before the state is measured. `feedback` solves it with at most `max_qp_steps`
     linear systems; `state.iterations` is the number of systems that it solved:
 
@@ -115,8 +118,8 @@ class MPC(AbstractController):
 
     **Derivatives.** The derivatives of the control are the derivatives of the planner.
     [`delucax.planning.ILQR`][] uses the implicit function theorem, and gives NaN if a
-    plan did not converge. If the planner is based on samples, only the start that it
-    chose is differentiated. The choice itself has no derivative.
+    plan did not converge. If the planner draws samples, the derivatives treat the
+    choice of the best start as fixed.
 
     **Arguments:**
 
@@ -127,27 +130,28 @@ class MPC(AbstractController):
     - `horizon`: the number of steps `T` of a plan.
     - `planner`: any [`delucax.planning.AbstractPlanner`][]; [`delucax.planning.ILQR`][]
         by default. You can differentiate with respect to its floating-point options,
-        and change these options without compiling again. A planner that has `states`
-        starts each plan only from these states and the controls of the last plan, not
-        from the other trajectories above.
+        and change these options without compiling again. If you set the option `states`
+        of the planner, each plan starts only from these states and the controls of the
+        last plan, not from the other trajectories above.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
     - `start`: the trajectories from which a plan may start besides the last plan; by
-        default the second and third trajectory above. If you give controls of shape
-        `(T, m)`, they replace the control of the third trajectory. A
-        [`delucax.planning.Start`][] replaces both trajectories, for example by another
-        stabilising feedback, and so does a [`delucax.planning.Plan`][]. The first plan
-        also starts from their multipliers.
+        default the second and third trajectory of the list above. If you give controls
+        of shape `(T, m)`, they replace the control of the third trajectory. A
+        [`delucax.planning.Start`][] or a [`delucax.planning.Plan`][] replaces both
+        trajectories, for example by a trajectory under another stabilising feedback.
+        The first plan also starts from the multipliers of this `Start` or `Plan`.
     - `throw`: whether to raise an error at run time if there is no usable plan; true by
-        default. If false, the controller uses the last plan for one more step, under
-        the gains of the plan, and then discards the plan. If there is no usable plan in
-        the next step either, it applies the first trajectory of `start`, which is by
-        default the trajectory under the LQR. With `real_time`, the controller keeps
-        following the last plan. All these controls keep `bounds`, but they need not
-        keep `constraints`.
-    - `fallback`: a controller that acts in the steps without a usable plan, instead of
-        raising. The fallback is called at every step, and gets the control that was
-        applied, so that its state is up to date. None by default.
+        default. If `throw` is false, the controller follows the last usable plan for
+        one more step, with the feedback gains of this plan, and then discards this
+        plan. If there is no usable plan in the next step either, the controller follows
+        the first trajectory of `start`, which is by default the trajectory under the
+        LQR. With `real_time`, the controller keeps following the last plan. All these
+        controls are within `bounds`, but they may violate `constraints`.
+    - `fallback`: a controller that computes the control in the steps without a usable
+        plan, so that no error is raised. The fallback is called at every step and gets
+        the control that was applied, so that the state of the fallback is always up to
+        date. None by default.
     - `real_time`: whether to solve one quadratic program per step; false by default.
         With `real_time`, the planner must be a [`delucax.planning.SQP`][], which is
         also the default.

@@ -43,8 +43,8 @@ class MLP(AbstractController):
     - `depth`: the number of hidden layers, 2 by default; 0 for a linear map.
     - `features`: $\phi$, a function of an observation, such as `env.encode`; the
         observation itself by default.
-    - `bounds`: `(low, high)`, each a finite number or vector, between which `tanh`
-        keeps the control; none by default.
+    - `bounds`: the bounds `(low, high)` of the control, each a finite number or vector;
+        none by default. The function `tanh` keeps the control between these bounds.
     - `activation`: the activation function of the hidden layers, `jnp.tanh` by default.
     - `key`: a random key for the initial weights.
 
@@ -150,23 +150,24 @@ def mlp_policy(
     head: Literal["deterministic", "gaussian"] = "deterministic",
     key: PRNGKey,
 ) -> AbstractController:
-    """A fully connected network that fits an environment.
+    """A fully connected network with the numbers of inputs and outputs that an
+    environment needs.
 
-    The network acts on `environment.encode(y)`. The network keeps the controls between
-    `environment.control_bounds` by `tanh`, if these bounds are finite.
+    The network acts on `environment.encode(y)`. If `environment.control_bounds` are
+    finite, the network keeps the controls between these bounds by `tanh`.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `width`: the number of units in a hidden layer, 64 by default.
     - `depth`: the number of hidden layers, 2 by default.
-    - `head`: `"deterministic"` (default) or `"gaussian"`. The standard deviation of a
-        Gaussian starts at a quarter of the range of each control, or at 1 without
-        bounds.
+    - `head`: `"deterministic"` (default) or `"gaussian"`. With `"gaussian"`, the
+        initial standard deviation of each control is a quarter of the range between its
+        bounds, or 1 without bounds.
     - `key`: a random key for the initial weights.
 
     **Returns:** a [`delucax.controllers.MLP`][], or a
-    [`delucax.controllers.Gaussian`][] around one.
+    [`delucax.controllers.Gaussian`][] whose mean is such a network.
 
     **Raises:** `ValueError` if `environment` is not an environment, `head` is unknown,
     a size is below 1 or no `key` is given.
@@ -303,7 +304,7 @@ class Standardise(eqx.Module):
 
     $$z = \operatorname{clip}((\phi(y) - \mu) / \sigma, -10, 10)$$
 
-    Pass it as the `features` of a network. [`delucax.training.PPO`][] and
+    Pass a `Standardise` as the `features` of a network. [`delucax.training.PPO`][] and
     [`delucax.training.SHAC`][] set `mean` and `std` of every `Standardise` in their
     model, from the observations during training.
 

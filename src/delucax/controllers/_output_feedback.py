@@ -30,10 +30,10 @@ class OutputFeedback(AbstractController):
 
     At each step the estimator updates its estimate with the observation, and the
     controller acts on the mean of the estimate. Then the estimator predicts the next
-    state, with the control that was applied after clipping.
+    state with the control that was applied, after clipping.
 
-    A rollout counts the steps at which the `status` of the estimator is not successful,
-    in `incidents["failed_estimate"]`.
+    In a rollout, `incidents["failed_estimate"]` is true at the steps at which the
+    `status` of the estimator is not successful.
 
     **Arguments:**
 
@@ -105,7 +105,7 @@ class LQG(AbstractController):
     $$u = u_\mathrm{ref} - K (\hat x - x_\mathrm{ref})$$
 
     Here $\hat x$ is the filtered estimate, which includes the current observation. The
-    filter predicts with the control that was applied after clipping.
+    filter predicts the next state with the control that was applied, after clipping.
 
     For the plant
 
@@ -143,10 +143,10 @@ class LQG(AbstractController):
         default.
     - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by
         default.
-    - `difference`: a function `(x, x_ref) -> deviation` that replaces subtraction of
-        states in the regulator, for example to wrap angles. The filter predicts with
-        the linear model, which does not wrap them, so the state should begin within
-        the turn of the operating point.
+    - `difference`: a function `(x, x_ref) -> deviation` that replaces the subtraction
+        of states in the regulator, for example to wrap angles. The filter predicts with
+        the linear model, which does not wrap angles. So each angle should begin less
+        than half a turn from the operating point.
     - `observation_difference`: the same for observations.
 
     **Attributes:** `regulator`, a [`delucax.controllers.LQR`][], with `K` and `P`;

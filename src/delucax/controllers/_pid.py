@@ -177,8 +177,8 @@ class PID(_AbstractPID):
     \end{aligned}$$
 
     The derivative $D$ passes through a first-order lag and starts at 0. By default $D$
-    is the derivative of $z = -h(y)$, so a jump of the reference gives no jump of the
-    control through $D$. With `derivative_on="error"`, $z = e$.
+    is the derivative of $z = -h(y)$, so a jump of the reference does not make $D$ jump.
+    With `derivative_on="error"`, $z = e$.
 
     The second term of the integral is back-calculation, which prevents windup.
     Back-calculation uses the control that was applied, so it also works for the bounds
@@ -187,24 +187,24 @@ class PID(_AbstractPID):
     **Arguments:**
 
     - `kp`, `ki`, `kd`: the gains $k_p$, $k_i$ and $k_d$, each a number or a vector with
-        an entry for each loop; trainable. `ki` and `kd` are 0 by default. The unit of a
-        gain is the unit of the control divided by the unit of the error, of its
-        integral or of its derivative.
+        an entry for each loop; trainable. `ki` and `kd` are 0 by default. The units of
+        $k_p$, $k_i$ and $k_d$ are the unit of the control divided by the units of the
+        error, of its integral and of its derivative, in this order.
     - `dt`: the control interval $\Delta t$, equal to the environment's `dt`.
     - `reference`: $r$, a function of time, a vector or a number; 0 by default.
-    - `output`: $h$, which takes the controlled outputs from the observation: an index
-        into the observation, a tuple of indices, a matrix, or a function of the
-        observation. By default the whole observation.
+    - `output`: $h$, which computes the controlled outputs from the observation: an
+        index into the observation, a tuple of indices, a matrix, or a function of the
+        observation. By default all entries of the observation are outputs.
     - `bounds`: `(low, high)`, each a number or a vector; none by default.
     - `derivative_time_constant`: $T_d$, the time constant of the first-order lag of the
         derivative, `dt` by default; 0 for no lag.
     - `derivative_on`: `"measurement"` (default) or `"error"`.
     - `anti_windup_time`: $T_a$, at least `dt`. The default is the integral time
-        `kp / ki` of each loop, but at least `dt`.
+        `kp / ki` of each loop, or `dt` if the integral time is shorter than `dt`.
 
-    **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or a
-    time is out of its range; at run time, if the number of outputs is not the number of
-    loops.
+    **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or
+    `dt` or a time constant is out of its range; at run time, if the number of outputs
+    is not the number of loops.
 
     Source: Åström and Hägglund, 2006.
 
@@ -308,10 +308,10 @@ class LeakyPID(_AbstractPID):
     u_k &= \operatorname{clip}(k_p e_k + k_i I_k + k_d D_k, \mathrm{low}, \mathrm{high})
     \end{aligned}$$
 
-    Both averages and the error start at 0. The average $I$ does not wind up, but it
-    does not remove a constant error of the outputs. The "derivative" $D$ is an average
-    of differences that is not divided by `dt`. For an exact integral and derivative,
-    use [`delucax.controllers.PID`][].
+    The averages $I$ and $D$ and the error $e$ are 0 before the first step. The average
+    $I$ does not wind up, but it does not remove a constant error of the outputs. The
+    "derivative" $D$ is an average of differences that is not divided by `dt`. For an
+    exact integral and derivative, use [`delucax.controllers.PID`][].
 
     **Arguments:**
 
@@ -320,9 +320,9 @@ class LeakyPID(_AbstractPID):
     - `dt`, `reference`, `output`, `bounds`: as in [`delucax.controllers.PID`][].
     - `time_constant`: $T$, 0.5 by default.
 
-    **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or a
-    time is not positive; at run time, if the number of outputs is not the number of
-    loops.
+    **Raises:** `ValueError` if the sizes of the arguments do not fit each other, or
+    `dt` or `time_constant` is not positive; at run time, if the number of outputs is
+    not the number of loops.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).

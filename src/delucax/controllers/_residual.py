@@ -15,7 +15,7 @@ class Residual(AbstractController):
     $$u = \operatorname{clip}(\pi_\mathrm{base}(t, y), \mathrm{low}, \mathrm{high}) +
     \pi_\mathrm{correction}(t, y)$$
 
-    Both controllers are told the total control that was applied.
+    After each step, both controllers get the total control that was applied.
     [`delucax.training.fit`][] with `trainable="correction"` trains only the correction.
 
     **Arguments:**
@@ -24,11 +24,11 @@ class Residual(AbstractController):
     - `correction`: the controller whose control is added.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, to which the control of
         `base` is clipped before the correction is added; none by default. Without
-        `bounds`, the correction must first undo a base control that is far beyond the
-        environment's bounds.
+        `bounds`, the control of `base` may be far beyond the environment's bounds, and
+        then a small correction has no effect.
 
-    **Raises:** `ValueError` if `base` or `correction` is not a controller, or low
-    bounds are above high ones; at run time, if the two controls differ in size.
+    **Raises:** `ValueError` if `base` or `correction` is not a controller, or a lower
+    bound is above its upper bound; at run time, if the two controls differ in size.
 
     Source: Johannink et al., 2019; Silver, Allen, Tenenbaum and Kaelbling, 2018
     (residual policy learning).

@@ -62,8 +62,8 @@ class SafetyFilterState(NamedTuple):
 class SafetyFilter(AbstractController):
     r"""A filter that makes any controller safe with the smallest change of its control.
 
-    The filter takes the control $n$ of a controller, and keeps barriers $b(t, x)$ at
-    zero or above. It solves
+    The filter takes the control $n$ of a controller, and changes it so that the
+    barriers $b(t, x)$ stay at zero or above. It solves
 
     $$\min_u \tfrac12 \sum_i \mathrm{weight}_i\,(u_i - n_i)^2
     \quad\text{such that}\quad c(t, x, u) \ge \mathrm{margin}, \quad
@@ -76,9 +76,10 @@ class SafetyFilter(AbstractController):
     $$c = \dot b + \mathrm{decay}\; b$$
 
     A barrier has relative degree two if only its second derivative depends on the
-    control. The condition of a barrier of degree two has $\dot b + \mathrm{decay}\; b$
-    in place of $b$, and a second decay. The filter determines the degree when you make
-    it.
+    control. The condition of a barrier of relative degree two has
+    $\dot b + \mathrm{decay}\; b$ in place of $b$, and a second value of `decay`. The
+    filter determines the relative degree of each barrier once, when you construct the
+    filter.
 
     If the filter acts at all times and $b \ge 0$ at the start, then $b \ge 0$ at all
     times. A barrier of degree two also needs $\dot b + \mathrm{decay}\; b \ge 0$ at the
@@ -88,40 +89,41 @@ class SafetyFilter(AbstractController):
 
     $$c = b(t + \Delta t, F(t, x, u)) - (1 - \mathrm{decay})\, b(t, x)$$
 
-    The filter linearises the condition at $n$, and again at each solution, until the
-    solution does not change any more. If no barrier is at risk, one linearisation is
-    enough.
+    The filter linearises the condition at the control $n$, solves for $u$, and
+    linearises again at this solution, until the solution does not change any more. If
+    the control $n$ is safe already, one linearisation is enough.
 
-    **Disturbances.** With `disturbance`, the condition holds for the worst
-    $|w_i| \le \mathrm{disturbance}_i$, in both derivatives of a barrier of degree two.
-    This worst case is exact in continuous time, where $f$ must be affine in $w$. In
-    discrete time it is exact to first order in $w$.
+    **Disturbances.** With the argument `disturbance`, the condition holds for all
+    disturbances with $|w_i| \le \mathrm{disturbance}_i$. For a barrier of relative
+    degree two, the filter takes the worst disturbance in both derivatives. In
+    continuous time, the worst case is exact, and $f$ must be affine in $w$. In discrete
+    time, the worst case is exact only to first order in $w$.
 
     **A control that is held.** If the control is held between samples, a condition can
     be violated between two samples. [`held`][delucax.controllers.SafetyFilter.held]
-    computes a margin that prevents this.
+    computes a margin that prevents such violations.
 
     **Conditions that cannot hold.** A condition with a `price` may be violated by an
-    amount $d$, at a cost of $\tfrac12\, \mathrm{price}\; d^2$. If the hard conditions
-    cannot all hold within the bounds, the filter returns the control within the bounds
-    with the smallest sum of the distances to these conditions. A rollout counts such
-    steps in `incidents["failed_filter"]`. The state of the controller has, for the last
-    step,
+    amount $d$, at a cost of $\tfrac12\, \mathrm{price}\; d^2$. Conditions without a
+    price are hard. If no control within the bounds satisfies all hard conditions, the
+    filter returns the control within the bounds that has the smallest sum of distances
+    to these conditions. In a rollout, `incidents["failed_filter"]` is true at the steps
+    at which the filter failed. The state of the controller has, for the last step,
 
     - `missed`: by how much each condition was violated,
     - `result`: the status: `no_feasible_point` if a hard condition was violated,
         `ill_posed` if a number was NaN, `not_converged` if a condition in discrete time
         was still violated after `max_iterations`,
-    - `iterations`: the number of linearisations,
+    - `iterations`: the number of linearisations.
 
-    and `failures`, the number of failed steps so far.
+    The state also has `failures`, the number of failed steps so far.
 
     **Derivatives.** You can train a policy through the filter. The derivatives are
-    exact. In discrete time, they come from the implicit function theorem and are exact
-    if the filter converged. A single active condition is solved in closed form, and
-    several active conditions by [`delucax.qp.solve`][]. The control is not smooth at
-    states where a condition becomes active. At such states the derivative is a
-    one-sided derivative, or NaN if a quadratic program was solved.
+    exact. In discrete time, the derivatives come from the implicit function theorem,
+    and they are exact if the filter converged. A single active condition is solved in
+    closed form, and several active conditions by [`delucax.qp.solve`][]. The control is
+    not smooth at states where a condition becomes active. At such states the derivative
+    is a one-sided derivative, or NaN if a quadratic program was solved.
 
     **Arguments:**
 
@@ -134,9 +136,10 @@ class SafetyFilter(AbstractController):
         dictionary of such functions. You can differentiate with respect to the
         [`delucax.parameter`][] fields of a barrier that is an `eqx.Module`.
     - `decay`: how fast a barrier may fall, 1 by default: a rate (1/s) in continuous
-        time, a fraction from 0 to 1 in discrete time. Give a number; or, for degree
-        two, a pair of the first and the second decay; or a dictionary from the name of
-        a barrier to a number or a pair.
+        time, a fraction from 0 to 1 in discrete time. Give a number or, for barriers of
+        relative degree two, a pair of the first and the second decay. To give each
+        barrier its own decay, pass a dictionary from the names of the barriers to
+        numbers or pairs.
     - `margin`: by how much each condition must be above zero, in the units of the
         condition; 0 by default. Give a number, or a dictionary from the name of a
         barrier to a number.
@@ -149,19 +152,21 @@ class SafetyFilter(AbstractController):
         default all are hard.
     - `weight`: the cost of changing each control, a number or of shape `(m,)`; 1 by
         default.
-    - `states`: the states at which the filter checks the relative degree and that the
-        system is affine, shape `(k, n)`. By default 16 points in a box of half-width 1
-        about the equilibrium, or about zero.
+    - `states`: the states at which the filter checks the relative degree of the
+        barriers, and whether the system is affine in the control, shape `(k, n)`. By
+        default the filter checks 16 points in a box of half-width 1 about the
+        equilibrium of the plant, or about zero if the plant defines no equilibrium.
     - `degrees`: the relative degree of each barrier, 1 or 2; a number, or a dictionary
         from the name of a barrier to a number. Give the degrees if the plant or the
-        barriers are traced, because the filter cannot determine or check them under a
-        trace.
-    - `max_iterations`: the largest number of linearisations in discrete time, 20 by
-        default.
+        barriers hold traced arrays, for example under `jax.jit`, because then the
+        filter cannot determine or check the degrees.
+    - `max_iterations`: the largest number of times that the filter linearises the
+        conditions at one time step, 20 by default. This limit is only for dynamics in
+        discrete time.
 
     **Raises:** `ValueError` if an argument has the wrong type, shape or value, if a
     barrier does not have relative degree 1 or 2, or if the system is not affine in the
-    control, or in a bounded disturbance.
+    control or, if `disturbance` is given, in the disturbance.
 
     Source: Ames et al., 2017 and 2019; Nguyen and Sreenath, 2016, Xiao and Belta, 2019
     (degree two); Jankovic, 2018 (disturbances); Agrawal and Sreenath, 2017 (discrete

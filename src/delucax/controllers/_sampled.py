@@ -23,13 +23,15 @@ def sampled_weights(
     dt: ArrayLike,
     S: Numbers | None = None,
 ) -> tuple[Array, Array, Array]:
-    r"""The exact weights of a continuous-time quadratic cost under a held control.
+    r"""The weights of the discrete-time cost that equals a continuous-time quadratic
+    cost exactly, if the control is held over each step.
 
     $$x^\top Q_d x + 2 x^\top S_d u + u^\top R_d u =
     \int_0^{\Delta t} \left( x(t)^\top Q x(t) + 2 x(t)^\top S u + u^\top R u \right)
     dt$$
 
-    The integral follows $\dot x = A x + B u$ from $x(0) = x$, with $u$ constant.
+    In the integral, the state $x(t)$ solves $\dot x = A x + B u$ from $x(0) = x$, with
+    $u$ constant.
 
     **Arguments:**
 
@@ -111,22 +113,22 @@ def lqrd(
     $$\delta x^\top Q\, \delta x + 2\, \delta x^\top S\, \delta u +
     \delta u^\top R\, \delta u$$
 
-    where $\delta x$ and $\delta u$ are the deviations from the operating point. The `P`
-    of the controller belongs to this continuous-time cost: the minimal cost from a
-    deviation $\delta x$ is $\delta x^\top P\, \delta x$. As `dt` goes to 0, the gain
-    converges to the gain of [`delucax.riccati.care`][].
+    where $\delta x$ and $\delta u$ are the deviations from the operating point. The
+    minimum of this continuous-time cost from a deviation $\delta x$ is
+    $\delta x^\top P\, \delta x$, where $P$ is the attribute `P` of the controller. As
+    `dt` goes to 0, the gain converges to the gain of [`delucax.riccati.care`][].
 
     **Arguments:**
 
-    - `system`: a linear system about an equilibrium, or any other system, which is
-        linearised at `point` or, without a `point`, at the equilibrium that the system
-        defines.
+    - `system`: a linear system about an equilibrium, or any other system. A nonlinear
+        system is linearised at `point` or, without a `point`, at the equilibrium that
+        the system defines.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `dt`: the step, a positive number.
     - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `difference`: a function `(x, x_ref) -> deviation`; by default subtraction for a
-        linear system, and the `difference` of any other system.
+    - `difference`: a function `(x, x_ref) -> deviation`; by default subtraction if the
+        system is linear, and the method `difference` of the system if it is not.
     - `point`: the [`delucax.dynamics.OperatingPoint`][] about which to linearise
         `system` at time 0, from [`delucax.trim`][].
 

@@ -63,10 +63,10 @@ class Gaussian(_AroundBase):
     e \sim N(0, I)$$
 
     The mean $\mu$ is the control of `base`. For a deterministic evaluation use
-    `gaussian.base`. The draw is differentiable: analytic gradients pass through it,
-    with the noise $e$ held fixed.
+    `gaussian.base`. You can differentiate the drawn control with respect to $\mu$ and
+    $\sigma$, with the noise $e$ held fixed.
 
-    The log-probability belongs to the clipped control. Between the bounds, the
+    The log-probability is that of the control after clipping. Between the bounds, the
     log-probability is the log of the normal density. At a bound, it is the log of the
     probability of all draws that are clipped to that bound. So if you pass the bounds
     of the environment, `log_prob` gives the log-probability of the controls that a

@@ -239,7 +239,7 @@ class Scaled(AbstractCost):
     **Arguments:**
 
     - `cost`: the cost, a [`delucax.AbstractCost`][].
-    - `factor`: $a$, a number. You can differentiate with respect to it.
+    - `factor`: $a$, a number. You can differentiate with respect to `factor`.
 
     **Raises:** `ValueError` if `cost` is not a cost, or `factor` is not a finite
     number.
@@ -274,7 +274,7 @@ class Scaled(AbstractCost):
 
 
 class Rate(AbstractCost):
-    r"""A cost per unit of time, charged for a step: $c(t, x, u)\, \Delta t$.
+    r"""A cost per unit of time, multiplied by the time step: $c(t, x, u)\, \Delta t$.
 
     The sum over the steps approximates an integral over time, so you can change `dt`
     without changing the weights. The final cost is unchanged.

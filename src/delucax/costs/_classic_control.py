@@ -21,12 +21,13 @@ class Arrival(AbstractCost):
 
     **Arguments:**
 
-    - `reached`: a function `(t, x) -> bool` that says whether the state is a goal.
-        Usually `reached` is the `terminated` function of the environment. By default no
-        state is a goal.
+    - `reached`: a function `(t, x) -> bool` that says whether the state is a goal
+        state. Usually `reached` is the `terminated` function of the environment. By
+        default no state is a goal state.
     - `step_cost`: $a$, 1 by default.
     - `control_weight`: $b$, 0 by default.
-    - `arrival_cost`: $c$, 0 by default. Pass a negative number to reward the arrival.
+    - `arrival_cost`: $c$, 0 by default. With a negative `arrival_cost`, the arrival at
+        a goal is rewarded.
 
     **Raises:** `ValueError` if a number is not finite.
 
@@ -107,8 +108,8 @@ class PendulumCost(AbstractCost):
 
 
 class AcrobotHeight(AbstractCost):
-    r"""A smooth cost for the acrobot: the squared height by which its tip is below
-    upright.
+    r"""A smooth cost for the acrobot: the square of the vertical distance of its tip
+    from its highest position.
 
     $$q(x) + b\, \tau^2, \qquad q(x) = (2 + \cos\theta_1 + \cos(\theta_1 + \theta_2))^2
     + a\, (\dot\theta_1^2 + \dot\theta_2^2)$$

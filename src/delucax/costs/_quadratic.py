@@ -165,15 +165,15 @@ class Tracking(_AbstractQuadratic):
 
     - `Q`: error weight, shape `(p, p)`, symmetric; or its diagonal, shape `(p,)`.
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
-    - `reference`: $r$, a function of time to a vector of shape `(p,)`, such as those in
-        `delucax.references`.
+    - `reference`: $r$, a function of time that returns a vector of shape `(p,)`, such
+        as those in `delucax.references`.
     - `final`: final weight $Q_f$, symmetric, or its diagonal, like `Q`; no final cost
         by default.
-    - `output`: $h$, a function of the state to the vector that should follow the
-        reference, shape `(p,)`; the state itself by default.
+    - `output`: $h$, a function of the state that returns the vector that should follow
+        the reference, shape `(p,)`; the state itself by default.
 
-    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if its
-    size does not fit the error or the control.
+    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if the
+    size of a weight does not fit the error or the control.
 
     !!! example
 

@@ -55,8 +55,8 @@ class Constant(AbstractEntrywise):
     **Arguments:**
 
     - `value`: a number, or shape `(size,)`.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if `value` is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if `value` is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -93,8 +93,8 @@ def shock(
     - `value`: a number, or shape `(size,)`.
     - `start`: the time at which the push starts, in units of time.
     - `duration`: how long the push lasts, in units of time.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if `value` is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if `value` is a vector.
 
     **Returns:** the disturbance.
 
@@ -131,11 +131,11 @@ class Sinusoid(AbstractEntrywise):
     **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `amplitude`: $a$.
-    - `frequency`: $f$, in hertz if time is in seconds.
+    - `frequency`: the frequency $f$, in hertz if time is in seconds.
     - `phase`: $\phi$ [rad], 0 by default.
     - `offset`: $b$, 0 by default.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if another argument is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -177,17 +177,18 @@ class Square(AbstractEntrywise):
     """A square wave: `+amplitude` in the first part of each period, `-amplitude` in the
     rest.
 
-    A period that differs from a whole number of steps only by rounding lasts exactly
-    that number of steps. The first part of a period is rounded in the same way. The
-    gradient with respect to `period` and `duty` is zero almost everywhere.
+    If rounding is the only reason why a period is not a whole number of steps, the
+    period lasts exactly that number of steps. The first part of a period is rounded in
+    the same way. The gradient with respect to `period` and `duty` is zero almost
+    everywhere.
 
     **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `amplitude`: half the difference between the two values of the wave.
     - `period`: in units of time, positive.
     - `duty`: the fraction of the period at `+amplitude`, from 0 to 1; 0.5 by default.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if another argument is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
     positive, or `duty` is not between 0 and 1. `sequence` also raises a `ValueError` if
@@ -246,7 +247,8 @@ class FromArray(AbstractDisturbance):
 
     **Arguments:**
 
-    - `values`: shape `(steps, size)`, with at least as many steps as the horizon.
+    - `values`: an array of shape `(steps, size)`, with at least as many steps as the
+        horizon.
 
     **Raises:** `ValueError` at construction if `values` is not a matrix of finite
     numbers, and in `sequence` if `values` has fewer steps than the horizon.

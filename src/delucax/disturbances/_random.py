@@ -24,8 +24,8 @@ class Gaussian(AbstractEntrywise):
 
     - `std`: the standard deviation $\sigma$.
     - `mean`: $\mu$, 0 by default.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if another argument is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` is
     negative.
@@ -68,8 +68,8 @@ class Uniform(AbstractEntrywise):
     **Arguments:** every argument except `size` is a number or has shape `(size,)`.
 
     - `low`, `high`: the ends of the interval.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if another argument is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `high` is
     below `low`.
@@ -116,8 +116,8 @@ class RandomWalk(AbstractEntrywise):
 
     - `std`: $\sigma$, the standard deviation of a step, 0.3 by default.
     - `bound`: $b$, 1 by default.
-    - `size`: the number of entries of the disturbance at each step. You may leave it
-        out if another argument is a vector.
+    - `size`: the number of entries of the disturbance at each step. You may leave out
+        `size` if another argument is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` or
     `bound` is negative.
@@ -173,15 +173,15 @@ class Brownian(AbstractDisturbance):
 
     - `size`: the number of Brownian motions.
     - `dt`: the control interval $\Delta t$, in units of time. By default, `sequence`
-        takes the interval between its first times, of which there must then be at least
-        two.
+        takes the interval between the first two of its `times`, so `times` must then
+        have at least two entries.
     - `substeps`: the number of solver steps per control interval, 1 by default. The
         disturbance holds the increments of all substeps of an interval, one after the
         other.
 
     **Raises:** `ValueError` if `size` or `substeps` is below 1 or `dt` is not positive.
-    If `dt` is left out, `sequence` also raises a `ValueError` if there are fewer than
-    two times, or if the times are so large that rounding hides the interval between
+    Without `dt`, `sequence` also raises a `ValueError` if `times` has fewer than two
+    entries, or if its entries are so large that rounding hides the interval between
     them.
 
     !!! example

@@ -38,8 +38,8 @@ class AbstractDynamics(AbstractPlant):
     r"""Dynamics in discrete time, $x_{k+1} = F(t_k, x_k, u_k, w_k)$.
 
     Environments, planners and controllers compute the next state of a plant with these
-    dynamics. To define your own, subclass `AbstractDynamics`, set `dt` and the names of
-    the states and controls, and write `advance`.
+    dynamics. To define your own dynamics, subclass `AbstractDynamics`, set `dt` and the
+    names of the states and controls, and write `advance`.
 
     **Attributes:**
 
@@ -338,14 +338,14 @@ class Forwarding(AbstractDynamics):
 
 
 class AbstractDiscretization(Forwarding):
-    """Discrete-time dynamics of a continuous-time system. The field `system` holds this
-    system, and the dynamics have the names, units, sensor and equilibrium of the
-    system.
+    """Discrete-time dynamics of a continuous-time system. The field `system` holds the
+    continuous-time system. The dynamics take the names, units, sensor and equilibrium
+    from this system.
 
     Subclass `AbstractDiscretization`, declare the fields `system` and `dt`, and write
-    `advance`. In `advance`, the disturbance `w` must act as the property `noise` of the
-    system says. You rarely need your own subclass, because [`delucax.Discretized`][]
-    takes any system and any solver.
+    `advance`. In `advance`, the disturbance `w` must act in the way that the property
+    `noise` of the system names. You rarely need your own subclass, because
+    [`delucax.Discretized`][] takes any system and any solver.
 
     !!! example
 
@@ -387,8 +387,8 @@ class AbstractDiscretization(Forwarding):
 
 
 class AbstractWrapper(Forwarding):
-    """Dynamics around other dynamics. The field `dynamics` holds the wrapped dynamics,
-    and everything that a subclass does not override is taken from them.
+    """Dynamics around other dynamics. The field `dynamics` holds the wrapped dynamics.
+    A subclass takes everything that it does not override from the wrapped dynamics.
 
     Subclass `AbstractWrapper`, declare the field `dynamics`, and write `advance`. If
     the wrapper adds entries to the state, also give `state_names`, `observe`,

@@ -37,7 +37,8 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
     \left(I + \tfrac{\Delta t}{2} A\right), \qquad
     B_d = \left(I - \tfrac{\Delta t}{2} A\right)^{-1} B\, \Delta t$$
 
-    A disturbance that enters the vector field is held over the step too.
+    If a disturbance enters the vector field, it is also held over the step, like the
+    control.
 
     **Arguments:**
 
@@ -92,9 +93,9 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     $$A = \tfrac{2}{\Delta t} (A_d + I)^{-1} (A_d - I), \qquad
     B = \tfrac{2}{\Delta t} (A_d + I)^{-1} B_d$$
 
-    Several continuous-time systems can have the same samples. `"zoh"` returns the
-    system whose frequencies are below $\pi / \Delta t$. The result is differentiable to
-    any order, in forward and reverse mode.
+    Several continuous-time systems can give the same discrete-time system. Of these,
+    `"zoh"` returns the one whose frequencies are below $\pi / \Delta t$. The result is
+    differentiable to any order, in forward and reverse mode.
 
     **Arguments:**
 
@@ -104,9 +105,10 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     **Returns:** a [`delucax.systems.LinearSystem`][] about the same operating point.
 
     **Raises:** `ValueError` if `dynamics` is not `LinearDynamics` or is time-varying,
-    or `method` is unknown. `RuntimeError` (an error at run time under `jax.jit`) if no
-    such system exists: for `"zoh"` if $A_d$ has an eigenvalue that is zero or negative,
-    for `"tustin"` if it has the eigenvalue -1.
+    or `method` is unknown. `RuntimeError` (an error at run time under `jax.jit`) if
+    there is no continuous-time system with these samples. With `"zoh"`, this is so if
+    $A_d$ has an eigenvalue that is zero or negative; with `"tustin"`, if $A_d$ has the
+    eigenvalue -1.
 
     Source: Cheng, Higham, Kenney and Laub, 2001 (the logarithm by square roots).
 

@@ -116,7 +116,8 @@ class Delayed(_AbstractDelay):
 
     $$x_{k+1} = F(t_k, x_k, u_{k-c}, w_k), \qquad y_k = h(t_{k-s}, x_{k-s})$$
 
-    The state holds the pending controls and observations after the state of the plant:
+    The state consists of the state of the plant, the controls that have not yet reached
+    the plant, and the observations that have not yet been read:
     $(x_k, u_{k-1}, \dots, u_{k-c}, y_{k-1}, \dots, y_{k-s})$. The delay is an exact
     transport delay, not an approximation, and the delayed values are differentiable
     like any other state. For delays that are not a whole number of steps, use
@@ -204,28 +205,30 @@ class TransportDelay(_AbstractDelay):
     $$\dot x = f(t, x, u(t - \tau_u), w), \qquad y(t) = h(t - \tau_y, x(t - \tau_y))$$
 
     The control is held over each control interval, so the delayed control switches once
-    within an interval. The interval is therefore integrated in two parts, which is
-    exact. If the sensor is delayed, the interval is also integrated from its start to
-    the time of the delayed reading.
+    within an interval. Therefore the interval is integrated in two parts, before and
+    after the switch, which causes no error. If the sensor is delayed, another
+    integration goes from the start of the interval to the time of the delayed reading.
 
     The state is $(x_k, u_{k-1}, \dots, y_{k-1}, \dots)$: the state of the plant, the
-    pending controls and the earlier readings of the sensor, the newest first. `filled`
-    makes such a state from a state of the plant. Disturbances act as in the plant; an
-    additive disturbance is added at the end of the interval.
+    controls that have not yet reached the plant, and the earlier readings of the
+    sensor, the newest first. The method `filled` makes such a state from a state of the
+    plant. Disturbances act as they do without a delay; an additive disturbance is added
+    at the end of the interval.
 
-    The delays are differentiable. If a delay is a whole number of steps, its derivative
-    is the right-hand derivative. The number of controls and readings in the state is
-    fixed at construction. If you change a delay later, as `delucax.training.fit` may,
-    the new delay must not need more of them; otherwise the status of a step is
-    `delay_beyond_memory`.
+    The delays are differentiable. If a delay is a whole number of steps, the derivative
+    with respect to this delay is the right-hand derivative. The number of controls and
+    readings in the state is fixed at construction. If a delay is changed later, for
+    example by `delucax.training.fit`, and needs more controls or readings than the
+    state holds, the status of a step is `delay_beyond_memory`.
 
     **Arguments:**
 
     - `dynamics`: the plant, such as a [`delucax.Discretized`][], without a diffusion.
     - `controls`: $\tau_u$, the delay of the controls, in units of time; 0 by default.
     - `sensor`: $\tau_y$, the delay of the sensor, in units of time; 0 by default.
-    - `control_memory`, `sensor_memory`: the longest delays that you may set later, in
-        steps; by default as long as the given delays need.
+    - `control_memory`, `sensor_memory`: the longest delays of the controls and of the
+        sensor that you may set later, in steps; by default the given delays, rounded up
+        to whole steps.
 
     **Raises:** `ValueError` if `dynamics` is not the discretisation of a system or has
     a diffusion, or if a delay is negative, not finite, or longer than `control_memory`

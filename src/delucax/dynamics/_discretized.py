@@ -58,9 +58,9 @@ class Discretized(AbstractDiscretization):
 
     After the integration, the system's `project` is applied. If the system has
     `disturbance_names`, the disturbance `w` enters the vector field and is held over
-    the interval. If the system has no `disturbance_names`, `w` is added to the
-    projected state, which may move the state off the manifold of `project` until the
-    next step.
+    the interval. If the system has no `disturbance_names`, `w` is added to the state
+    after the projection. This may move the state off the manifold of `project` until
+    the next step.
 
     **Fixed steps** (the default): the interval is cut into `substeps` equal steps of
     `solver`. The solver may be an explicit or a diagonally implicit Runge-Kutta method.
@@ -73,10 +73,10 @@ class Discretized(AbstractDiscretization):
     that a step of an autonomous system has the same result at any start time `t`. A
     time-dependent vector field or diffusion is evaluated at `t + s`. Below double
     precision, the sum `t + s` is rounded: in float32 the error is up to 5e-4 at a time
-    of 1e4. The vector field is then corrected for this rounding error with its first
-    two derivatives with respect to time. If the second forward-mode derivative does not
-    exist, for example because the field uses a `jax.custom_vjp` of time, there is no
-    correction.
+    of 1e4. The value of the vector field is then corrected for this rounding error, by
+    its first two derivatives with respect to time. There is no correction if the second
+    derivative cannot be computed in forward mode, for example because the vector field
+    uses a `jax.custom_vjp` of time.
 
     **Diffusion:** if the system has a `diffusion`, `w` holds the Brownian increments of
     all substeps, one after the other, each with the variance `dt / substeps`. Use one
@@ -87,15 +87,17 @@ class Discretized(AbstractDiscretization):
     **Events:** a [`delucax.systems.AbstractHybridSystem`][] is integrated from event to
     event.
 
-    - *Detection.* Each guard is interpolated over a step by a cubic, from its values
-        and its time derivatives at both ends of the step. The cubic detects where the
+    - *Detection.* In each step of the solver, the value of a guard is approximated by a
+        cubic polynomial of time. The cubic matches the values and the time derivatives
+        of the guard at both ends of the step. The zeros of the cubic show where the
         guard crosses zero, even if the guard crosses zero and comes back within the
         same step. The step is then shortened until it ends at the event, up to
-        rounding, so that the states keep the order of the solver.
-    - *Limits.* Up to `max_events` events may happen in one control interval. A crossing
-        of a guard whose event is not enabled counts as one of them. If several guards
-        cross at once, the event that is first in `event_names` fires; the other events
-        are checked after the reset of the first one.
+        rounding. So the events do not lower the order of accuracy of the solver.
+    - *Limits.* Up to `max_events` events may happen in one control interval. A zero
+        crossing of a guard counts as an event here, even if the event of this guard is
+        not enabled. If several guards cross zero at the same time, the event that is
+        first in `event_names` fires; the other events are checked after the reset of
+        the first one.
     - *Derivatives* are the exact derivatives of the computed trajectory, in forward and
         reverse mode and to any order. The derivatives take into account that the time
         of an event changes with the state (the saltation matrix).
@@ -107,7 +109,7 @@ class Discretized(AbstractDiscretization):
         The state then stays at its value after the last event that was handled.
     - `RESULTS.beyond_guard`: the state is beyond an enabled guard at the start of the
         interval or after a reset. The event of this guard does not fire until the guard
-        has returned to the side where it should be.
+        has returned to its allowed side.
     - `RESULTS.grazing`: a guard hardly crosses zero. The state is still correct, but
         the derivatives are NaN. If a guard does not cross zero but comes closer to zero
         than the error of the cubic interpolation, the event may or may not fire.
@@ -122,8 +124,8 @@ class Discretized(AbstractDiscretization):
     **Arguments:**
 
     - `system`: the continuous-time system.
-    - `dt`: the control interval $\Delta t$, in units of time, a positive number. `dt`
-        is an array leaf, so a new value does not cause a new compilation.
+    - `dt`: the control interval $\Delta t$, in units of time, a positive number. If you
+        change `dt`, JAX does not compile again, because `dt` is an array leaf.
     - `solver`: a Diffrax solver; [`delucax.dynamics.RK4`][] by default, and
         `diffrax.Euler` for a system with a diffusion.
     - `substeps`: the number of solver steps per control interval, 1 by default; for
@@ -134,7 +136,8 @@ class Discretized(AbstractDiscretization):
         `diffrax.RecursiveCheckpointAdjoint()` by default. Fixed steps are
         differentiated directly. `diffrax.BacksolveAdjoint()` raises an error if you ask
         for a gradient with respect to `dt`.
-    - `max_steps`: the largest number of adaptive steps in an interval, 256 by default.
+    - `max_steps`: the largest number of adaptive steps in one control interval, 256 by
+        default.
     - `max_events`: the largest number of events in an interval of a hybrid system, 16
         by default.
 

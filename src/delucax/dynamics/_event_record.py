@@ -24,8 +24,8 @@ class Events(eqx.Module):
     - `before`, `after`: the states of the plant just before and just after each event,
         shape `(max_events, n)`; NaN after the last event.
     - `fault_time`, `fault_kind`: the time of the first failure in the interval, and the
-        event whose guard failed, as an index into `event_names`; NaN and -1 if nothing
-        failed.
+        event whose guard failed, as an index into `event_names`. Without a failure,
+        `fault_time` is NaN and `fault_kind` is -1.
 
     !!! example
 

@@ -19,15 +19,16 @@ from ._base import AbstractDynamics
 
 
 class LinearDynamics(AbstractDynamics):
-    r"""Linear dynamics in discrete time, or affine dynamics about an operating point.
+    r"""Linear dynamics in discrete time, or dynamics that are linear in the deviation
+    from an operating point.
 
     $$x_{k+1} = x_\mathrm{next} + A (x_k - x_\mathrm{ref}) + B (u_k - u_\mathrm{ref})
     + E w_k, \qquad y_k = C x_k$$
 
     The dynamics are time-varying if `A` has a leading time axis of length `T`. `B`, `E`
     and the operating point may then have a leading time axis too. At time `t`, the
-    dynamics use the entries with the index `round(t / dt)`. Before the first and after
-    the last entry, the next state is NaN, which a rollout reports.
+    dynamics use the entries with the index `round(t / dt)`. At times before the first
+    entry or after the last entry, the next state is NaN, and a rollout reports this.
 
     **Arguments:**
 
@@ -38,8 +39,8 @@ class LinearDynamics(AbstractDynamics):
     - `dt`: the time step, in units of time; 1 by default.
     - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`, or `(T, n)` and
         `(T, m)`; zero by default.
-    - `x_next`: the state that follows the operating point, shape `(n,)` or `(T, n)`; by
-        default `x_ref`, for an equilibrium.
+    - `x_next`: the state one step after the operating point, shape `(n,)` or `(T, n)`;
+        by default `x_ref`, so that the operating point is an equilibrium.
     - `state_names`, `control_names`: tuples of `n` and `m` strings; `("x0", ...)` and
         `("u0", ...)` by default.
 

@@ -37,10 +37,10 @@ class MethodOfSteps(Forwarding):
 
     Each control interval is cut into `substeps` equal steps of an explicit Runge-Kutta
     method. No step is longer than the shortest delay, so the delayed states are always
-    known. A delayed state is interpolated by the cubic through the states and slopes at
-    both ends of a past step, with an error of order 4. If the system has
-    `disturbance_names`, the disturbance `w` is held over the interval; otherwise `w` is
-    added to the next state.
+    known. A delayed state is interpolated by a cubic polynomial, which matches the
+    states and the slopes at both ends of a past step. The error of this interpolation
+    is of order 4. If the system has `disturbance_names`, the disturbance `w` is held
+    over the interval; otherwise `w` is added to the next state.
 
     The state is `(x, history)`. For each past step within `memory`, the history holds
     the state and the slope at the start and at the end of that step, the newest step
@@ -48,11 +48,12 @@ class MethodOfSteps(Forwarding):
     from a past that is a function of time. The state with its history can be used like
     any other state. For example, you can [`delucax.linearize`][] the dynamics, and the
     eigenvalues of the matrix `A` show whether they are stable. Derivatives with respect
-    to the delays are those of the cubic interpolation.
+    to the delays are computed through the cubic interpolation.
 
     The slope of the state jumps when a control switches and at the start of the
-    simulation, where the given history ends. One delay later, a higher derivative of
-    the state jumps. The method has order 4 if the delays are whole numbers of substeps.
+    simulation, where the given history ends. One delay after such a jump of the slope,
+    a higher derivative of the state jumps. The method has order 4 if the delays are
+    whole numbers of substeps.
 
     **Arguments:**
 
@@ -61,13 +62,14 @@ class MethodOfSteps(Forwarding):
     - `solver`: an explicit Runge-Kutta method of Diffrax; [`delucax.dynamics.RK4`][] by
         default.
     - `substeps`: the number of steps per control interval; by default the smallest
-        number that keeps a step within the shortest delay.
+        number for which no step is longer than the shortest delay.
     - `memory`: the longest delay that you may set later, in substeps; by default the
         longest delay of the system.
 
     **Raises:** `ValueError` if a delay is not positive, is shorter than a substep or
-    longer than `memory`, or if `solver` does not fit. If you later change a delay to a
-    value outside of this range, the status of a step is `delay_beyond_memory`.
+    longer than `memory`, or if `solver` does not fit. If you later change a delay so
+    that it is shorter than a substep or longer than `memory`, the status of a step is
+    `delay_beyond_memory`.
 
     Source: Hairer, Nørsett and Wanner, 1993, section II.17.
 

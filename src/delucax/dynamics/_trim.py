@@ -42,31 +42,34 @@ def trim(
     F(t, x, u) = x \text{ for dynamics}$$
 
     Disturbances are zero. The point is a solution near the guess, but not always the
-    nearest one. If there are more unknowns than equations, there are many solutions
-    close to each other; `trim` returns the solution with the smallest change from the
+    nearest one. If there are more unknowns than equations, many solutions lie close to
+    each other. Then `trim` returns the solution with the smallest change from the
     guess, to first order. If there is no solution, `trim` returns a point where the
     residual is smallest, and `result` says so.
 
     Changes and residuals are measured in units that follow from the guess:
 
-    - A state is measured in units of its guess. If its guess is zero, the unit is the
-        largest guess of all states, but at most 1; if all guesses are zero, the unit
-        is 1. The units of the controls are chosen in the same way.
-    - A guess counts as zero if it is below 100 eps times the largest guess or 1,
-        whichever is less. In float32, 100 eps is 1e-5. If a state is much smaller than
-        the others, express it in a smaller unit, for example in nmol instead of mol.
-    - A state or control that is not fixed is set to zero if it is below 4 eps times its
-        unit.
+    - The unit of a state is the absolute value of its guess. If the guess of a state is
+        zero, its unit is the largest absolute guess of all states, or 1 if that is
+        larger than 1. If the guesses of all states are zero, their unit is 1. The units
+        of the controls are chosen in the same way.
+    - A guess counts as zero if its absolute value is below 100 eps times the largest
+        guess. If the largest guess is above 1, the threshold is 100 eps. In float32,
+        100 eps is 1e-5. If a state is much smaller than the others, express it in a
+        smaller unit, for example in nmol instead of mol.
+    - A state or control that is not fixed is set to zero in the result if its absolute
+        value is below 4 eps times its unit.
     - The residual of each equation is measured relative to the size of the terms of
         this equation.
 
-    At a multiple root the last digits of the point may be wrong, and the result may be
-    `no_equilibrium`.
+    If the solution is a multiple root of the equations, the last digits of the
+    operating point may be wrong, and `result` may be `no_equilibrium`.
 
-    The method is Levenberg-Marquardt in a trust region, followed by Newton's method on
-    the conditions of the nearest point. The result is differentiable in forward and
-    reverse mode with respect to all arrays in `model`, the guess and the fixed values,
-    by the implicit function theorem.
+    First `trim` uses the Levenberg-Marquardt method in a trust region. Then it applies
+    Newton's method to the optimality conditions of the solution with the smallest
+    change from the guess. The result is differentiable in forward and reverse mode with
+    respect to all arrays in `model`, the guess and the fixed values, by the implicit
+    function theorem.
 
     **Arguments:**
 
@@ -77,11 +80,11 @@ def trim(
     - `x`, `u`: the guess, shapes `(n,)` and `(m,)`; by default the `equilibrium` of the
         model. You may pass an `OperatingPoint` as `x`: it holds both the state and the
         control.
-    - `fix`: the states and controls to hold at the guess: a name, several names, or a
-        dictionary from names to values, which replace the values of the guess. None by
-        default.
-    - `throw`: whether to raise if there is no operating point, true by default. With
-        `throw=False`, look at `result`.
+    - `fix`: the states and controls that stay at their guess: a name, several names, or
+        a dictionary from names to values. The values in a dictionary replace the guess.
+        None by default.
+    - `throw`: whether to raise an error if there is no operating point, true by
+        default. With `throw=False`, look at `result`.
 
     **Returns:** a [`delucax.dynamics.OperatingPoint`][].
 

@@ -19,11 +19,11 @@ class WorstCase(AbstractWrapper):
 
     $$x_{k+1} = F(t_k, x_k, u_k, w_k + L (x_k - x_\mathrm{ref}))$$
 
-    Here $x_\mathrm{ref}$ is the equilibrium of the dynamics, and `difference` is the
-    method of the dynamics that gives the deviation of a state. If `L` is the gain of
-    [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][], the
-    adversary plays the worst disturbance of the H-infinity game. Use `bound` to keep it
-    realistic.
+    Here $x_\mathrm{ref}$ is the equilibrium of the dynamics. The deviation
+    $x_k - x_\mathrm{ref}$ is computed by the method `difference` of the dynamics. If
+    `L` is the gain of [`delucax.controllers.HInfinity`][] or of
+    [`delucax.riccati.hinf_dare`][], the adversary plays the worst disturbance of the
+    H-infinity game. Use `bound` to keep it realistic.
 
     **Arguments:**
 

@@ -31,9 +31,9 @@ def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Limit = 2.0) ->
     - *End:* never terminates.
     - *Features:* `encode` gives the cosine and sine of the angle, and the velocity.
 
-    The dynamics are not smooth where the speed meets the limit of Gym's integrator.
-    Pass a `solver` for smooth dynamics. The slope of the cost jumps where the pendulum
-    hangs straight down.
+    The dynamics are not smooth where the speed reaches the speed limit of Gym's
+    integrator. Pass a `solver` for smooth dynamics. The slope of the cost jumps where
+    the pendulum hangs straight down.
 
     **Arguments:**
 
@@ -154,8 +154,8 @@ def mountain_car(
 
     - *State:* position, velocity [1/step]. *Control:* push, in +-1.
     - *Start:* at rest, with the position uniformly random in [-0.6, -0.4].
-    - *Cost:* `0.1 push^2` per step, and -100 on arrival at the goal. This cost uses the
-        push after clipping, whereas Gym uses the push before clipping.
+    - *Cost:* `0.1 push^2` per step, and -100 on arrival at the goal. The push in this
+        cost is the push after clipping, whereas Gym uses the push before clipping.
     - *End:* at the goal.
 
     The arrival has no gradient. For planning and policy gradients, pass a
@@ -168,8 +168,8 @@ def mountain_car(
     - `goal_velocity`: the smallest velocity with which the car must reach the goal
         [1/step], 0 by default.
     - `max_speed`: the speed limit of Gym's integrator [1/step], 0.07 by default.
-    - `min_position`, `max_position`: the walls of Gym's integrator, -1.2 and 0.6 by
-        default. The car stops at the left wall.
+    - `min_position`, `max_position`: the positions of the walls in Gym's integrator,
+        -1.2 and 0.6 by default. The car stops at the left wall.
 
     Source: Gymnasium (Towers et al., 2023), `MountainCarContinuous-v0`; Moore, 1990.
 
@@ -215,7 +215,7 @@ def mountain_car_discrete(
 
     - *Control:* the integer actions 0, 1 and 2 are the pushes -1, 0 and 1. A push in
         between works too.
-    - *Cost:* 1 per step, and no final cost on arrival.
+    - *Cost:* 1 per step, also for the last step, and no final cost on arrival.
 
     The cost has no gradient. See [`delucax.environments.mountain_car`][] for smooth
     alternatives.
@@ -286,14 +286,16 @@ def acrobot(
     goal_height: Number = 1.0,
     disturbance: AbstractDisturbance | None = None,
 ) -> Fields:
-    r"""Swing the tip of two hanging links above a line, with a torque at the elbow.
+    r"""Swing the tip of two hanging links above a given height, with a torque at the
+    elbow.
 
     - *State:* angle_1 [rad], angle_2 [rad], both 0 when the links hang straight down;
         velocity_1 [rad/s], velocity_2 [rad/s]. *Control:* torque [N m]; the integer
         actions 0, 1 and 2 are the torques -1, 0 and 1. *Disturbance:* push [N m], added
         to the torque.
     - *Start:* each state is uniformly random in +-0.1.
-    - *Cost:* 1 per step, and -1 on arrival, because Gym rewards the last step with 0.
+    - *Cost:* 1 per step, and a final cost of -1 on arrival. So the last step costs
+        nothing, as in Gym.
     - *End:* when `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`.
     - *Features:* `encode` gives the cosines and sines of both angles, and the
         velocities.
@@ -301,23 +303,24 @@ def acrobot(
     The cost has no gradient. For planning and policy gradients, pass
     `cost=`[`delucax.costs.AcrobotHeight`][]`()`, `terminated=None`, and a `solver` in
     place of Gym's integrator, which wraps angles and clips velocities. Gym's dynamics
-    are not smooth where a velocity meets its limit. When an angle is wrapped, the state
-    jumps, but the gradient does not.
+    are not smooth where a velocity reaches its limit. When an angle is wrapped, the
+    state jumps, but the gradient does not.
 
     A step has the same result as a step of Gym up to rounding. But the acrobot is
-    chaotic: of 100 episodes with random actions in double precision, about 5 end more
-    than 1e-6 away from the same episodes in Gym. Differences of this size also arise in
-    Gym itself if the last bit of the initial state is changed.
+    chaotic, so the rounding errors grow. Of 100 episodes with random actions in double
+    precision, about 5 end more than 1e-6 away from the same episodes in Gym.
+    Differences of this size also arise in Gym itself if the last bit of the initial
+    state is changed.
 
     **Arguments:**
 
     - `max_torque`: the largest absolute value of the torque [N m], 1 by default.
-    - `torque_noise`: the largest absolute value of a random torque [N m], drawn
-        uniformly from +-`torque_noise` and added at each step after clipping, as Gym's
-        `torque_noise_max` does; none by default. Do not combine `torque_noise` with a
-        `disturbance`.
-    - `goal_height`: height of the line above the first joint, in lengths of a link; 1
-        by default.
+    - `torque_noise`: the largest absolute value of a random torque [N m], like Gym's
+        `torque_noise_max`; none by default. At each step, a torque is drawn uniformly
+        from +-`torque_noise` and added to the control after clipping. Do not combine
+        `torque_noise` with a `disturbance`.
+    - `goal_height`: height above the first joint that the tip must exceed, in lengths
+        of a link; 1 by default.
     - `disturbance`: the disturbance of the environment, in place of `torque_noise`;
         none by default.
     - `max_velocity_1`, `max_velocity_2`: the velocity limits of Gym's integrator

@@ -94,8 +94,8 @@ class Environment(eqx.Module):
     - `dynamics`: the discrete-time dynamics, a [`delucax.AbstractDynamics`][].
     - `cost`: the stage and final cost, a [`delucax.AbstractCost`][]. A cost is minus a
         reward.
-    - `disturbance`: a [`delucax.AbstractDisturbance`][]. By default there is no
-        disturbance, except for dynamics with a diffusion: they get Brownian increments.
+    - `disturbance`: a [`delucax.AbstractDisturbance`][]. By default, dynamics with a
+        diffusion get Brownian increments, and all other dynamics get no disturbance.
     - `sensor_noise`: a [`delucax.AbstractDisturbance`][] that is added to the
         observation; none by default.
     - `initial_state`: the first state, shape `(n,)`, or a function that draws the first
@@ -107,11 +107,11 @@ class Environment(eqx.Module):
         episode; by default no state does.
     - `actions`: the controls that the integer actions 0, 1, ... stand for, shape
         `(actions, m)`; by default there are no integer actions.
-    - `encode`: a function from an observation to the features that networks and
-        Gymnasium users get, such as the cosine and sine of an angle; the identity by
-        default. Controllers get the observation itself.
-    - `observation_bounds`: `(low, high)`, each a number or a vector: the bounds of
-        `encode(y)` that define the observation space of Gymnasium. These bounds are not
+    - `encode`: a function of an observation that returns the features for networks and
+        for Gymnasium, such as the cosine and sine of an angle; the identity by default.
+        Controllers get the observation itself.
+    - `observation_bounds`: the bounds `(low, high)` of `encode(y)`, each a number or a
+        vector. They define the observation space for Gymnasium. These bounds are not
         enforced. None by default.
 
     **Raises:** `ValueError` if sizes do not fit each other, or `low` is above `high`.
@@ -120,8 +120,9 @@ class Environment(eqx.Module):
 
         `jax.jit(env.step)` raises "unhashable", because `env` holds arrays. Use
         `eqx.filter_jit(env.step)`, or pass the environment as an argument,
-        `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither. The
-        methods of every other module must be compiled in one of these two ways too.
+        `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither. The same
+        holds for the methods of all other Equinox modules: compile them in one of these
+        two ways.
 
     !!! example
 

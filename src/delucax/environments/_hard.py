@@ -109,11 +109,11 @@ def cartpole_swing_up(
     - *Cost:* `0.1 position^2 + 2 (1 - cos(angle)) + 0.01 (velocity^2 + spin^2) +
         0.001 force^2` per step.
     - *End:* when the cart leaves the track. Leaving the track costs `exit_cost`, which
-        is more than the cost of a whole episode of hanging.
+        is more than the cost of a whole episode in which the pendulum only hangs.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
-    The largest force is smaller than the weight of cart and pole, so a swing-up takes
-    two or three pushes.
+    The largest force is smaller than the weight of the cart and the pole, so a swing-up
+    takes two or three pushes.
 
     **Arguments:**
 
@@ -154,7 +154,7 @@ def double_pendulum_cart(
     - *Cost:* `0.1 position^2 + 2 (1 - cos(angle_1)) + 2 (1 - cos(angle_2)) +
         0.01 (velocity^2 + spin_1^2 + spin_2^2) + 0.0003 force^2` per step.
     - *End:* when the cart leaves the track. Leaving the track costs `exit_cost`, which
-        is more than the cost of a whole episode of hanging.
+        is more than the cost of a whole episode in which the pendulum only hangs.
     - *Features:* `encode` replaces each angle by its cosine and sine.
 
     A planner with a horizon of one second swings the rods up within 1.5 seconds. A
@@ -193,8 +193,8 @@ def furuta(system: FurutaPendulum, *, max_voltage: Limit = 5.0) -> Fields:
     - *Start:* the arm uniformly random in +-0.5 rad, the angle within 0.2 rad of
         hanging, the rates in +-0.5 rad/s.
     - *Cost:* `0.1 arm^2 + 2 (1 - cos(angle)) + 0.001 (arm_rate^2 + spin^2) + 0.001
-        voltage^2` per step. The angle of the arm is not wrapped, because every turn of
-        the arm winds up its cable.
+        voltage^2` per step. The cost does not wrap the angle of the arm, because every
+        turn of the arm winds up its cable.
     - *End:* never terminates.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
@@ -202,8 +202,8 @@ def furuta(system: FurutaPendulum, *, max_voltage: Limit = 5.0) -> Fields:
 
     **Arguments:**
 
-    - `max_voltage`: the largest absolute value of the voltage [V], 5 by default; the
-        motor allows 10 V.
+    - `max_voltage`: the largest absolute value of the voltage [V], 5 by default. The
+        motor itself would allow 10 V.
 
     Source: Furuta, Yamakita and Kobayashi, 1992; Cazzolato and Prime, 2011.
 
@@ -229,8 +229,9 @@ def quadrotor_flip(system: PlanarQuadrotor, *, max_thrust: Limit = 1.0) -> Field
         thrusts left and right [N], not negative. *Disturbance:* force_x, force_y [N].
     - *Start:* x and y uniformly random in +-0.5 m, the angle within 0.5 rad of upside
         down, the velocities in +-0.5 m/s, the rate in +-1 rad/s.
-    - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 0.1 (vx^2 + vy^2) + 0.01 rate^2 +
-        0.1 |u - u*|^2` per step, where each entry of `u*` is half of the weight.
+    - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 0.1 (vx^2 + vy^2) + 0.01 rate^2 + 0.1 |u
+        - u*|^2` per step, where each entry of `u*` is half of the weight of the
+        quadrotor.
     - *End:* never terminates.
     - *Features:* `encode` replaces the angle by its cosine and sine.
 
@@ -269,14 +270,14 @@ def slung_load(system: SlungLoad, *, max_thrust: Limit = 5.0) -> Fields:
         right [N], not negative.
     - *Start:* x and y uniformly random in +-4 m, the angle in +-0.1 rad, the swing in
         +-0.8 rad, the velocities and rates in +-0.5.
-    - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 2 (1 - cos(swing)) +
-        0.1 (vx^2 + vy^2 + swing_rate^2) + 0.01 rate^2 + 0.01 |u - u*|^2` per step,
-        where each entry of `u*` is half of the whole weight.
+    - *Cost:* `x^2 + y^2 + 2 (1 - cos(angle)) + 2 (1 - cos(swing)) + 0.1 (vx^2 + vy^2 +
+        swing_rate^2) + 0.01 rate^2 + 0.01 |u - u*|^2` per step, where each entry of
+        `u*` is half of the weight of the quadrotor with its load.
     - *End:* never terminates.
     - *Features:* `encode` replaces each angle by its cosine and sine.
 
-    From a start this far away, a linear controller asks for too much thrust, and the
-    quadrotor tips over.
+    From a start up to 4 m from the origin, a linear controller demands too much thrust,
+    and the quadrotor tips over.
 
     **Arguments:**
 
@@ -315,8 +316,9 @@ def drift(
     - *Start:* vx within 2 m/s of the speed of the drift, vy in +-0.2 m/s, the rate in
         +-0.1 rad/s.
     - *Cost:* `(vx - vx*)^2 + (vy - vy*)^2 + 10 (rate - rate*)^2 + 1e-7 (force -
-        force*)^2 + (steering - steering*)^2` per step. The stars mark the drift to the
-        left, an unstable equilibrium.
+        force*)^2 + (steering - steering*)^2` per step. Here `vx*`, `vy*`, `rate*`,
+        `force*` and `steering*` are the states and controls of the drift to be held,
+        which is to the left and is an unstable equilibrium.
     - *End:* never terminates.
 
     **Arguments:**
@@ -324,7 +326,7 @@ def drift(
     - `speed`: the forward velocity vx of the drift [m/s], 8 by default.
     - `steering`: steering angle of the drift [rad], 12 degrees to the right by default.
     - `max_force`: the largest absolute value of the force [N], 4500 by default, which
-        is nine tenths of the grip of the rear tyre.
+        is nine tenths of the largest friction force of the rear tyre.
     - `max_steering`: the largest steering angle to either side [rad], 0.6 by default.
 
     Source: Voser, Hindiyeh and Gerdes, 2010; Hindiyeh and Gerdes, 2014.
@@ -371,21 +373,23 @@ def reactor_start_up(
 
     - *State:* concentration [mol/l], temperature [K]. *Control:* coolant [K]. Time is
         in minutes.
-    - *Start:* the concentration uniformly random in [0.9, 1] mol/l, with hardly any of
-        the feed reacted, the temperature in [295, 305] K.
+    - *Start:* the concentration uniformly random in [0.9, 1] mol/l, so that hardly any
+        of the feed has reacted, and the temperature in [295, 305] K.
     - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
-        step. The stars are the equilibrium at `concentration`.
+        step. Here `c*`, `T*` and `T_coolant*` are the values at the equilibrium whose
+        concentration is the argument `concentration`.
     - *End:* above `max_temperature`. A shutdown costs `shutdown_cost`, which is more
-        than the cost of a whole episode of doing nothing.
+        than the cost of a whole episode in which the controller does nothing.
 
-    The plant is that of [`delucax.environments.cstr`][], but the jacket must heat
-    first, and the linear model at the goal has two unstable poles. With too little heat
-    the reaction never starts; with too much heat the reaction runs away.
+    The plant is the same as in [`delucax.environments.cstr`][]. But here the cooling
+    jacket must first heat the reactor, and the linear model at the goal has two
+    unstable poles. With too little heat the reaction never starts; with too much heat
+    the reaction runs away.
 
     **Arguments:**
 
-    - `concentration`: the concentration to hold [mol/l], below that of the feed; 0.3 by
-        default.
+    - `concentration`: the concentration to hold [mol/l], below the concentration of the
+        feed; 0.3 by default.
     - `min_coolant`, `max_coolant`: the lowest and the highest temperature of the
         coolant [K], 290 and 310 by default.
     - `max_temperature`: the temperature above which the reactor is shut down [K], 380

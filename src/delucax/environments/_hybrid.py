@@ -58,27 +58,28 @@ def bouncing_ball(
     max_force: Limit = 3.0,
     rest_cost: Number = 1000.0,
 ) -> Fields:
-    """Keep a ball bouncing to a given height, with a force smaller than its weight.
+    """Keep a ball bouncing up to a given height, with a force smaller than its weight.
 
     - *State:* height [m], velocity [m/s]. *Control:* force [N].
     - *Start:* at rest, at a height uniformly random in [0.5, 1.5] m.
-    - *Cost:* `(peak - height)^2 + 0.01 force^2` per step, where `height` is the
-        argument and `peak` is the height to which the energy of the ball would lift it:
-        its height plus `velocity^2 / (2 gravity)`.
-    - *End:* when the peak is below 0.05 m. The end of the bouncing costs `rest_cost`.
-        Bounces do not accumulate before the episode ends, unless the restitution is
-        below 0.2.
+    - *Cost:* `(peak - height)^2 + 0.01 force^2` per step. Here `height` is the argument
+        of this function, and `peak` is the height that the ball would reach without
+        drag and force: the current height of the ball plus `velocity^2 / (2 gravity)`.
+    - *End:* when the peak is below 0.05 m. This end of the episode costs `rest_cost`.
+        The episode ends before the bounces become infinitely frequent, unless the
+        restitution is below 0.2.
 
-    The cost and the condition of termination use the parameters of the ball too. To
-    change these parameters, call this function again (under `jax.vmap` for a batch),
-    because [`delucax.replace`][] would change them in one of the three places only.
+    The dynamics, the cost and the condition of termination each hold the parameters of
+    the ball. To change these parameters, call this function again (under `jax.vmap` for
+    a batch), because [`delucax.replace`][] would change the parameters in only one of
+    these three places.
 
     **Arguments:**
 
     - `drag`: drag of the ball [kg/m], 0.02 by default.
     - `height`: the height to which the ball should bounce [m], 2 by default.
     - `max_force`: the largest absolute value of the force [N], 3 by default.
-    - `rest_cost`: the cost of letting the ball come to rest, 1000 by default.
+    - `rest_cost`: the cost if the ball comes to rest, 1000 by default.
 
     Source: Goebel, Sanfelice and Teel, 2012.
 
@@ -114,20 +115,22 @@ def rimless_wheel(
     max_torque: Limit = 2.0,
     stall_cost: Number = 500.0,
 ) -> Fields:
-    """Roll a wheel of spokes down a gentle slope, faster than it rolls by itself.
+    """Roll a wheel that has spokes but no rim down a gentle slope, faster than the
+    wheel rolls by itself.
 
     - *State:* angle [rad], velocity [rad/s]. *Control:* torque [N m].
     - *Start:* the angle uniformly random in +-0.2 rad about the vertical, the velocity
         in [0.8, 1.6] rad/s.
     - *Cost:* `(velocity - speed)^2 + 0.1 torque^2` per step.
-    - *End:* when the wheel rolls back. Rolling back costs `stall_cost`.
+    - *End:* when the wheel rolls backwards, which costs `stall_cost`.
 
     **Arguments:**
 
     - `speed`: the velocity to hold [rad/s], 2 by default.
     - `max_torque`: the largest absolute value of the torque [N m], 2 by default, which
-        is about half of the gravity torque that keeps a standing wheel from rolling.
-    - `stall_cost`: the cost of rolling back, 500 by default.
+        is about half of the torque by which gravity keeps a standing wheel from
+        rolling.
+    - `stall_cost`: the cost if the wheel rolls backwards, 500 by default.
 
     Source: McGeer, 1990; Coleman, Chatterjee and Ruina, 1997.
 
@@ -192,28 +195,31 @@ def compass_gait(
 
     - *State:* swing [rad], stance [rad], swing rate [rad/s], stance rate [rad/s].
         *Control:* torque [N m].
-    - *Start:* near the start of a step of the passive gait on a slope of 3 degrees,
-        with the angles within 0.01 rad and the rates within 0.03 rad/s of this point.
+    - *Start:* near the state in which a step of the passive gait on a slope of 3
+        degrees begins, with the angles within 0.01 rad and the rates within 0.03 rad/s
+        of this state.
     - *Cost:* `(v - speed)^2 + 0.001 torque^2` per step, where `v` is the speed of the
         hip along the slope.
-    - *End:* when the walker trips (the swing foot is still below the ground after the
-        legs have passed each other), or when the stance leg leans by more than 0.8 rad
-        from the normal of the slope. A fall costs `fall_cost`.
+    - *End:* when the walker trips or falls over. It trips if the swing foot is still
+        below the ground after the legs have passed each other. It falls over if the
+        stance leg leans by more than 0.8 rad from the normal of the slope. Both cost
+        `fall_cost`.
 
     On the default slope of 3 degrees the walker walks on without control. On level
     ground (`slope=0.0`) the walker slows down and falls.
 
-    The cost and the condition of termination use the parameters of the walker too. To
-    change these parameters, call this function again (under `jax.vmap` for a batch),
-    because [`delucax.replace`][] would change them in one of the three places only.
+    The dynamics, the cost and the condition of termination each hold the parameters of
+    the walker. To change these parameters, call this function again (under `jax.vmap`
+    for a batch), because [`delucax.replace`][] would change the parameters in only one
+    of these three places.
 
     **Arguments:**
 
-    - `speed`: the speed of the hip to hold [m/s], 0.73 by default, which is the speed
-        of the passive gait on a slope of 3 degrees.
+    - `speed`: the speed at which the hip should move [m/s], 0.73 by default, which is
+        the speed of the passive gait on a slope of 3 degrees.
     - `max_torque`: the largest absolute value of the torque [N m], 10 by default; 0 for
         a passive walker.
-    - `fall_cost`: the cost of falling, 200 by default.
+    - `fall_cost`: the cost of tripping or falling over, 200 by default.
 
     Source: Goswami, Thuilot and Espiau, 1998.
 
@@ -242,8 +248,8 @@ def compass_gait(
 def thermostat(
     system: Thermostat, *, target: Number = 20.0, max_heat: Limit = 2.0
 ) -> Fields:
-    """Reduce the temperature swings of a room with a thermostat, with a heat pump that
-    is too weak to heat the room alone.
+    """Reduce the temperature swings in a room whose heater is switched by a thermostat.
+    The control is a heat pump that is too weak to heat the room alone.
 
     - *State:* temperature [degC], mode. *Control:* heat [kW]. Time is in hours.
     - *Start:* the heater is off, the temperature uniformly random in [19.2, 20.8] degC.
@@ -254,7 +260,7 @@ def thermostat(
 
     - `target`: the temperature to hold [degC], 20 by default.
     - `max_heat`: the largest heating or cooling power of the heat pump [kW], 2 by
-        default. Holding the default target takes 3 kW of heat.
+        default. To hold the default target, the room needs 3 kW of heat.
 
     Source: Ihara and Schweppe, 1981.
 
@@ -280,21 +286,21 @@ def thermostat(
     arguments=lambda *, damping=0.1: dict(damping=damping),
 )
 def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
-    """Bring a mass on a moving belt to rest, so that the belt slips under it.
+    """Bring a mass on a moving belt to rest, so that the belt slides under the mass.
 
     - *State:* position [m], velocity [m/s], mode. *Control:* force [N].
     - *Start:* the mass sticks to the belt, the position uniformly random in +-0.1 m.
     - *Cost:* `100 (position - position*)^2 + 10 velocity^2 + force^2` per step, where
-        `position*` is the position at rest.
+        `position*` is the position in which the mass can stay at rest.
     - *End:* never terminates.
 
-    Without control the mass sticks and slips forever.
+    Without control the mass goes on sticking to the belt and slipping, again and again.
 
     **Arguments:**
 
     - `damping`: damping of the mass [N s/m], 0.1 by default.
-    - `max_force`: the largest absolute value of the force [N], 0.5 by default, less
-        than the static and the kinetic friction.
+    - `max_force`: the largest absolute value of the force [N], 0.5 by default, which is
+        less than the static and the kinetic friction.
 
     Source: Popp and Stelter, 1990.
 
@@ -317,11 +323,11 @@ def stick_slip(system: StickSlip, *, max_force: Limit = 0.5) -> Fields:
 
 @task(ValveWithStops, dt=0.02, horizon=200)
 def valve_with_stops(system: ValveWithStops, *, max_force: Limit = 25.0) -> Fields:
-    """Bring the valve of an engine to its open stop, land softly, and hold it there.
+    """Bring the valve of an engine softly to its open stop, and hold the valve there.
 
     - *State:* position, velocity [1/s], mode. *Control:* force [N].
-    - *Start:* free, the position uniformly random in [0.2, 0.8], the velocity in +-1
-        per second.
+    - *Start:* the valve is between its stops, the position uniformly random in [0.2,
+        0.8], the velocity in +-1 per second.
     - *Cost:* `10 (position - 1)^2 + 0.1 velocity^2 + 0.0002 force^2` per step.
     - *End:* never terminates.
 

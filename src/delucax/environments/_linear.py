@@ -35,15 +35,15 @@ def cartpole_linear(
     horizon: int = 200,
     **others: Any,
 ) -> Environment:
-    r"""The linear cart-pole of the Deluca paper: a point mass on a rod near upright,
-    discretised by an Euler step.
+    r"""The linear cart-pole of the Deluca paper: a point mass on a rod, linearised
+    about upright and discretised by Euler's method.
 
     $$\ddot p = \frac{F + m g \theta}{M}, \qquad
     \ddot\theta = \frac{F + (M + m) g \theta}{M l}$$
 
     - *State:* position $p$ [m], angle $\theta$ [rad], velocity [m/s], spin [rad/s], in
-        this order. A positive angle leans towards negative positions. *Control:* force
-        $F$ [N], without bounds.
+        this order. If the angle is positive, the pole leans in the direction of
+        negative positions. *Control:* force $F$ [N], without bounds.
     - *Start:* each state is uniformly random in +-0.05.
     - *Cost:* $x^\top x + u^\top u$ per step.
     - *End:* never terminates.
@@ -55,8 +55,8 @@ def cartpole_linear(
     - `length`: $l$, length of the rod [m], 1 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
     - `dt`: the time step [s], 0.02 by default.
-    - `horizon`: the number of steps per episode, 200 by default, which is 4 s. The
-        paper's code stops after 10 steps.
+    - `horizon`: the number of steps per episode, 200 by default, which is 4 s. The code
+        of the Deluca paper stops after 10 steps.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
@@ -138,8 +138,9 @@ def lds(
     **Arguments:**
 
     - `A`, `B`, `C`: the matrices, shapes `(n, n)`, `(n, m)` and `(p, n)`; `C` is the
-        identity by default. Without `A` and `B`, all matrices are drawn with `key`:
-        their entries are standard normal, and `A` is scaled to `spectral_radius`.
+        identity by default. Without `A` and `B`, all matrices are drawn with `key`.
+        Their entries are standard normal, and then `A` is scaled so that it has the
+        given `spectral_radius`.
     - `system`: a [`delucax.LinearDynamics`][] or a [`delucax.systems.LinearSystem`][],
         in place of the matrices. A `LinearSystem` is converted exactly to discrete time
         with the step `dt`. A linear model can be made from a python-control object by
@@ -149,8 +150,10 @@ def lds(
         `system` in continuous time, and must be left out for a `system` in discrete
         time.
     - `key`: a random key, for random matrices.
-    - `states`, `controls`: `n` and `m` of random matrices, 2 and 1 by default.
-    - `observations`: `p` of a random `C`; by default `C` is the identity.
+    - `states`, `controls`: the number `n` of states and the number `m` of controls for
+        random matrices, 2 and 1 by default.
+    - `observations`: the number `p` of observations for a random `C`; by default `C` is
+        the identity.
     - `spectral_radius`: the spectral radius of a random `A`, 0.9 by default. The system
         is stable if the spectral radius is below 1.
     - `horizon`: the number of steps per episode, 200 by default.

@@ -19,10 +19,11 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     """Domain randomisation: a copy of an environment with some parameters drawn at
     random.
 
-    Use `jax.vmap` over keys to make a batch of plants, which compiles once. Values that
-    are drawn under `jax.vmap` or `jax.jit` cannot be checked. Therefore the ends of the
-    ranges are checked instead: each end, with all other parameters at their lower and
-    at their upper ends. Values that a function draws are checked only outside of
+    To make a batch of plants with one compilation, use `jax.vmap` over keys. Values
+    that are drawn under `jax.vmap` or `jax.jit` cannot be checked. Therefore
+    `randomise` checks the ends of the ranges instead. It checks each end of a range
+    twice: with all other parameters at their lower ends, and with all of them at their
+    upper ends. If a range is a function, the drawn values are checked only outside of
     `jax.vmap` and `jax.jit`.
 
     **Arguments:**
@@ -31,7 +32,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     - `key`: a random key.
     - `ranges`: a dictionary from paths, such as `"dynamics.system.length"`, to ranges.
         A range is a pair `(low, high)`, from which values are drawn uniformly, or a
-        function of a random key to a value.
+        function that takes a random key and returns a value.
 
     **Returns:** the copy.
 

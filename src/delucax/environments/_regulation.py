@@ -64,8 +64,8 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fi
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
 def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> Fields:
-    """Bring a mass on a spring, or a chain of masses, to rest with a force on the last
-    mass.
+    """Bring a chain of masses and springs, by default of one mass, to rest with a force
+    on the last mass.
 
     - *State:* positions [m], velocities [m/s]. *Control:* force [N].
     - *Start:* each state is uniformly random in +-1.
@@ -123,8 +123,8 @@ def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
 
     - *State:* x, y, z. *Control:* u.
     - *Start:* x and y uniformly random in +-20, z in [10, 40].
-    - *Cost:* `(x - x*)^2 + (y - y*)^2 + (z - z*)^2 + 0.001 u^2` per step, where the
-        stars mark the equilibrium.
+    - *Cost:* `(x - x*)^2 + (y - y*)^2 + (z - z*)^2 + 0.001 u^2` per step, where `x*`,
+        `y*` and `z*` are the coordinates of the equilibrium at this centre.
     - *End:* never terminates.
 
     **Arguments:**
@@ -190,15 +190,17 @@ def cstr(
 
     - *State:* concentration [mol/l], temperature [K]. *Control:* coolant [K]. Time is
         in minutes.
-    - *Start:* within 0.05 mol/l and 3 K of the equilibrium.
+    - *Start:* the concentration within 0.05 mol/l, and the temperature within 3 K, of
+        the equilibrium.
     - *Cost:* `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per
-        step. The stars mark the equilibrium at `concentration`.
+        step. Here `c*`, `T*` and `T_coolant*` are the values at the equilibrium whose
+        concentration is the argument `concentration`.
     - *End:* never terminates.
 
     **Arguments:**
 
-    - `concentration`: the concentration to hold [mol/l], below that of the feed; 0.5 by
-        default.
+    - `concentration`: the concentration to hold [mol/l], below the concentration of the
+        feed; 0.5 by default.
     - `min_coolant`, `max_coolant`: the lowest and the highest temperature of the
         coolant [K], 280 and 320 by default.
 
@@ -228,7 +230,8 @@ def permanent_magnet_motor(
         *Disturbance:* load [N m].
     - *Start:* the currents uniformly random in +-1 A, the speed in +-50 rad/s.
     - *Cost:* `0.01 |i - i*|^2 + 0.001 (speed - speed*)^2 + 1e-5 |v - v*|^2` per step,
-        where the stars mark the equilibrium at the speed, without load.
+        where `i*`, `speed*` and `v*` are the values at the equilibrium with the given
+        speed and without load.
     - *End:* never terminates.
 
     **Arguments:**
@@ -279,9 +282,10 @@ def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
 
     **Arguments:**
 
-    - `key`: a random key for random weights.
-    - `states`, `controls`, `width`: sizes of the network with random weights, 2, 1 and
-        32 by default; see [`delucax.systems.NeuralSystem`][].
+    - `key`: a random key, with which the random weights of the network are drawn.
+    - `states`, `controls`, `width`: the number of states, the number of controls and
+        the width of the network with random weights, 2, 1 and 32 by default; see
+        [`delucax.systems.NeuralSystem`][].
     - `max_control`: the largest absolute value of each control, 1 by default.
 
     Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.

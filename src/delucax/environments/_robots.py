@@ -79,7 +79,8 @@ def kinematic_bicycle(
     max_acceleration: Limit = 3.0,
     max_steering: Limit = 0.5,
 ) -> Fields:
-    """Bring a car that rolls without slip to the lane y = 0, and to a given speed.
+    """Steer a car that rolls without slip to the lane y = 0, and bring it to a given
+    speed.
 
     - *State:* x [m], y [m], heading [rad], speed [m/s]. *Control:* acceleration
         [m/s^2], steering [rad].
@@ -120,7 +121,8 @@ def dynamic_bicycle(
     max_acceleration: Limit = 5.0,
     max_steering: Limit = 0.2,
 ) -> Fields:
-    """Bring a fast car on tyres to the lane y = 0, and to a given speed.
+    """Steer a fast car whose tyres slip to the lane y = 0, and bring it to a given
+    speed.
 
     - *State:* x [m], y [m], heading [rad], vx [m/s], vy [m/s], rate [rad/s]. *Control:*
         acceleration [m/s^2], steering [rad].
@@ -189,18 +191,18 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
         force_y [N].
     - *Start:* at rest at (1, 1).
     - *Cost:* `|x|^2 + 0.1 |u - u*|^2` per step, where each entry of `u*` is half of the
-        weight, with or without wind.
+        weight of the quadrotor, with or without wind.
     - *End:* never terminates.
 
     The default solver is explicit Euler, as in the paper.
 
     **Arguments:**
 
-    - `wind`: `"dissipative"`, `"constant"` or `"vortices"`, for
-        [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] or
-        [`delucax.systems.VortexWind`][]; or any function `(t, x) -> force`. None by
-        default.
-    - `wind_strength`: the strength of a wind given by name, 0.1 by default.
+    - `wind`: the name of a wind or a function `(t, x) -> force`. The names
+        `"dissipative"`, `"constant"` and `"vortices"` stand for
+        [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] and
+        [`delucax.systems.VortexWind`][]. None by default.
+    - `wind_strength`: the strength of the wind if `wind` is a name, 0.1 by default.
 
     Source: Gradu et al., 2021 (Deluca).
 
@@ -248,7 +250,7 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
         *Control:* the thrusts front, left, back and right [N]; or with
         `inputs="wrench"` thrust [N] and torques [N m]. *Disturbance:* a force [N].
     - *Start:* the position uniformly random in +-1 m, the velocity in +-0.5 m/s, the
-        rates in +-0.5 rad/s, the attitude up to about 40 degrees from level.
+        rates in +-0.5 rad/s, the attitude tilted by up to about 40 degrees.
     - *Cost:* $|p|^2 + |q - q^*|^2 + 0.1 (|v|^2 + |\omega|^2) + 0.1 |u - u^*|^2$ per
         step, with the attitude $q^*$ and the control $u^*$ of hovering.
     - *End:* never terminates.
@@ -334,7 +336,7 @@ def _feature_bounds(system: Reacher, goal: Vector) -> tuple[Vector, Vector]:
 def reacher(
     system: Reacher, *, goal: ArrayLike | tuple[float, float] = (0.0, 1.8)
 ) -> Fields:
-    """Bring the tip of an arm of two links to a goal.
+    """Bring the tip of an arm with two links to a goal position.
 
     - *State:* shoulder [rad], elbow [rad], shoulder_rate [rad/s], elbow_rate [rad/s].
         *Control:* shoulder_torque [N m], elbow_torque [N m], without bounds.
@@ -346,9 +348,9 @@ def reacher(
 
     The default solver is explicit Euler, as in the paper.
 
-    The cost and `encode` use the parameters of the arm too. To change these parameters,
-    call this function again (under `jax.vmap` for a batch), because
-    [`delucax.replace`][] would change them in one of the three places only.
+    The dynamics, the cost and `encode` each hold the parameters of the arm. To change
+    these parameters, call this function again (under `jax.vmap` for a batch), because
+    [`delucax.replace`][] would change the parameters in only one of these three places.
 
     **Arguments:**
 

@@ -204,8 +204,8 @@ def task(
 
             **Raises:** `ValueError` on invalid numbers, or on arguments that exclude
             each other: a system and arguments of its class, or a solver and limits of
-            Gym's integrator. A task with Gym's integrator also raises it if `substeps`
-            is given without a `solver`.
+            Gym's integrator. A task with Gym's integrator also raises a `ValueError` if
+            `substeps` is given without a `solver`.
             """
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             check_step(dt, where)

@@ -17,8 +17,10 @@ class Belief(NamedTuple):
 
     **Arguments:**
 
-    - `mean`: shape `(n,)`; along a record it has a leading time axis.
-    - `covariance`: shape `(n, n)`; along a record it has a leading time axis.
+    - `mean`: the mean of the state, shape `(n,)`. The beliefs of a whole record have a
+        leading time axis.
+    - `covariance`: the covariance of the state, shape `(n, n)`, with the same leading
+        time axis for a whole record.
 
     !!! example
 
@@ -50,19 +52,23 @@ class AbstractEstimator(eqx.Module):
 
     At each step, `update` is called first, with the observation $y_k$. Then `predict`
     is called, with the control $u_k$ that was actually applied over the step from
-    $t_k$. The estimator remembers the past in its state, a pytree of arrays. `estimate`
-    returns the belief of a state, and `status` the status of the last call.
+    $t_k$. The estimator keeps all that it needs of past observations and controls in
+    its own state, a pytree of arrays. `estimate` returns the estimated mean and
+    covariance of the plant's state. `status` tells whether the last call succeeded.
 
-    [`delucax.controllers.OutputFeedback`][] makes these calls in a closed loop, and
-    [`delucax.estimators.run_estimator`][] along a record. For Kalman filters,
-    [`delucax.estimators.run_filter`][] also computes the log-likelihood.
+    In a closed loop, [`delucax.controllers.OutputFeedback`][] calls `update` and
+    `predict` for you. For recorded observations and controls,
+    [`delucax.estimators.run_estimator`][] does. For Kalman filters,
+    [`delucax.estimators.run_filter`][] also computes the log-likelihood of the
+    observations.
 
     To write an estimator, subclass this class and write `init`, `update` and `predict`.
-    If the state of the estimator is a [`delucax.estimators.Belief`][], as in a filter,
-    these three methods are enough. Otherwise write `estimate` too: a
-    [`delucax.estimators.MHE`][], for example, carries the observations and controls of
-    its window and the last solution. Override `status` if the estimator can fail in
-    other ways.
+    If the state of the estimator is a [`delucax.estimators.Belief`][], as in a Kalman
+    filter, you need no other methods. If the state holds something else, write
+    `estimate` too. The state of [`delucax.estimators.MHE`][], for example, holds the
+    observations and controls of its window and the last solution. By default `status`
+    only reports estimates that are not finite, so override `status` if the estimator
+    can also fail in other ways.
 
     !!! example
 

@@ -46,35 +46,38 @@ class KalmanFilter(AbstractGaussianFilter):
     $L = \Sigma C^T (C \Sigma C^T + V)^{-1}$. The measurement update changes the
     covariance from $\Sigma$ to $P = (I - L C) \Sigma (I - L C)^T + L V L^T$ (Joseph's
     form). The time update changes the covariance from $P$ to $A P A^T + E W E^T$. In
-    the steady state $\Sigma$ and $L$ are constant; [`delucax.riccati.filter_dare`][]
-    computes this $\Sigma$.
+    the steady state of the filter, $\Sigma$ and $L$ are constant.
+    [`delucax.riccati.filter_dare`][] computes $\Sigma$ of the steady state.
 
     **Arguments:**
 
     - `dynamics`: linear dynamics, time-invariant or time-varying.
     - `W`: covariance of the disturbance `w`, shape `(k, k)`, symmetric, semidefinite.
-        If the dynamics have no `E`, a step adds `W` itself to the covariance.
+        If the dynamics have no `E`, the time update adds `W` itself to the covariance
+        of the state.
     - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
     - `mean`: mean of the first state, shape `(n,)`; `x_ref` by default.
     - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
         symmetric, semidefinite; the identity by default. Do not give `covariance`
         together with `steady_state`, which computes the covariance.
-    - `steady_state`: whether to use the gain of the steady state at all times; false by
-        default.
+    - `steady_state`: whether to use the constant gain of the steady state from the
+        first step on; false by default.
     - `y_ref`: the observation at the operating point, shape `(p,)`; `C x_ref` by
         default. Give `y_ref` if a nonlinear sensor was linearised, because its reading
         at the operating point is not `C x_ref`.
-    - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
-        angles among the observations; subtraction by default.
+    - `observation_difference`: a function `(y, y_predicted) -> deviation`; subtraction
+        by default. If some of the observations are angles, give a function that wraps
+        their differences.
 
-    **Attributes:** the arguments. With `steady_state`, there are also `L`, the gain,
-    shape `(n, p)`, trainable; and `updated_covariance`, the covariance after the
-    measurement update, shape `(n, n)`. They are `None` otherwise.
+    **Attributes:** the arguments. If `steady_state` is true, there are also `L`, the
+    constant gain, shape `(n, p)`, which is trainable, and `updated_covariance`, the
+    constant covariance after the measurement update, shape `(n, n)`. Both are `None` if
+    `steady_state` is false.
 
     **Raises:** `ValueError` if `dynamics` is not linear, a covariance is not symmetric
-    and semidefinite, or the sizes of the arguments do not fit each other; or if
-    `steady_state` is combined with time-varying dynamics or with `covariance`. An error
-    at run time if the filter has no steady state.
+    and semidefinite, or the sizes of the arguments do not match. `ValueError` also if
+    `steady_state` is combined with time-varying dynamics or with `covariance`. With
+    `steady_state`, an error at run time if the filter has no steady state.
 
     Source: Kalman, 1960; Bucy and Joseph, 1968.
 
@@ -228,7 +231,7 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
     y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
 
-    This filter is the [`delucax.estimators.KalmanFilter`][] with
+    This filter has the equations of the [`delucax.estimators.KalmanFilter`][] with
     $A = \partial F / \partial x$, $E = \partial F / \partial w$ and
     $C = \partial h / \partial x$, computed at each step by automatic differentiation.
     For linear dynamics, the extended Kalman filter is the same as the Kalman filter.
@@ -238,17 +241,19 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     - `dynamics`: any dynamics. Their `observe` is the sensor $h$. Smoothers also use
         their `difference`.
     - `W`: covariance of the disturbance `w` of the dynamics, shape `(k, k)`, symmetric,
-        semidefinite. For a system with a diffusion, `w` are the Brownian increments.
+        semidefinite. If the dynamics come from a stochastic differential equation (a
+        system with a `diffusion`), `w` holds the increments of the Brownian motion.
     - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
     - `mean`: mean of the first state, shape `(n,)`; zero by default.
     - `covariance`: covariance of the first state before it is observed, shape `(n, n)`,
         symmetric, semidefinite; the identity by default.
-    - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
-        angles among the observations; subtraction by default. If the state is observed,
-        use `dynamics.difference`.
+    - `observation_difference`: a function `(y, y_predicted) -> deviation`; subtraction
+        by default. If some of the observations are angles, give a function that wraps
+        their differences. If the observation is the whole state, use
+        `dynamics.difference`.
 
-    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
-    symmetric and semidefinite, or the sizes of the arguments do not fit each other.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, a covariance is
+    not symmetric and semidefinite, or the sizes of the arguments do not match.
 
     Source: Schmidt, 1966; Jazwinski, 1970.
 
@@ -303,41 +308,48 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
 
 class UnscentedKalmanFilter(_AbstractNonlinearFilter):
-    r"""The unscented Kalman filter: moments from points that the dynamics move.
+    r"""The unscented Kalman filter, which passes sigma points through the dynamics.
 
     $$x_{k+1} = F(t_k, x_k, u_k, w_k), \quad w_k \sim N(0, W), \qquad
     y_k = h(t_k, x_k) + v_k, \quad v_k \sim N(0, V)$$
 
-    The $2 n + 1$ points are the mean, and the mean plus and minus each column of
+    The $2 n + 1$ sigma points are the mean, and the mean plus and minus each column of
     $\sqrt{c}\, \mathrm{chol}(\mathrm{covariance})$, with $c = \alpha^2 (n + \kappa)$.
-    The outer points have the weight $1 / (2 c)$. The middle point has the weight
-    $1 - n / c$ in the mean and $2 - n / c - \alpha^2 + \beta$ in the covariance. The
-    points are computed again for each measurement update and for each time update.
+    After the sigma points have passed through the dynamics or the sensor, weighted sums
+    of the results give the new mean and covariance. The first point, which is the mean,
+    has the weight $1 - n / c$ in the sum for the mean and
+    $2 - n / c - \alpha^2 + \beta$ in the sum for the covariance. Each other point has
+    the weight $1 / (2 c)$ in both sums. The sigma points are computed again before each
+    measurement update and before each time update.
 
-    The disturbance is treated to first order: it adds $E W E^T$, with
-    $E = \partial F / \partial w$ at the mean, to the covariance. This treatment is
-    exact if the disturbance is added to the state. For linear dynamics the filter is
-    the same as the [`delucax.estimators.KalmanFilter`][].
+    The effect of the disturbance is linearised: the time update adds $E W E^T$ to the
+    covariance, with $E = \partial F / \partial w$ at the mean. This linearisation is
+    exact if the disturbance is additive. For linear dynamics, the unscented filter
+    gives the same result as the [`delucax.estimators.KalmanFilter`][].
 
     With the default `alpha`, `beta` and `kappa` no weight is negative, so covariances
     stay semidefinite. A small `alpha`, such as the common 1e-3, gives weights of size
-    $1 / \alpha^2$ that cancel each other, so digits are lost in rounding. The filter
-    treats a state with zero variance as known, and there is no derivative with respect
-    to this variance.
+    $1 / \alpha^2$ with opposite signs. Their large terms cancel in the sums, so digits
+    are lost to rounding. If the variance of a state is zero, the filter treats this
+    state as known, and the result has no derivative with respect to this variance.
 
     **Arguments:**
 
     - `dynamics`, `W`, `V`, `mean`, `covariance`, `observation_difference`: as for
-        [`delucax.estimators.ExtendedKalmanFilter`][]. The `difference` of the dynamics
-        measures the spread of the moved points.
-    - `alpha`: $\alpha$, the spread of the points, a positive number; 1 by default.
-    - `beta`: $\beta$, a number added to the weight of the middle point in covariances;
-        2 by default, which is optimal for normal states.
-    - `kappa`: $\kappa$, additional spread, a number above `-n`; 0 by default.
+        [`delucax.estimators.ExtendedKalmanFilter`][]. In the time update, the filter
+        computes the deviations of the sigma points from each other with the
+        `difference` of the dynamics.
+    - `alpha`: $\alpha$, the spread of the sigma points about the mean, a positive
+        number; 1 by default.
+    - `beta`: $\beta$, a number that is added to the weight of the first sigma point in
+        the sum for the covariance; 2 by default, which is optimal for a normal
+        distribution.
+    - `kappa`: $\kappa$, a second parameter of the spread of the sigma points (see $c$
+        above), a number above `-n`; 0 by default.
 
-    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
-    symmetric and semidefinite, a number is out of its range, or the sizes of the
-    arguments do not fit each other.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, a covariance is
+    not symmetric and semidefinite, a number is out of its range, or the sizes of the
+    arguments do not match.
 
     Source: Julier and Uhlmann, 1997; Wan and van der Merwe, 2000.
 

@@ -32,29 +32,30 @@ class MHE(AbstractEstimator):
     $$|x_0 - \bar x|^2_{P^{-1}} + \sum_{k < N-1} |w_k|^2_{W^{-1}}
     + \sum_{k < N} 2 \rho(|y_k - h(t_k, x_k)|_{V^{-1}})$$
 
-    over the states of the $N$ stages of the window, the last of which is the current
-    stage. Bounds on states and disturbances are respected, and parameters of the
-    dynamics can be estimated together with the states. The prior $(\bar x, P)$ of the
-    first state comes from an extended Kalman filter, linearised about the states of the
-    window. The prior does not include the observations of the window, so that no
-    observation is used twice (the filtering update). For linear dynamics without active
-    bounds, the estimate is the same as with a [`delucax.estimators.KalmanFilter`][],
-    for any length of the window.
+    over the states $x_0, \dots, x_{N - 1}$ of the window, where $x_{N - 1}$ is the
+    current state. Bounds on states and disturbances are respected, and parameters of
+    the dynamics can be estimated together with the states. The prior $(\bar x, P)$ of
+    the first state $x_0$ is computed by an extended Kalman filter that is linearised
+    about the estimated states of the window. The prior is computed from the
+    observations before the window only, so that no observation is used twice (the
+    filtering update). For linear dynamics without active bounds, the estimate is the
+    same as with a [`delucax.estimators.KalmanFilter`][], for any length of the window.
 
-    By default, an update makes one full Gauss-Newton step from the previous solution,
-    shifted by a step (the real-time iteration). If `iterations` is above 1, an update
-    makes that many steps with a line search. A step consists of a forward pass of the
-    Kalman filter over the window and a backward pass. All covariances may be singular,
-    for example for a known state, a constant parameter or a perfect sensor. Active
-    bounds are treated as perfect observations, and finding the active bounds takes more
-    passes. The covariance of the estimate comes from the forward pass without bounds.
+    By default, an update starts from the previous solution, shifted by one time step,
+    and makes one full Gauss-Newton step (the real-time iteration). If `iterations` is
+    above 1, an update makes that many Gauss-Newton steps, each with a line search. A
+    Gauss-Newton step consists of a forward pass of the Kalman filter over the window
+    and a backward pass. All covariances may be singular, for example for a known state,
+    a constant parameter or a perfect sensor. An active bound is treated as a perfect
+    observation. More passes are needed to find out which bounds are active. The
+    covariance of the estimate comes from a forward pass that ignores the bounds.
 
     The estimate is differentiable with respect to the weights, the prior, the bounds
-    and the dynamics, in forward and reverse mode. The derivative is the derivative of
-    the steps that the update made, with the active bounds fixed. The derivative jumps
-    when a bound becomes active, or when a residual crosses the threshold of `robust`.
-    Under `jax.vmap`, all members of a batch make as many passes as the member that
-    needs the most passes.
+    and the dynamics, in forward and reverse mode. JAX differentiates the Gauss-Newton
+    steps that the update made, and does not vary which bounds are active. The
+    derivative jumps when a bound becomes active, or when a residual crosses the
+    threshold of `robust`. Under `jax.vmap`, each estimate of the batch makes as many
+    passes as the one that needs the most.
 
     **Arguments:**
 
@@ -68,31 +69,36 @@ class MHE(AbstractEstimator):
         symmetric, semidefinite; the identity by default.
     - `bounds`: bounds of the states, a pair `(low, high)` of numbers or vectors of
         shape `(n,)`, which may be infinite; none by default.
-    - `disturbance_bounds`: bounds of `w`, a pair of numbers or vectors of shape `(k,)`;
-        none by default.
-    - `parameters`: the parameters to estimate, a dictionary from paths in the dynamics
-        to a [`delucax.estimators.RandomWalk`][], such as
+    - `disturbance_bounds`: bounds of the disturbance `w`, a pair of numbers or vectors
+        of shape `(k,)`; none by default.
+    - `parameters`: the parameters to estimate, a dictionary that maps the path of each
+        parameter in the dynamics to a [`delucax.estimators.RandomWalk`][], such as
         `{"system.length": RandomWalk(0.1)}`; none by default.
-    - `robust`: a threshold against outliers, in standard deviations. For larger
-        residuals, $\rho$ is linear (Huber's penalty). Thresholds from 1.5 to 3 are
-        usual; with a threshold, `V` must be definite. By default $\rho(r) = r^2 / 2$.
-    - `iterations`: the number of steps of an update, 1 by default.
-    - `observation_difference`: a function `(y, y_predicted) -> deviation` that wraps
-        angles among the observations; subtraction by default.
+    - `robust`: the size of a residual above which an observation counts as an outlier,
+        in standard deviations of the sensor noise. Above this threshold, $\rho$ grows
+        only linearly (Huber's penalty). Thresholds from 1.5 to 3 are usual. With a
+        threshold, `V` must be positive definite. By default there is no threshold, and
+        $\rho(r) = r^2 / 2$ for all residuals.
+    - `iterations`: the number of Gauss-Newton steps in each update, 1 by default.
+    - `observation_difference`: a function `(y, y_predicted) -> deviation`; subtraction
+        by default. If some of the observations are angles, give a function that wraps
+        their differences.
 
-    If a reading is missing, do not call `update` at this step. An observation that is
-    not finite is left out, and `status` reports a failure. `status` is
+    If the sensor gives no observation at a step, call only `predict` at this step, and
+    not `update`. If an observation is not finite, the estimator ignores it, and
+    `status` reports a failure. `status` is
 
     - `diverged` if an observation or the solution is not finite. If the solution is not
-        finite, the window keeps the estimate before the update.
-    - `no_feasible_point` if the bounds cannot all hold.
+        finite, the estimate stays as it was before the update.
+    - `no_feasible_point` if no solution satisfies all bounds.
     - `inaccurate` if the bounds are violated slightly because of rounding.
-    - `not_converged` if the active bounds were not found or, with several iterations,
-        if more iterations would change the estimate.
+    - `not_converged` if the search for the active bounds did not finish. If
+        `iterations` is above 1, `status` is also `not_converged` if more iterations
+        would still change the estimate.
 
-    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not
-    symmetric and semidefinite, the sizes of the arguments do not fit each other, bounds
-    are not numbers with `low <= high`, a parameter is not finite in the dynamics, or a
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, a covariance is
+    not symmetric and semidefinite, the sizes of the arguments do not match, bounds are
+    not numbers with `low <= high`, a parameter is not finite in the dynamics, or a
     number is out of its range.
 
     Source: Rao, Rawlings and Mayne, 2003; Haseltine and Rawlings, 2005; Kühl et al.,

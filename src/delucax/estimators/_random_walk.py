@@ -15,7 +15,8 @@ from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
 class RandomWalk(eqx.Module):
-    r"""A parameter that [`delucax.estimators.MHE`][] estimates, as a random walk.
+    r"""The random-walk model of a parameter that [`delucax.estimators.MHE`][]
+    estimates.
 
     $$\theta_0 \sim N(\theta_\mathrm{start}, \mathrm{variance}), \qquad
     \theta_{k+1} = \theta_k + e_k, \quad e_k \sim N(0, \mathrm{step})$$
@@ -24,11 +25,14 @@ class RandomWalk(eqx.Module):
 
     **Arguments:**
 
-    - `variance`: the variance of the first value, a number, or one number for each
-        entry of the parameter. With a variance of 0, the first value is known.
-    - `step`: the variance of the change in a step, a number, or one number for each
-        entry of the parameter. The default is 0, for a constant parameter.
-    - `bounds`: a pair `(low, high)` of numbers or vectors; none by default.
+    - `variance`: the variance of the first value $\theta_0$, either one number, or one
+        number for each entry of the parameter. If the variance is 0, the estimate
+        starts exactly at $\theta_\mathrm{start}$.
+    - `step`: the variance of the change of the parameter in one time step, either one
+        number, or one number for each entry of the parameter. The default is 0, which
+        means that the parameter is constant.
+    - `bounds`: bounds of the parameter, a pair `(low, high)` of numbers or vectors;
+        none by default.
 
     **Raises:** `ValueError` if a variance is negative or not finite, or `bounds` is not
     a pair with `low <= high`.

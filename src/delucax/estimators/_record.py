@@ -43,8 +43,9 @@ def run_estimator(
     r"""Run any estimator over a record.
 
     At step k, with $t_k = t_0 + k\, dt$, `run_estimator` calls `update` with
-    `observations[k]`, then `predict` with `controls[k]`. For a Kalman filter,
-    [`delucax.estimators.run_filter`][] also computes the likelihood.
+    `observations[k]`, then `predict` with `controls[k]`. For a Kalman filter, you can
+    use [`delucax.estimators.run_filter`][] instead, which also computes the likelihood
+    of the observations.
 
     **Arguments:**
 
@@ -54,8 +55,8 @@ def run_estimator(
         of a moving-horizon estimator must not be longer than T.
     - `controls`: the controls that were applied, shape `(T, m)`; zero by default.
     - `t0`: the time of the first observation, 0 by default.
-    - `throw`: raise an error if the `status` of an update is not success; true by
-        default. If false, check `result`.
+    - `throw`: whether to raise an error if an update fails; true by default. If `throw`
+        is false, check `result`.
 
     **Returns:** an object with
 
@@ -66,12 +67,12 @@ def run_estimator(
         size `T`;
     - `states`: the state of the estimator after each update, with a leading axis of
         size `T`;
-    - `results`: the status of each update; and `result`, the first status that is not
-        success.
+    - `results`: the status of each update. `result` is the first status that reports a
+        failure, or success if there is none.
 
-    **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
-    finite, or the window is longer than the record; an error at run time if `throw` is
-    true and an update fails.
+    **Raises:** `ValueError` if an argument has the wrong type or shape or is not
+    finite, or if the window is longer than the record. An error at run time if `throw`
+    is true and an update fails.
 
     !!! example
 

@@ -56,7 +56,7 @@ def run_filter(
     t0: Any = 0.0,
     throw: bool = True,
 ) -> Filtered:
-    r"""Run a Kalman filter over a record.
+    r"""Run a Kalman filter over recorded observations and controls.
 
     At step k, with $t_k = t_0 + k\, dt$, the filter makes the measurement update with
     `observations[k]`, then the time update with `controls[k]`. It also computes the
@@ -75,8 +75,8 @@ def run_filter(
     - `observations`: shape `(T, p)`, for example `trajectory.observations`.
     - `controls`: the controls that were applied, shape `(T, m)`; zero by default.
     - `t0`: the time of the first observation, 0 by default.
-    - `throw`: raise an error if a belief or the likelihood is not finite; true by
-        default. If false, check `result`.
+    - `throw`: whether to raise an error if a mean, a covariance or the likelihood is
+        not finite; true by default. If `throw` is false, check `result`.
 
     **Returns:** an object with
 
@@ -87,14 +87,15 @@ def run_filter(
         size `T`;
     - `log_likelihoods`: the log-density of each observation given those before it,
         shape `(T,)`, and `log_likelihood`, their sum;
-    - `result`: one of `delucax.RESULTS`. The result is `diverged` if a belief is not
-        finite; all results from this step on are NaN. The result is `ill_posed` if only
-        the likelihood is not finite, because the covariance of an observation is not
+    - `result`: one of `delucax.RESULTS`. The result is `diverged` if the mean or the
+        covariance of a step is not finite; all means, covariances and densities from
+        this step on are NaN. The result is `ill_posed` if only the likelihood is not
+        finite, because the covariance of a predicted observation is not positive
         definite.
 
-    **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
-    finite; with `throw`, an error at run time if a belief or the likelihood is not
-    finite.
+    **Raises:** `ValueError` if an argument has the wrong type or shape or is not
+    finite. An error at run time if `throw` is true and a mean, a covariance or the
+    likelihood is not finite.
 
     Source: Kalman, 1960; Schweppe, 1965 (the likelihood).
 
@@ -146,10 +147,11 @@ def smooth(
     G_k = P_k A^T \Sigma_{k+1}^{-1}$$
 
     The covariance is computed in a form that stays semidefinite. For a nonlinear
-    filter, $P_k A^T$ is the covariance of the state with the next state, which the
-    filter computes. Covariances may be singular, for example for a known first state,
-    or if only some of the states have noise. The smoothed covariances then lose digits,
-    so compute them in float64.
+    filter, $P_k A^T$ is replaced by the cross-covariance of the states at steps $k$ and
+    $k + 1$, which the filter computes. Covariances may be singular, for example because
+    the first state is known, or because noise acts on only some of the states. If
+    covariances are singular, the smoothed covariances lose digits to rounding, so
+    compute in float64.
 
     **Arguments:**
 

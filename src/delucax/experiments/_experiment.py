@@ -45,7 +45,7 @@ class Fixture:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A function with its parameters, seeds, fixtures and marks.
+    """A function to run, with its parameters, seeds, fixtures and marks.
 
     You make one with [`delucax.experiments.experiment`][]. Calling it calls the
     function.
@@ -57,8 +57,8 @@ class Experiment:
     - `axes`: the parameters; none by default.
     - `seeds`: the seeds; `(0,)` by default.
     - `marks`: the marks of all cases; none by default.
-    - `fixtures`: a dictionary from names to the fixtures that are not globals of the
-        function's module; empty by default.
+    - `fixtures`: a dictionary that maps names to fixtures, for fixtures that are not
+        global variables in the module of the function; empty by default.
 
     !!! example
 
@@ -234,21 +234,24 @@ class Experiment:
 
 
 class experiment:  # noqa: N801
-    """Make an experiment from a function. Its decorators are like those of pytest.
+    """Make an experiment from a function. `experiment.parametrize` works as in pytest.
 
     The function is called for each case, with the parameters and fixtures as arguments.
     The function must return a number, or a dictionary from names to numbers, strings or
     arrays. The arguments of the function decide how the function is called:
 
-    - with `key`: the function is traced, compiled, and called for all seeds at once by
-        `vmap`, each with `jax.random.key(seed)`. Arrays, the arrays of modules, and
-        numbers among the parameters are traced, so that other values need no new
-        compilation. A number that must be known when the function is traced (a horizon,
-        a width) is static. To find the static numbers, the function is first traced
-        with all numbers traced, then with floats only, and then with no numbers.
-    - with `seed`: the function is called once for each seed, with an integer and
-        without `jit`. Use `seed` for code that cannot be traced, such as `fit`.
-    - with neither `key` nor `seed`: the function is called once, without `jit`.
+    - if the function has an argument `key`: it is traced, compiled, and called for all
+        seeds at once by `vmap`, each with `jax.random.key(seed)`. Arrays, arrays in
+        modules, and numbers among the parameters are traced, so that the function need
+        not be compiled again for other values. A number that must be known when the
+        function is traced (a horizon, a width) is static. To find out which numbers
+        must be static, `experiment` first tries to trace all numbers. If this fails, it
+        traces only floats, and if this fails too, it traces no numbers.
+    - if the function has an argument `seed`: it is called once for each seed, without
+        `jit`, and gets the seed as an integer. Use `seed` for code that cannot be
+        traced, such as `fit`.
+    - if the function has neither `key` nor `seed` as an argument: it is called once,
+        without `jit`.
 
     **Arguments:**
 

@@ -25,20 +25,21 @@ class Results:
 
     A row is a dictionary with these keys:
 
-    - `experiment`, `case`, the names of the parameters, and `seed`.
+    - `experiment`, `case` and `seed`, and the name of each parameter.
     - `status`: `"passed"`, `"failed"`, `"failed as expected"`, `"passed unexpectedly"`,
-        or `"skipped"`, which is not stored.
-    - the names of what the function returned; `value` if it returned a single number.
+        or `"skipped"`. Skipped cases are not stored.
+    - the name of each result in the dictionary that the function returned, or `value`
+        if the function returned a single number.
     - `error` and `traceback`.
-    - `compile_seconds` and `run_seconds`: the times of the case [s], for all its seeds
-        together.
-    - `date`, `commit`, `dirty`, `dtype`, `device`, `versions`, `hash`: how the result
-        was made.
+    - `compile_seconds` and `run_seconds`: the times to compile and to run the case [s],
+        for all its seeds together.
+    - `date`, `commit`, `dirty`, `dtype`, `device`, `versions`, `hash`: when, with which
+        code and on which device the result was computed.
 
     **Arguments:**
 
     - `rows`: the rows, dictionaries.
-    - `metrics`: the names of what the functions returned.
+    - `metrics`: the names of the results that the functions returned.
     - `parameters`: the names of the parameters.
 
     !!! example

@@ -55,21 +55,21 @@ def run(
     retry: bool = False,
     progress: bool = True,
 ) -> Results:
-    """Run the cases of experiments that are not in the store yet.
+    """Run those cases of experiments whose results are not stored yet.
 
     If a case fails, its traceback is recorded and the other cases are still run, even
     if the case kills its worker process. Each result is stored at once. A stored case
-    is run again only if its code or parameters changed. So if a run was killed, the
-    same call of `run` continues it.
+    is run again only if its code or parameters changed. So if a run was interrupted,
+    call `run` with the same arguments to continue it.
 
     **Arguments:**
 
     - `*experiments`: the experiments, each a [`delucax.experiments.Experiment`][].
     - `store`: a results file, which is created if it does not exist. By default the
         results are only kept in memory.
-    - `workers`: the number of processes. 1 by default, which is this process; -1 means
-        one process for each core. If there are several workers, each worker computes
-        with one thread.
+    - `workers`: the number of processes, 1 by default. With 1, the cases run in the
+        current process. With -1, there is one process for each core. If there are
+        several workers, each worker computes with one thread.
     - `backend`: how workers are started: `"loky"` (default), on this machine, or
         `"dask"`, on the cluster of the open `dask.distributed.Client`. Both backends
         need the extra `experiments`, and `"dask"` also needs the extra `dask`.
@@ -78,21 +78,21 @@ def run(
     - `marks`: selects cases by their marks, with the same syntax as `select`; all by
         default.
     - `slow`: whether to include cases that are marked `slow`; `False` by default.
-    - `seeds`: a number of seeds, or a sequence of seeds, which replaces the seeds of
-        the experiments.
-    - `mesh`: a `jax.sharding.Mesh`. The seeds of each case are spread over its first
-        axis. If one of them is missing in the store, all are run. None by default. A
-        mesh needs `workers=1`.
+    - `seeds`: a number of seeds, or a sequence of seeds, to use in place of the seeds
+        of the experiments.
+    - `mesh`: a `jax.sharding.Mesh`. The seeds of each case are distributed over the
+        devices along the first axis of the mesh. If the store lacks one seed of a case,
+        all seeds of this case are run. None by default. A mesh needs `workers=1`.
     - `fresh`: whether to run cases that are already stored; `False` by default.
-    - `retry`: whether to run again the cases that raised an error, expected or not;
-        `False` by default.
+    - `retry`: whether to run stored cases again that raised an error, even if the error
+        was expected; `False` by default.
     - `progress`: whether to show the progress of the run and of each worker; `True` by
         default.
 
     **Returns:** the [`delucax.experiments.Results`][] of the selected cases.
 
-    **Raises:** `ValueError` if an argument is invalid, before any case is run;
-    `OSError` if the store cannot be written. The results so far are kept.
+    **Raises:** `ValueError` if an argument is invalid; this is checked before any case
+    is run. `OSError` if the store cannot be written. The results so far are kept.
 
     !!! example
 

@@ -25,16 +25,17 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     """The interquartile mean: the mean of the values between the quartiles.
 
     The interquartile mean ignores outliers, as the median does, but uses more of the
-    data. If the number of values is not a multiple of 4, the values at the edges of the
-    middle half have a reduced weight.
+    data. If the number of values is not a multiple of 4, the smallest and the largest
+    value of the middle half have a reduced weight.
 
     **Arguments:**
 
-    - `values`: numbers. Infinite values in the outer quarters have no effect. If a
-        value is NaN, the mean is NaN.
+    - `values`: numbers. Infinite values among the lowest and the highest quarter of the
+        values have no effect. If a value is NaN, the mean is NaN.
     - `axis`: the axis to average over; all axes by default.
 
-    **Returns:** a number, or an array without that axis.
+    **Returns:** a number if all axes are averaged, otherwise an array that lacks
+    `axis`.
 
     **Raises:** `ValueError` if `values` is empty.
 
@@ -91,17 +92,19 @@ def compare(
 ) -> Any:
     """Compare each value of a parameter with a baseline, on the same cases and seeds.
 
-    A value and the baseline are compared in pairs of rows that passed and that agree in
-    all other parameters and in the seed. The intervals come from a bootstrap over the
-    pairs. The bootstrap draws seeds within each case, or cases if each case has only
-    one seed.
+    Each value is compared with the baseline in pairs of rows. Both rows of a pair have
+    passed, and they have the same seed and the same values of all other parameters. The
+    confidence intervals are computed by a bootstrap over the pairs. In each case, the
+    bootstrap resamples the seeds. If each case has only one seed, the bootstrap
+    resamples the cases.
 
     **Arguments:**
 
     - `results`: from [`delucax.experiments.run`][].
     - `by`: the parameter, such as `"controller"`.
-    - `baseline`: the value to compare with, as the table shows it.
-    - `metric`: the result to compare, `"value"` by default.
+    - `baseline`: the value of the parameter to compare with, written as in the table of
+        the results.
+    - `metric`: the name of the result to compare, `"value"` by default.
     - `ratio`: whether to give the ratio of the interquartile means instead of their
         difference; `False` by default.
     - `confidence`: the confidence level of the intervals, 0.95 by default.
@@ -112,9 +115,10 @@ def compare(
 
     - `iqm`, `low`, `high`: the interquartile mean and its confidence interval.
     - `difference`, `difference_low`, `difference_high`: the difference from the
-        baseline over the common pairs, and its confidence interval. With `ratio` these
-        columns are called `ratio`, `ratio_low` and `ratio_high`.
-    - `below`: the fraction of the pairs in which the value is below the baseline.
+        baseline, computed over the pairs, and its confidence interval. If `ratio` is
+        true, these columns are called `ratio`, `ratio_low` and `ratio_high`.
+    - `below`: the fraction of the pairs in which the result is lower than the result of
+        the baseline.
     - `pairs`: the number of pairs.
 
     **Raises:** `ValueError` if `by`, `baseline` or `metric` does not exist in the
@@ -196,10 +200,11 @@ def compare(
 
 @dataclasses.dataclass(frozen=True)
 class Bootstrap:
-    """Bootstrap intervals of a statistic, and of differences or ratios of pairs.
+    """Bootstrap confidence intervals of a statistic, or of a comparison of paired
+    values.
 
-    The values come in groups, and each group is resampled separately. The two values of
-    a pair are always drawn together.
+    The values are given in groups, and the bootstrap resamples each group separately.
+    The two values of a pair are always drawn together.
 
     Source: Efron, 1979.
 
@@ -208,8 +213,8 @@ class Bootstrap:
     - `confidence`: the confidence level of the intervals, 0.95 by default.
     - `resamples`: the number of bootstrap samples, 2000 by default.
     - `seed`: the seed of the bootstrap, 0 by default.
-    - `statistic`: a function of an array and an `axis`; by default
-        [`delucax.experiments.interquartile_mean`][].
+    - `statistic`: the statistic, a function that takes an array and an argument `axis`;
+        by default [`delucax.experiments.interquartile_mean`][].
 
     !!! example
 

@@ -38,22 +38,24 @@ def c(
     Every loop has a bound. Every value that does not depend on the inputs, such as the
     weights of a network, becomes a constant.
 
-    A controller becomes three functions, which do what its `init`, `__call__` and
-    `applied` do: `NAME_init(state)`, `NAME_step(state, t, y, u)` and
-    `NAME_applied(state, u, cost)`. A step returns 0, or a flag if a number is not
-    finite: `NAME_BAD_INPUT` for an input, `NAME_BAD_RESULT` for a result. If a step
-    returns a flag, the control is `fallback`, and the state stays as it was before the
-    step. A step in which Python would raise an error, for example with
-    `equinox.error_if`, returns `NAME_BAD_RESULT`.
+    A controller becomes three functions, `NAME_init(state)`,
+    `NAME_step(state, t, y, u)` and `NAME_applied(state, u, cost)`. These C functions do
+    the same as the methods `init`, `__call__` and `applied` of the controller.
+    `NAME_step` returns 0 if all numbers are finite, `NAME_BAD_INPUT` if an input is not
+    finite, and `NAME_BAD_RESULT` if a result is not finite. If `NAME_step` does not
+    return 0, the control is `fallback`, and the state stays as it was before the step.
+    A step in which Python would raise an error, for example with `equinox.error_if`,
+    returns `NAME_BAD_RESULT`.
 
     A function becomes `NAME(inputs..., outputs...)`. The C function takes numbers by
-    value, and arrays as pointers to their entries in row-major order. It always writes
-    its outputs, and returns the same flags as a step. Arrays in the closure of the
-    function become constants.
+    value, and arrays as pointers to their entries in row-major order. The C function
+    always writes its outputs, and returns the same flags as `NAME_step`. Arrays in the
+    closure of the function become constants.
 
-    A plant is exported as a function: the vector field of a system, or the step of
-    dynamics. The inputs are `(t, x, u)`. The disturbance `w` is an input too if it
-    enters the equations, or if it holds the Brownian increments of a step.
+    A plant is exported as a function. For a system, this function is the vector field.
+    For dynamics, it is the step to the next state. The inputs are `(t, x, u)`. The
+    disturbance `w` is a fourth input if it occurs in the equations of the plant, or if
+    it holds the increments of a Brownian motion.
 
     **Arguments:**
 
@@ -63,31 +65,33 @@ def c(
     - `directory`: the folder to write to. The folder is created if it does not exist.
     - `name`: an identifier in C. All public names in the C code begin with `name`.
     - `dtype`: the type of all real numbers, `"float32"` or `"float64"`. By default the
-        type is the type of the arrays in `function_or_controller` and `example`. The
-        type may differ from the precision of JAX in this process.
-    - `example`: for a function, a tuple of its inputs: arrays, numbers,
-        `jax.ShapeDtypeStruct`, or pytrees of them. Only the shapes and types of the
-        inputs are used. For a controller, an observation, which you need to give only
-        if the controller does not fix the size of the observation.
-    - `fallback`: the control of a step that fails, shape `(m,)`. By default the
-        fallback is the control of the last step that succeeded, or zeros if no step has
-        succeeded yet.
+        type is the type of the arrays in `function_or_controller` and `example`. You
+        can choose `"float64"` even if JAX computes in float32 in this process, and the
+        other way round.
+    - `example`: if you export a function, a tuple of example inputs, which may be
+        arrays, numbers, `jax.ShapeDtypeStruct`, or pytrees of them. Only the shapes and
+        types of these inputs are used. If you export a controller, `example` is an
+        observation. It is needed only if the controller itself does not determine the
+        size of its observation.
+    - `fallback`: the control that a step returns if it fails, shape `(m,)`. By default
+        the fallback is the control of the last step that succeeded, or zeros if no step
+        has succeeded yet.
     - `key`: a random key, for a controller that draws random numbers, such as
-        [`delucax.controllers.BPC`][]. The state in C holds the two words of the key.
-        The C code draws the numbers that JAX would draw after `init(key=key)`, and the
-        same numbers again after each `NAME_init`.
+        [`delucax.controllers.BPC`][]. The state in C holds this key. The C code draws
+        the same random numbers as the controller in JAX draws after `init(key=key)`.
+        Each call of `NAME_init` restarts the same sequence of random numbers.
     - `plant`: a plant whose names and units are written into the header of a
         controller. By default the plant is taken from the controller, if it holds one.
-    - `max_iterations`: the largest number of rounds of a loop for which no bound is
-        found. A loop that would need more rounds stops after `max_iterations` rounds,
-        and the flag is `NAME_BAD_RESULT`.
+    - `max_iterations`: the largest number of iterations of a loop, for loops whose
+        number of iterations cannot be bounded in advance. A loop that would need more
+        iterations stops after `max_iterations`, and the flag is `NAME_BAD_RESULT`.
 
     **Returns:** a [`delucax.export.Report`][].
 
     **Raises:** `ValueError` if something cannot be written in C, such as eigenvalues,
-    calls of Python, or random draws of a function; the message names the line of your
-    code. A `ValueError` is also raised if `name` is not an identifier, or `directory`
-    cannot be written to. After an error no file has changed.
+    callbacks to Python, or random numbers in a function. The message names the line of
+    your code. A `ValueError` is also raised if `name` is not an identifier in C, or
+    `directory` cannot be written to. If an error is raised, no file is changed.
 
     !!! example
 

@@ -20,10 +20,11 @@ def load(
     compiler: str | None = None,
     flags: Sequence[str] = FLAGS,
 ) -> LoadedController | LoadedFunction:
-    """Compile C that [`delucax.export.c`][] wrote, and load it into Python.
+    """Compile the C code that [`delucax.export.c`][] wrote, and load it into Python.
 
-    The compiled library is kept in the user's cache. The library is compiled again only
-    if the C code, the compiler or the flags change. Nothing is written to `directory`.
+    The compiled library is kept in the cache folder of the user. The library is
+    compiled again only if the C code, the compiler or the flags change. Nothing is
+    written to `directory`.
 
     **Arguments:**
 
@@ -34,14 +35,15 @@ def load(
         variable `CC` or, if `CC` is not set, the first of `cc`, `gcc` and `clang` that
         is installed.
     - `flags`: arguments of the compiler. The default flags make the results comparable
-        with JAX: `-ffp-contract=off` keeps the compiler from fusing products and sums.
+        with JAX: `-ffp-contract=off` forbids the compiler to compute a product and a
+        sum with a single rounding.
 
     **Returns:** a [`delucax.export.LoadedController`][] for a controller, or a
     [`delucax.export.LoadedFunction`][] for a function or a plant.
 
     **Raises:** `ValueError` if the folder holds no export, or holds several exports and
-    `name` is not given; if no compiler is found; or if the compiler fails. In this case
-    the error shows the message of the compiler.
+    `name` is not given; if no compiler is found; or if the compiler fails. If the
+    compiler fails, the error shows the message of the compiler.
 
     !!! example
 

@@ -34,22 +34,24 @@ class LoadedController(AbstractController):
 
     Use it like any other controller. [`delucax.rollout`][] accepts this controller,
     also under `jit` and `vmap`: Python then calls the C code at each step. With NumPy
-    arrays, the controller calls the C code directly and returns NumPy arrays. It
-    computes in the precision of the export. It has no derivative.
+    arrays, the controller calls the C code directly and returns NumPy arrays. The
+    controller computes in the precision that was chosen in the export. It has no
+    derivative.
 
-    If a number is not finite, the control is the `fallback` of [`delucax.export.c`][]:
-    by default the control of the last step that succeeded. A rollout records each step
-    with a fallback in `trajectory.incidents` as `"declared_answer"`, and
-    [`delucax.export.Running`][] warns.
+    If an input or a result of a step is not finite, the control is the `fallback` that
+    was given to [`delucax.export.c`][], by default the control of the last step that
+    succeeded. A rollout records each step that used the fallback in
+    `trajectory.incidents` as `"declared_answer"`. [`delucax.export.Running`][] gives a
+    warning at such a step.
 
     **Arguments:**
 
     - `library`: the path of the compiled library.
-    - `description`: the description of the program, from its header.
+    - `description`: the description of the program, as read from its header file.
         [`delucax.export.load`][] sets both.
 
-    **Raises:** `ValueError` when called if an argument has the wrong shape, or the
-    state is not one that `init` returned.
+    **Raises:** `ValueError` if the controller is called with an argument of the wrong
+    shape, or with a state that does not come from `init`.
 
     !!! example
 
@@ -216,17 +218,17 @@ class LoadedFunction:
     It takes and returns NumPy arrays. If one of the arguments is a JAX array, the
     function returns JAX arrays, also under `jit` and `vmap`. The results are those of
     the exported function, as a flat tuple if there are several results. It has no
-    derivative. A result that is not finite is returned unchanged. With NumPy arrays the
-    function also warns.
+    derivative. A result that is not finite is returned unchanged. If the arguments are
+    NumPy arrays, the function also warns about such a result.
 
     **Arguments:**
 
     - `library`: the path of the compiled library.
-    - `description`: the description of the program, from its header.
+    - `description`: the description of the program, as read from its header file.
         [`delucax.export.load`][] sets both.
 
-    **Raises:** `ValueError` when called with the wrong number of arguments, or an
-    argument of the wrong shape or type.
+    **Raises:** `ValueError` if the function is called with the wrong number of
+    arguments, or with an argument of the wrong shape or type.
 
     !!! example
 

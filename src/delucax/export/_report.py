@@ -10,13 +10,14 @@ class Report(NamedTuple):
 
     - `files`: the paths of the files that were written.
     - `constants`: the bytes of constants.
-    - `state`: the bytes of the state; 0 for a function.
+    - `state`: the size of the state in bytes; 0 for a function.
     - `stack`: the largest number of bytes that the arrays and variables of one call
-        need. The functions of `math.h` need some more.
+        need. The functions of `math.h` need some more bytes on the stack.
     - `operations`: the largest number of arithmetic operations of one call. A call of a
         `math.h` function counts as one operation.
-    - `bounds`: `(line, rounds)` for each loop that may end early: the line of Python
-        from which the loop comes, and the largest number of rounds.
+    - `bounds`: a pair `(line, rounds)` for each loop whose number of iterations is not
+        fixed: the line of Python code from which the loop comes, and the largest number
+        of iterations.
     - `lines`: the number of lines in `NAME.c`.
 
     !!! example

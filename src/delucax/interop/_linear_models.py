@@ -19,7 +19,7 @@ from ..systems import LinearSystem
 def read_linear(
     path: str | os.PathLike, *, dt: Any = None
 ) -> LinearSystem | LinearDynamics:
-    r"""Read a linear model from a file of its matrices: `.npz` of NumPy or `.mat` of
+    r"""Read a linear model from a file with its matrices, `.npz` of NumPy or `.mat` of
     MATLAB.
 
     The model is $\dot x = A x + B u + E w$ in continuous time, or
@@ -36,9 +36,9 @@ def read_linear(
     **Returns:** a [`delucax.systems.LinearSystem`][] if the step is 0, otherwise
     [`delucax.LinearDynamics`][].
 
-    **Raises:** `ValueError` if the file has another format, lacks `A`, `B` or a step,
-    holds a step that differs from `dt` or a `D` that is not zero, or if the shapes do
-    not fit each other. `OSError` if the file cannot be read.
+    **Raises:** `ValueError` if the file has another format, if it lacks `A`, `B` or a
+    step, if its step differs from `dt`, if its `D` is not zero, or if the shapes of the
+    matrices do not match. `OSError` if the file cannot be read.
 
     !!! example
 
@@ -116,19 +116,19 @@ def to_control(
 ) -> Any:
     """Convert a linear model to a `control.StateSpace` of python-control.
 
-    Use it for the Bode, Nyquist and root-locus plots of python-control. It needs the
-    extra `delucax[control]`. The result describes deviations from the operating point
-    of the model: `StateSpace` cannot store that point. States and inputs keep their
-    names. If the whole state is observed, outputs have the names of the states,
-    otherwise the names are `y[0]`, `y[1]`, ...
+    Use the result for the Bode, Nyquist and root-locus plots of python-control. The
+    conversion needs the extra `delucax[control]`. The result describes deviations from
+    the operating point of the model: `StateSpace` cannot store that point. States and
+    inputs keep their names. If the whole state is observed, outputs have the names of
+    the states, otherwise the names are `y[0]`, `y[1]`, ...
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
-    - `disturbances`: whether to append the columns of `E` to the inputs, with the names
-        `w0`, `w1`, ... By default the inputs are the controls only. Dynamics without
-        `E` append the identity.
+    - `disturbances`: whether the disturbances become inputs too, named `w0`, `w1`, ...,
+        with the columns of `E`. By default the inputs are the controls only. For
+        dynamics without `E`, the columns of the identity are appended.
 
     **Returns:** a `control.StateSpace`. The `dt` of the result is the step of the
     dynamics, or 0 for a system.
@@ -192,13 +192,14 @@ def from_control(
 
     The operating point of the model is the origin. The conversion needs the extra
     `delucax[control]`. States and controls keep their names. If `C` is the identity,
-    the model has no `C`, because the state is observed.
+    the model needs no `C`, because the observation is the state itself.
 
     **Arguments:**
 
     - `system`: a `control.StateSpace` without feed-through: its `D` must be zero.
     - `disturbances`: the inputs that are disturbances, by name or index; none by
-        default. The columns of these inputs become the columns of `E`, in this order.
+        default. The columns of `system.B` that belong to these inputs become the
+        columns of `E`, in this order.
 
     **Returns:** a [`delucax.systems.LinearSystem`][] if `system.dt` is 0, otherwise
     [`delucax.LinearDynamics`][] with the step `system.dt`. A `dt` of `True`, which

@@ -24,23 +24,26 @@ class _Phases(NamedTuple):
 
 
 class Breathing(AbstractController):
-    r"""A controller of whole breaths, made from a controller of the inspiratory valve.
+    r"""A controller of both valves in all phases of a breath, made from a controller of
+    the inspiratory valve.
 
-    In the inspiratory phase, the control of the inspiratory valve is the control of
-    `inspiratory`, clipped to [0, 100]. In the expiratory phase the inspiratory valve is
-    closed. With an `expiratory_opening` $u_e$, the inspiratory valve is opened to
-    $u_e (1 - e^{-5 s})$ in the second half of each period, where $s$ is the time since
-    the middle of the period [s]. This flow keeps the airway open in spite of a leak.
+    In the inspiratory phase, the controller `inspiratory` sets the inspiratory valve,
+    and its control is clipped to [0, 100]. In the expiratory phase the inspiratory
+    valve is closed. If `expiratory_opening` $u_e$ is not 0, the inspiratory valve is
+    instead opened to $u_e (1 - e^{-5 s})$ in the second half of each breath, where $s$
+    is the time since the middle of the breath [s]. This flow keeps the airway open in
+    spite of a leak.
 
     The inspiratory controller is reset at the start of each breath. The state of the
     inspiratory controller does not change in the expiratory phase.
 
     **Arguments:**
 
-    - `inspiratory`: any controller of one control, such as a
+    - `inspiratory`: any controller whose control has one entry, such as a
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
-    - `expiratory_opening`: $u_e$ [%], 0 by default; 5 in the code of Deluca.
+    - `expiratory_opening`: $u_e$, the opening of the inspiratory valve late in the
+        breath [%], 0 by default; 5 in the code of Deluca.
     - `valve`: a controller of the expiratory valve. By default the expiratory valve is
         closed in the inspiratory phase and open in the expiratory phase.
 
@@ -133,13 +136,13 @@ def _is_key(leaf: Any) -> bool:
 
 
 class BangBang(AbstractController):
-    """Opens the inspiratory valve fully below the target pressure, and closes the valve
-    above the target.
+    """Opens the inspiratory valve fully if the pressure is below the target, and closes
+    the valve if the pressure is above the target.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `high`: the control below the target [%], 100 by default.
+    - `high`: the control if the pressure is below the target [%], 100 by default.
 
     **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
 
@@ -169,35 +172,39 @@ class BangBang(AbstractController):
 
 
 class BreathPolicy(AbstractController):
-    r"""A policy of the inspiratory valve: a network whose inputs are errors, targets
-    and controls.
+    r"""A policy of the inspiratory valve: a neural network whose inputs are past
+    errors, targets and past controls.
 
     $$u_k = 100 \, \sigma(\mathrm{network}(e_k, \dots, e_{k + 1 - n_e},
     r_{k + 1}, r_{k + 2}, r_k, u_{k - 1}, \dots, u_{k - n_u}) + \mathrm{shift})$$
 
     The inputs are the last errors $e$, the target $r$ now and at the next two steps,
-    and the last controls $u$. The inputs are scaled to about 1, and errors and controls
-    are zero before the breath. The sigmoid $\sigma$ enforces the bounds of the valve,
-    and its gradient is never zero.
+    and the last controls $u$. All inputs are scaled to a size of about 1. Errors and
+    controls from before the breath are set to zero. The sigmoid $\sigma$ enforces the
+    bounds of the valve, and its gradient is never zero.
 
-    The kind `"mlp"` is a fully connected network. The kind `"cnn"` first takes the
-    means of the last 1, 2, ..., `errors` errors, and convolves them.
+    The kind `"mlp"` is a fully connected network. The kind `"cnn"` first computes the
+    mean of the last error, of the last 2 errors, and so on up to all `errors` errors,
+    and then applies a convolution to these means.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `dt`: the control interval [s].
     - `kind`: `"mlp"` (default) or `"cnn"`.
-    - `width`: the number of hidden units, or of channels, 32 by default.
+    - `width`: the number of hidden units of the `"mlp"`, or of channels of the `"cnn"`,
+        32 by default.
     - `depth`: the number of hidden layers of the `"mlp"`, 2 by default; may be 0. The
         `"cnn"` has none.
-    - `errors`: the number of errors $n_e$, 10 by default. A `"cnn"` needs at least 5.
-    - `controls`: the number of controls $n_u$, 4 by default; may be 0. The published
-        networks had neither the controls nor $r_k$ as inputs.
+    - `errors`: $n_e$, the number of past errors that enter the network, 10 by default.
+        A `"cnn"` needs at least 5.
+    - `controls`: $n_u$, the number of past controls that enter the network, 4 by
+        default; may be 0. In the published networks, neither past controls nor the
+        target $r_k$ were inputs.
     - `key`: a random key, for the first weights.
 
-    **Attributes:** `network`, trainable; `shift`, -2, so that the valve is a little
-    open at first.
+    **Attributes:** `network`, trainable; `shift`, which is -2, so that the valve is
+    open a little before training.
 
     **Raises:** `ValueError` if a size is too small, the kind is unknown, `waveform` is
     not a `BreathWaveform`, or `key` is missing.

@@ -30,14 +30,15 @@ def read_breaths(
     resistances: Sequence[float] = RESISTANCES,
     compliances: Sequence[float] = COMPLIANCES,
 ) -> Breaths:
-    """Read the inspirations of recorded breaths from a file.
+    """Read recorded breaths from a file, and keep only their inspirations.
 
     The file has the columns of the "Ventilator Pressure Prediction" data set: `id`,
     `breath_id`, `R` [cmH2O s/L], `C` [mL/cmH2O], `time_step` [s], `u_in` (0 to 100 %),
     `u_out` (0 or 1) and `pressure` [cmH2O], in any order. All rows of a breath must
-    follow each other in the file. An inspiration ends when `u_out` is first 1. The
-    steps of the file are uneven, so each inspiration is sampled again every `dt`: the
-    pressure is interpolated linearly, and the controls are held.
+    follow each other in the file. The inspiration of a breath ends at the first row
+    with `u_out` equal to 1. The time steps in the file are uneven, so each inspiration
+    is resampled with the constant step `dt`: the pressure is interpolated linearly, and
+    each control is held until the next row.
 
     Numbers may be quoted and blank lines are ignored. Comments are not allowed.
 
@@ -45,7 +46,8 @@ def read_breaths(
 
     - `path`: the file.
     - `length`: the number of samples per inspiration, 29 by default.
-    - `dt`: the time between samples [s]; the median of the file by default.
+    - `dt`: the time between samples [s], by default the median of the time steps in the
+        file.
     - `resistances`, `compliances`: the values that `R` and `C` may have; 5, 20, 50 and
         10, 20, 50 by default.
 
@@ -55,9 +57,9 @@ def read_breaths(
     **Raises:** `ValueError` if a column is missing, a value is not a finite number,
         `u_in` is out of its bounds, `R`, `C` or `u_out` has a value that is not
         allowed, `R` or `C` changes within a breath, time does not increase, or a breath
-        is too short. The message of the error names the column and the row, which is
-        the line of the file as an editor counts it: the header is row 1, and blank
-        lines count. `OSError` if the file cannot be read.
+        is too short. The message of the error names the column and the row. Rows are
+        counted like the lines in an editor: the header is row 1, and blank lines count.
+        `OSError` if the file cannot be read.
 
     Source: Google Brain, 2021 (the data set); Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu,
     Singh, Zhang, Minasyan, LaChance, Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -208,7 +210,7 @@ def _numbers(
 
 
 def write_breaths(path: str | os.PathLike, breaths: Breaths) -> None:
-    """Write breaths with the columns that [`delucax.lung.read_breaths`][] reads.
+    """Write breaths to a file that [`delucax.lung.read_breaths`][] can read.
 
     **Arguments:**
 

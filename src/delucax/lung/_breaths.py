@@ -31,11 +31,11 @@ class Breaths(eqx.Module):
         `None` by default.
     - `compliance`: the compliance of the lung of each breath [mL/cmH2O], shape `(B,)`;
         `None` by default.
-    - `truth`: the reading of a sensor without noise [cmH2O], shape `(B, T)`; `None` by
-        default.
+    - `truth`: the pressure that a sensor without noise would read [cmH2O], shape
+        `(B, T)`; `None` by default.
 
-    **Raises:** `ValueError` if shapes do not fit each other, a value is not finite, or
-    `dt` is not positive.
+    **Raises:** `ValueError` if shapes do not match, a value is not finite, or `dt` is
+    not positive.
 
     !!! example
 

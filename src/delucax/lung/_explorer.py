@@ -29,21 +29,23 @@ GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
 class Explorer(AbstractController):
     r"""A PID with random gains and a random disturbance, to collect data from a lung.
 
-    The control is the sum of the PID and a bump, clipped to [0, 100], with the
-    expiratory valve closed. In the expiratory phase the control is (0, 1): the
-    inspiratory valve is closed and the expiratory valve is open.
+    In the inspiratory phase, the control of the inspiratory valve is the output of the
+    PID plus a disturbance (a bump), clipped to [0, 100], and the expiratory valve is
+    closed. In the expiratory phase the control is (0, 1): the inspiratory valve is
+    closed and the expiratory valve is open.
 
     The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn for each
-    episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10}, times `scale`. A bump is drawn too:
-    a triangle of height -30 to 30 % and width 0.1 to 0.5 s, at a random time in the
-    inspiration. With probability 0.15 the bump is instead a ramp, which falls from a
-    height of 0 to 100 % to zero within 0.05 to 0.3 s.
+    episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10}, times `scale`. A bump is drawn for
+    each episode too: a triangle with a height from -30 to 30 % and a width from 0.1 to
+    0.5 s, at a random time in the inspiration. With probability 0.15, the bump is a
+    ramp in place of a triangle. The ramp starts at a random height from 0 to 100 %, and
+    falls to zero within 0.05 to 0.3 s.
 
     **Arguments:**
 
     - `dt`: the control interval [s].
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `scale`: the scale of the random gains, 1 by default.
+    - `scale`: the factor by which the random gains are multiplied, 1 by default.
 
     **Raises:** `ValueError` if an argument is not a finite number, `dt` is not
     positive, or `waveform` is not a `BreathWaveform`.
@@ -128,9 +130,9 @@ def explore(
 ) -> Breaths:
     """Collect breaths of a lung with a [`delucax.lung.Explorer`][].
 
-    Each breath begins at the start of the task. Breaths whose pressure exceeds the
-    abort limit are left out, because a real machine would not finish them. Other
-    breaths are drawn in place of those that are left out.
+    Each breath is the first breath of a new episode. Breaths whose pressure exceeds the
+    limit `abort` are discarded, because a real machine would not finish them. New
+    breaths are drawn in their place.
 
     **Arguments:**
 
@@ -138,16 +140,17 @@ def explore(
     - `breaths`: the number of breaths.
     - `key`: a random key.
     - `length`: the number of samples per breath, 29 by default.
-    - `pips`: the peak pressures to draw from, 10, 15, ..., 35 cmH2O by default.
-    - `scale`: the scale of the random PID gains, 1 by default.
-    - `abort`: the abort limit [cmH2O], 70 by default.
+    - `pips`: the peak pressures of the target from which one is drawn for each breath,
+        10, 15, ..., 35 cmH2O by default.
+    - `scale`: the factor by which the random PID gains are multiplied, 1 by default.
+    - `abort`: the pressure above which a breath is discarded [cmH2O], 70 by default.
     - `resistance`, `compliance`: the resistance and the compliance of the lung, which
-        are recorded with the breaths; `None` by default.
+        are stored with the breaths; `None` by default.
 
     **Returns:** a [`delucax.lung.Breaths`][] with `truth`.
 
     **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
-    below PEEP), or if too few breaths stay below the limit.
+    below PEEP), or if too few breaths stay below the limit `abort`.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.

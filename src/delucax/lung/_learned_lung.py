@@ -41,10 +41,11 @@ def _moments(breaths: Breaths) -> tuple[Array, ...]:
 
 
 class LearnedLung(AbstractDynamics):
-    r"""A lung learned from breaths: a network of the last controls and pressures.
+    r"""A lung learned from breaths: a neural network that predicts the next pressure.
 
-    Each of the first steps of an inspiration has an extra network. At step $k$ of an
-    inspiration, the normalised pressure is predicted as
+    For each of the first steps of an inspiration, there is one more small network,
+    which is used only at this step. At step $k$ of an inspiration, the normalised
+    pressure is predicted as
 
     $$p_{k + 1} = p_k + \ell^\top z + \mathrm{network}(z)
     + o_k^\top \tanh(H_k z_\mathrm{all})$$
@@ -52,31 +53,36 @@ class LearnedLung(AbstractDynamics):
     $$z = (v(u_k), \dots, v(u_{k + 1 - n_u}), p_k, \dots, p_{k + 1 - n_p})$$
 
     Here $u$ are the normalised controls, $\ell$ is `line`, and $v$ is a small network
-    of one control that linearises the curve of the valve. The last term has the weights
-    `output` ($o_k$) and `hidden` ($H_k$) and takes the whole history $z_\mathrm{all}$;
-    it is present only for $k < \mathrm{boundary}$. Before an inspiration the valve is
+    of one control that linearises the curve of the valve. The last term is the small
+    network of step $k$, and is present only for $k < \mathrm{boundary}$. Its weights
+    are `output` ($o_k$) and `hidden` ($H_k$), and its input $z_\mathrm{all}$ holds the
+    whole history. In the part of the history before the inspiration, the valve is
     closed and the pressure is the start pressure of the breaths.
 
-    With `published=True` the model is that of the paper:
+    If `published` is `True`, the model is the one in the paper:
     $p_{k + 1} = \mathrm{network}(z)$, where $z$ holds the controls without $v$. For
-    $k < \mathrm{boundary}$ there is only the last term, and the history before an
-    inspiration is zero, except for the start pressure.
+    $k < \mathrm{boundary}$, the published model consists of the last term only. The
+    history before an inspiration is zero, except for the start pressure.
 
     The networks of the first steps have 16 hidden units each and are stacked in one
     array. While `u_out` is above 1/2, the state is reset to the state before an
-    inspiration. The state is the last controls and the last pressures, both with the
-    newest first, and the number of steps. The observation is the pressure [cmH2O].
+    inspiration. The state holds the last controls and the last pressures, both with the
+    newest first, and the number of steps since the start of the inspiration. The
+    observation is the pressure [cmH2O].
 
     **Arguments:**
 
-    - `breaths`: a [`delucax.lung.Breaths`][], which gives the scales and the pressure
-        before an inspiration.
+    - `breaths`: a [`delucax.lung.Breaths`][], from which the model takes the means and
+        standard deviations for the normalisation, and the pressure before an
+        inspiration.
     - `width`, `depth`: the hidden units and hidden layers of the network, 24 and 1 by
         default.
-    - `boundary`: the number of first steps with a network of their own, 5 by default.
-    - `u_window`, `p_window`: the numbers $n_u$ and $n_p$ of controls and pressures that
-        enter the network, 8 and 6 by default.
-    - `published`: whether to use the published model (see above); `False` by default.
+    - `boundary`: the number of steps at the start of an inspiration that have a network
+        of their own, 5 by default.
+    - `u_window`, `p_window`: $n_u$ and $n_p$, the numbers of last controls and of last
+        pressures that enter the network, 8 and 6 by default.
+    - `published`: whether to use the model in the paper (see above); `False` by
+        default.
     - `key`: a random key, for the first weights.
 
     **Attributes:** `line`, `valve`, `network`, `hidden` and `output`, trainable;

@@ -105,7 +105,7 @@ class LungModel(eqx.Module):
 
 
 class NeuralLung(AbstractLung):
-    r"""A lung as a neural ODE, whose state is a pressure and some hidden states.
+    r"""A lung as a neural ODE. Its state consists of a pressure and some hidden states.
 
     $$\dot z = \mathrm{rate} \cdot
     \mathrm{network}(z, q(u_\mathrm{in}) / q_\mathrm{max}, u_\mathrm{out}), \qquad
@@ -186,16 +186,16 @@ class NeuralLung(AbstractLung):
 
 
 class GreyBoxLung(AbstractLung):
-    r"""A single-compartment lung, with neural networks for the effects that it leaves
-    out.
+    r"""A single-compartment lung, with neural networks for the effects that the
+    single-compartment model leaves out.
 
     $$p = p_\mathrm{single}(x) + p_\mathrm{std} \, \mathrm{network}(q,
     V / (C p_\mathrm{std}), h), \qquad
     \dot h = \mathrm{rate} \cdot \mathrm{memory}(q, V / (C p_\mathrm{std}), h)$$
 
-    The state is (inflow $q$ [L/s], opening, volume $V$ [L], memory $h$). The first
-    network starts with a small output, so that the model starts near the physical one.
-    The vector field is not smooth at an opening of 0.
+    The state is (inflow $q$ [L/s], opening, volume $V$ [L], memory $h$). Before
+    training the output of the first network is small, so that the model is close to the
+    physical model. The vector field is not smooth at an opening of 0.
 
     **Arguments:**
 
@@ -205,7 +205,7 @@ class GreyBoxLung(AbstractLung):
     - `key`: a random key, for the first weights.
 
     **Attributes:** `network` and `memory`, trainable; `p_std`, the scale of the
-        pressures, 10 cmH2O; `rate`, the scale of $\dot h$, 5 / s.
+        pressures, 10 cmH2O; `rate`, the scale of $\dot h$, which is 5 / s.
 
     **Raises:** `ValueError` if a size is below 1, or `key` is missing.
 

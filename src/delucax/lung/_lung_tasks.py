@@ -83,18 +83,19 @@ def balloon_lung(
 ) -> Environment:
     """Ventilate a balloon, so that the pressure tracks a waveform.
 
-    The controls, the observation, the state and the cost are those of
-    [`delucax.lung.ventilation`][]. The lung starts at rest at PEEP. The task never
-    terminates.
+    The controls, the observation, the state and the cost are described in
+    [`delucax.lung.ventilation`][]. At the start of an episode, the lung is at rest at
+    PEEP. The task never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.BalloonLung`][]; made from `options` by default.
+    - `system`: a [`delucax.lung.BalloonLung`][]; by default one is made with the
+        arguments in `options`.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: arguments of the lung; the control interval `dt` (0.03 s by default),
-        `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
-        `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; and those
-        of [`delucax.Environment`][].
+    - `**options`: further arguments, which are passed on to the lung, to
+        [`delucax.Discretized`][] (the control interval `dt`, 0.03 s by default,
+        `solver` and `substeps`), to [`delucax.lung.ventilation`][] (such as `waveform`,
+        `sensor_delay` and `noise`) and to [`delucax.Environment`][].
 
     **Returns:** a [`delucax.Environment`][].
 
@@ -124,16 +125,17 @@ def delay_lung(
 ) -> Environment:
     """Ventilate a balloon through a long pipe, with a transport delay.
 
-    This is the task `lung/balloon_lung` with controls that act some steps late, and
-    with an elastic pipe.
+    This task differs from `lung/balloon_lung` in two ways: the controls act some steps
+    late, and the pipe is elastic.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.DelayLung`][]; made from `options` by default.
+    - `system`: a [`delucax.lung.DelayLung`][]; by default one is made with the
+        arguments in `options`.
     - `delay`: the number of steps until a control acts, 5 by default.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: those of `lung/balloon_lung`. `substeps` is 4 by default, because the
-        pipe empties in about 25 ms.
+    - `**options`: the same as for `lung/balloon_lung`. `substeps` is 4 by default,
+        because the pipe empties in about 25 ms.
 
     **Returns:** a [`delucax.Environment`][].
 
@@ -161,13 +163,14 @@ def single_compartment(
 ) -> Environment:
     """Ventilate a lung of one compartment, so that the pressure tracks a waveform.
 
-    This is the task `lung/balloon_lung` with another lung.
+    This task is the same as `lung/balloon_lung`, but with another lung.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.SingleCompartment`][]; made from `options` by default.
+    - `system`: a [`delucax.lung.SingleCompartment`][]; by default one is made with the
+        arguments in `options`.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: those of `lung/balloon_lung`.
+    - `**options`: the same as for `lung/balloon_lung`.
 
     **Returns:** a [`delucax.Environment`][].
 
@@ -189,18 +192,20 @@ def single_compartment(
 def double_compartment(
     system: DoubleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Ventilate a lung with a fast and a slow part. Its sensor is late and noisy.
+    """Ventilate a lung with a fast and a slow part. The sensor is delayed and noisy.
 
-    This is the plant of the ventilator study: the task `lung/single_compartment` with
+    The ventilator study uses this task. It is the task `lung/single_compartment` with
     another lung and a realistic sensor.
 
     **Arguments:**
 
-    - `system`: a [`delucax.lung.DoubleCompartment`][]; made from `options` by default.
+    - `system`: a [`delucax.lung.DoubleCompartment`][]; by default one is made with the
+        arguments in `options`.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: those of `lung/balloon_lung`. By default `sensor_delay` is 2 steps
-        and `noise` is 0.2 cmH2O. `substeps` is 2, because the fast compartment of a
-        narrow lung empties in about 10 ms when the expiratory valve is open.
+    - `**options`: the same as for `lung/balloon_lung`. By default `sensor_delay` is 2
+        steps, `noise` is 0.2 cmH2O and `substeps` is 2. Two substeps are needed because
+        the fast compartment of a lung with a low resistance and a low compliance
+        empties in about 10 ms when the expiratory valve is open.
 
     **Returns:** a [`delucax.Environment`][].
 
@@ -228,22 +233,22 @@ def learned_lung(
 ) -> Environment:
     """Ventilate a lung that was learned from breaths, for example to train controllers.
 
-    The task is like `lung/balloon_lung`, but its time step is the time between samples
-    of the breaths. The lung exhales to the start pressure of the breaths, whatever the
-    PEEP of `waveform` is. The sensor of a [`delucax.lung.LungModel`][] has the delay of
-    the model.
+    The task is like `lung/balloon_lung`, but its control interval is the time between
+    two samples of the breaths. The lung exhales to the start pressure of the breaths,
+    and not to the PEEP of `waveform`. For a [`delucax.lung.LungModel`][], the delay of
+    the sensor is the `sensor_delay` of the model.
 
     **Arguments:**
 
     - `model`: a [`delucax.lung.LearnedLung`][], a [`delucax.lung.LungModel`][] or a
         [`delucax.lung.PublishedLung`][]. The default is the learned lung that comes
-        with the library. The default was fitted to breaths of the task
-        `lung/double_compartment`, whose sensor is two samples late, so the pressure of
-        this lung is late too. In the repository, `python -m benchmarks.learned_lung`
-        trains this default lung.
+        with the library. This default lung was fitted to breaths of the task
+        `lung/double_compartment`. The sensor of that task is two samples late, so the
+        pressure of the default lung is late too. In the repository,
+        `python -m benchmarks.learned_lung` trains this default lung.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: `waveform`, `noise`, `limit` and others of
-        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `**options`: further arguments of [`delucax.lung.ventilation`][], such as
+        `waveform`, `noise` and `limit`, and of [`delucax.Environment`][].
 
     **Returns:** a [`delucax.Environment`][].
 

@@ -67,36 +67,39 @@ def fit_lungs(
 ) -> Fitted:
     """Fit several lungs at once, each to its own breaths.
 
-    The training has two parts. The first part, only for a
-    [`delucax.lung.LearnedLung`][], fits the prediction of each pressure from the
-    recorded pressures before it, as in the paper. The second part fits the prediction
-    of the whole breath from its controls only, so that the noise of the sensor does not
-    bias the model. The loss is the mean absolute error, relative to the standard
-    deviation of the pressures. The optimiser is Adam with a learning rate that falls to
-    0 along a cosine.
+    The training has two parts. The first part trains the model to predict each pressure
+    from the recorded pressures before it, as in the paper. The first part is done only
+    for a [`delucax.lung.LearnedLung`][]. The second part trains the model to predict
+    all pressures of a breath from its controls only, so that the noise of the sensor
+    does not bias the model. The loss is the mean absolute error of the pressure,
+    divided by the standard deviation of the pressures. The optimiser is Adam with a
+    learning rate that falls to 0 along a cosine.
 
     **Arguments:**
 
     - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
-        several stacked in one module, as `equinox.filter_vmap` returns models: each
-        array has a leading axis over the models.
+        several models stacked in one module, as `equinox.filter_vmap` returns them. In
+        a stacked module each array has a leading axis over the models.
     - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`, or of shape
         `(models, B, T)` for several models.
-    - `key`: a random key, for the batches.
+    - `key`: a random key, to draw the batches.
     - `teacher_steps`: the number of steps of the first part, 1000 by default.
     - `steps`: the number of steps of the second part, 800 by default.
-    - `learning_rate`: 5e-3 by default. The first part uses twice this learning rate.
+    - `learning_rate`: 5e-3 by default. The first part of the training uses twice this
+        learning rate.
     - `optimiser`: an Optax optimiser for both parts in place of Adam, with its own
         learning rate; none by default.
-    - `batch_size`: the number of breaths of each lung in a step, 64 by default; `None`
-        for all.
+    - `batch_size`: the number of breaths of each lung in a training step, 64 by
+        default; `None` for all breaths.
     - `trainable`: what to train, as in [`delucax.training.fit`][]; the weights by
         default.
     - `progress`: whether to show a progress bar, `False` by default.
     - `checkpoint`: the path of a file from which an interrupted run continues. The
-        first part uses the same path with `.first` added. None by default.
+        first part of the training uses the same path with `.first` added. None by
+        default.
 
-    **Returns:** a [`delucax.training.Fitted`][] of the last part.
+    **Returns:** a [`delucax.training.Fitted`][], the result of the last part of the
+    training.
 
     **Raises:** `ValueError` if the arguments are invalid, `RuntimeError` if the loss
     diverges.
@@ -171,11 +174,13 @@ def breath_error(
     pips: Any = PIPS,
     horizon: int = LENGTH,
 ) -> Array:
-    """The mean absolute error of the pressure under a controller, weighed by the task.
+    """The mean absolute error of the pressure under a controller, with the weights of
+    the task.
 
-    Each step counts by the cost of the task, a [`delucax.lung.BreathCost`][]. So a
-    step of the expiratory phase counts with `expiration_weight`, 0 by default. With
-    a `limit`, a pressure above it counts more.
+    The error of a step is the stage cost of the task, a [`delucax.lung.BreathCost`][].
+    So the errors in the expiratory phase are weighted with the `expiration_weight` of
+    the task, 0 by default. If the task has a `limit`, a pressure above the limit costs
+    more.
 
     **Arguments:**
 
@@ -183,14 +188,15 @@ def breath_error(
     - `controller`: a controller of both valves ([`delucax.lung.Breathing`][]), or of
         the inspiratory valve only.
     - `key`: a random key, for the noise of the sensor.
-    - `pips`: the peak pressures to follow, each in its own episode; 10, 15, ..., 35
+    - `pips`: the peak pressures of the target, one for each episode; 10, 15, ..., 35
         cmH2O by default.
-    - `horizon`: the number of steps per episode, 29 by default, which is 0.87 s of an
-        inspiration.
+    - `horizon`: the number of steps per episode, 29 by default, which are the first
+        0.87 s of an inspiration.
 
     **Returns:** the mean cost of the steps of each episode [cmH2O], shape `(pips,)`.
-        For the default `horizon` and a task without `limit` it is the mean of
-        $|p - r|$. The error is NaN if a simulation failed.
+        For the default `horizon` and a task without `limit`, this cost is the mean of
+        $|p - r|$, the distance of the pressure from the target. The error is NaN if a
+        simulation failed.
 
     **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
     below PEEP).
@@ -298,38 +304,40 @@ def train_controllers(
     checkpoint: Any = None,
     throw: bool = True,
 ) -> Fitted:
-    """Train controllers in lungs, with the gradient of their error.
+    """Train controllers on simulated lungs, by gradient descent on their error.
 
-    The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
-    noise in each step. The optimiser is Adam with a learning rate that falls to 0 along
-    a cosine. Adam scales each weight separately, so the gradients of one controller do
-    not affect the others.
+    The loss is the mean of [`delucax.lung.breath_error`][] over all peak pressures,
+    lungs and seeds. The noise of the sensor is drawn again in each training step. The
+    optimiser is Adam with a learning rate that falls to 0 along a cosine. Adam scales
+    each weight separately, so the gradients of one controller do not affect the others.
 
     **Arguments:**
 
-    - `envs`: tasks of lungs, stacked in one module: each array has a leading axis over
-        the tasks. `equinox.filter_vmap(learned_lung)(models)` makes them from stacked
-        models. See the example for tasks with several resistances.
-    - `controllers`: controllers of the inspiratory valve, stacked over seeds and then
-        over lungs: leaves have the shape `(seeds, lungs, ...)`. With `shared` the
-        leaves have the shape `(seeds, ...)`.
-    - `key`: a random key, for the noise.
+    - `envs`: tasks of lungs, stacked in one module, in which each array has a leading
+        axis over the tasks. `equinox.filter_vmap(learned_lung)(models)` makes them from
+        stacked models. The example below stacks tasks with several resistances.
+    - `controllers`: controllers of the inspiratory valve, stacked in one module. Each
+        array has the shape `(seeds, lungs, ...)`, with one controller for each seed and
+        lung. If `shared` is true, each array has the shape `(seeds, ...)`.
+    - `key`: a random key, for the noise of the sensor.
     - `shared`: whether all lungs share one controller; `False` by default.
-    - `steps`: the number of steps, 400 by default.
+    - `steps`: the number of training steps, 400 by default.
     - `learning_rate`: 1e-2 by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
     - `horizon`: the number of steps per episode, 29 by default.
-    - `trainable`, `progress`, `checkpoint`: as in [`delucax.training.fit`][]; the
-        weights, no bar and no file by default.
+    - `trainable`, `progress`, `checkpoint`: as in [`delucax.training.fit`][]. By
+        default the weights are trained, without a progress bar and without a checkpoint
+        file.
     - `throw`: whether to raise an error if a loss or its gradient is not finite; `True`
         by default. If `throw` is `False`, a gradient that is not finite is replaced by
-        0, the other controllers are unaffected, and `history["diverged"]` counts the
-        controllers with such a gradient at each step.
+        0, so it does not affect the other controllers, and `history["diverged"]` counts
+        the controllers with such a gradient at each step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 
     **Raises:** `ValueError` if the arguments are invalid (for example, a peak pressure
-    below PEEP), `RuntimeError` if `throw` and a loss or its gradient is not finite.
+    below PEEP), `RuntimeError` if `throw` is true and a loss or its gradient is not
+    finite.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -403,17 +411,17 @@ def pid_grid(
     kd: Any = (0.0,),
     pips: Any = PIPS,
 ) -> tuple[Float[Array, "grid 3"], Float[Array, "lungs grid"]]:
-    """The error of every PID of a grid in every lung, computed at once.
+    """Compute the error of every PID of a grid of gains in every lung, all at once.
 
     **Arguments:**
 
-    - `envs`: a task of a lung, or several stacked in one module: each array has a
-        leading axis over the tasks.
+    - `envs`: a task of a lung, or several tasks stacked in one module, in which each
+        array has a leading axis over the tasks.
     - `key`: a random key, for the noise of the sensor, which is the same for all PIDs.
     - `kind`: `"leaky"` (default) for [`delucax.controllers.LeakyPID`][], as in the
-        original; `"true"` for [`delucax.controllers.PID`][].
-    - `kp`, `ki`, `kd`: the gains. All combinations are tried. The defaults are 0, 0.1,
-        ..., 0.9, 1, 2, ..., 10 for `kp` and `ki`, and 0 for `kd`.
+        original Deluca; `"true"` for [`delucax.controllers.PID`][].
+    - `kp`, `ki`, `kd`: the gains. All combinations are tried. By default `kp` and `ki`
+        each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10, and `kd` is 0.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
 
     **Returns:** the gains (kp, ki, kd) of each PID, shape `(grid, 3)`, and the mean

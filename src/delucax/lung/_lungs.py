@@ -144,14 +144,15 @@ class SingleCompartment(_AbstractCompartment):
 
     $$\dot V = \frac{p - V / C}{R}$$
 
-    The pressure $p$ of the airway balances the flows of the valves; see
-    [`delucax.lung.Valves.airway_pressure`][]. The state is (inflow [L/s], opening,
-    volume $V$ [L]). The vector field is not smooth at an opening of 0.
+    The pressure $p$ of the airway follows from the balance of the flows through the
+    valves and into the lung; see [`delucax.lung.Valves.airway_pressure`][]. The state
+    is (inflow [L/s], opening, volume $V$ [L]). The vector field is not smooth at an
+    opening of 0.
 
-    If the opening of the inspiratory valve is held, the pressure settles. With the
-    expiratory valve closed and a leak $G$, the pressure settles at
-    $q(u_\mathrm{in}) / G$, where $q$ is the flow of the valve. With the expiratory
-    valve open and no leak, the pressure settles at
+    For constant controls, the steady pressure depends on the expiratory valve. If the
+    expiratory valve is closed and there is a leak $G$, the pressure settles at
+    $q(u_\mathrm{in}) / G$, where $q$ is the flow of the inspiratory valve. If the
+    expiratory valve is open and there is no leak, the pressure settles at
     `peep + flow(u_in) * expiratory_resistance`.
 
     **Arguments:**
@@ -198,22 +199,25 @@ class DoubleCompartment(_AbstractRigidPipe):
     $$\dot V_i = \frac{p_c - V_i / C_i}{R_i}, \qquad
     p_c = p - R_0 (\dot V_1 + \dot V_2)$$
 
-    The resistance $R$ has a central part $R_0 = c R$, with $c$ = `central`. The rest of
-    the resistance consists of the two branches in parallel,
-    $1 / (1 / R_1 + 1 / R_2) = (1 - c) R$, with $R_2 / R_1$ = `imbalance`. The
-    compliance is divided into $C_1 = s C$ and $C_2 = (1 - s) C$, with $s$ = `share`. So
-    $R$ is the resistance at high frequencies, and $C$ is the static compliance. The
-    state is (inflow [L/s], opening, fast volume $V_1$ [L], slow volume $V_2$ [L]). The
-    vector field is not smooth at an opening of 0.
+    The central airway has the resistance $R_0 = c R$, where $c$ is the argument
+    `central`. The two branches in parallel have the rest of the resistance $R$, so
+    $1 / (1 / R_1 + 1 / R_2) = (1 - c) R$, and the ratio $R_2 / R_1$ is the argument
+    `imbalance`. The compliances of the compartments are $C_1 = s C$ and
+    $C_2 = (1 - s) C$, where $s$ is the argument `share`. So $R$ is the resistance at
+    high frequencies, and $C$ is the static compliance. The state is (inflow [L/s],
+    opening, fast volume $V_1$ [L], slow volume $V_2$ [L]). The vector field is not
+    smooth at an opening of 0.
 
     **Arguments:**
 
     - `resistance`: $R$, the resistance of the whole lung at high frequencies
         [cmH2O s/L], 20 by default.
     - `compliance`: $C$, the compliance of the whole lung [mL/cmH2O], 20 by default.
-    - `central`: the share of $R$ that is common to both compartments, 0.3 by default.
+    - `central`: the share of the resistance $R$ that lies in the airway common to both
+        compartments, 0.3 by default.
     - `share`: the share of $C$ in the fast compartment, 0.1 by default.
-    - `imbalance`: $R_2 / R_1$, 10 by default.
+    - `imbalance`: $R_2 / R_1$, the ratio of the resistances of the slow and the fast
+        branch, 10 by default.
     - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
     **Raises:** `ValueError` if a number is not positive, or a share is not between 0
@@ -288,23 +292,23 @@ def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
 
 
 class BalloonLung(_AbstractCompartment):
-    r"""A lung that behaves like a balloon, behind a flow resistance.
+    r"""A lung that behaves like a balloon, filled through a flow resistance.
 
     $$\dot V = \frac{p - P(V)}{R}, \qquad
     P(V) = \frac{k}{r_0^2 r} \left(1 - \left(\frac{r_0}{r}\right)^6\right)$$
 
-    Here $r$ and $r_0$ are the radii of spheres of the volumes $V$ and $V_0$. As the
-    balloon fills, the pressure rises, is greatest at $V = 2.65 \, V_0$, and then falls.
-    Below $V_0 / 10$ the pressure is constant. The state is (inflow [L/s], opening,
-    volume $V$ [L]). The vector field is not smooth at an opening of 0 and at
-    $V = V_0 / 10$.
+    Here $r$ is the radius of a sphere of volume $V$, and $r_0$ is the radius of a
+    sphere of volume $V_0$. As the balloon fills, the pressure rises, is greatest at
+    $V = 2.65 \, V_0$, and then falls. Below $V_0 / 10$ the pressure is constant. The
+    state is (inflow [L/s], opening, volume $V$ [L]). The vector field is not smooth at
+    an opening of 0 and at $V = V_0 / 10$.
 
     **Arguments:**
 
     - `resistance`: $R$ [cmH2O s/L], 20 by default.
-    - `stiffness`: $k$ [cmH2O L], 40 by default. With the default `rest`, the pressure
-        is at most 69 cmH2O.
-    - `rest`: $V_0$, the volume at which the balloon has no pressure [L], 1.5 by
+    - `stiffness`: $k$ [cmH2O L], 40 by default. With the default values of `stiffness`
+        and `rest`, the pressure of the balloon is at most 69 cmH2O.
+    - `rest`: $V_0$, the volume at which the pressure of the balloon is zero [L], 1.5 by
         default.
     - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 
@@ -349,16 +353,17 @@ class DelayLung(AbstractLung):
     \dot V = \frac{p - P(V)}{R}$$
 
     The elastic pressure $P(V)$ is the same as in [`delucax.lung.BalloonLung`][]. The
-    pipe stores air, so the pressure $p$ in the pipe, which the sensor reads, is a
-    state. The state is (inflow $q_\mathrm{in}$ [L/s], opening, pipe pressure $p$
-    [cmH2O], volume $V$ [L]). The task `lung/delay_lung` adds the transport delay, with
-    [`delucax.dynamics.Delayed`][].
+    pipe stores air, so the pressure $p$ in the pipe is one of the states. The sensor
+    reads this pressure. The state is (inflow $q_\mathrm{in}$ [L/s], opening, pipe
+    pressure $p$ [cmH2O], volume $V$ [L]). This system has no transport delay. The task
+    `lung/delay_lung` adds the delay with [`delucax.dynamics.Delayed`][].
 
     **Arguments:**
 
     - `resistance`: $R$ [cmH2O s/L], 20 by default.
     - `stiffness`: the stiffness of the balloon [cmH2O L], 40 by default.
-    - `rest`: the volume at which the balloon has no pressure [L], 1.5 by default.
+    - `rest`: the volume at which the pressure of the balloon is zero [L], 1.5 by
+        default.
     - `pipe`: $C_p$, the compliance of the pipe [mL/cmH2O], 5 by default.
     - `valves`: a [`delucax.lung.Valves`][]; `Valves()` by default.
 

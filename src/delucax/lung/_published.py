@@ -51,25 +51,27 @@ class PublishedLung(AbstractDynamics):
     z &= (u_k, \dots, u_{k - 4}, p_k, p_{k - 1}, p_{k - 2})
     \end{aligned}$$
 
-    Here $u$ are the scaled controls. The published network has three layers of SELUs
-    without biases. Before an inspiration the history is zero, except for the start
-    pressure. While `u_out` is above 1/2, the state is reset to the state before an
-    inspiration. The task `lung/learned_lung` clips the controls; the model does not.
+    Here $u$ are the scaled controls. The published network has three layers with the
+    SELU activation and without biases. At the start of an inspiration, all past
+    controls and pressures are set to zero, except for the start pressure. While `u_out`
+    is above 1/2, the state is reset to the state before an inspiration. This model does
+    not clip the controls, but the task `lung/learned_lung` does.
 
-    The model is rebuilt from the published weights, without the program of the authors.
-    Under the conditions of the authors' notebook, the model has the same errors as in
-    the notebook; see [the comparison](../../ventilator.md#the-published-simulator).
+    The model uses the published weights, but not the program of the authors. Under the
+    conditions of the authors' notebook, the model has the same errors as in the
+    notebook; see [the comparison](../../ventilator.md#the-published-simulator).
 
-    The state is the last controls and the last pressures, both scaled and with the
-    newest first, and the number of steps. The observation is the pressure [cmH2O].
+    The state holds the last controls and the last pressures, both scaled and with the
+    newest first, and the number of steps since the start of the inspiration. The
+    observation is the pressure [cmH2O].
 
     **Arguments:**
 
-    - `hidden`, `output`, `bias`: $H$, $o$ and $b$ of the first steps, of shapes
-        `(5, width, 10)`, `(5, width)` and `(5,)`.
+    - `hidden`, `output`, `bias`: $H$, $o$ and $b$, the weights for the first five
+        steps, of shapes `(5, width, 10)`, `(5, width)` and `(5,)`.
     - `network`: a module that maps the 8 numbers of $z$ to a number.
-    - `u_mean`, `u_std`, `p_mean`, `p_std`: the scales of the controls [%] and of the
-        pressures [cmH2O].
+    - `u_mean`, `u_std`, `p_mean`, `p_std`: the means and standard deviations that scale
+        the controls [%] and the pressures [cmH2O].
     - `start`: the pressure before an inspiration [cmH2O].
     - `dt`: the control interval [s], 0.03 by default.
 
@@ -160,21 +162,23 @@ class PublishedController(AbstractController):
 
     $$u = \mathrm{clip}(o^\top \mathrm{relu}(W F e + c) + b, 0, \mathrm{high})$$
 
-    Here $e$ are the last ten errors [cmH2O], newest first, which are zero before the
-    breath. The published featurizer $F$ takes the means of the last 10, 9, ..., 1
-    errors. The published convolution has width 5 over a single position, so only its
-    middle row has an effect.
+    Here $e$ is the vector of the last ten errors [cmH2O], newest first. Errors from
+    before the breath are set to zero. With the published $F$, the entries of $F e$ are
+    the means of the last 10 errors, of the last 9 errors, and so on, down to the last
+    error alone. The published convolution has a kernel of 5 rows but an input with a
+    single position, so only the middle row of the kernel has an effect.
 
-    The controller is rebuilt from the published weights, like
-    [`delucax.lung.PublishedLung`][]. Unlike the original controller, this one is reset
-    before each breath by [`delucax.lung.Breathing`][]. The gradient of the control is
-    zero where the control is clipped.
+    The controller uses the published weights, but not the program of the authors, like
+    [`delucax.lung.PublishedLung`][]. [`delucax.lung.Breathing`][] resets this
+    controller before each breath, unlike the original controller, which was not reset.
+    The gradient of the control is zero where the control is clipped.
 
     **Arguments:**
 
     - `featurizer`: $F$, shape `(10, 10)`.
-    - `convolution`, `biases`: $W$ and $c$, shapes `(width, 10)` and `(width,)`.
-    - `output`, `bias`: $o$, shape `(width,)`, and $b$, a number.
+    - `convolution`, `biases`: the weights $W$ and $c$, of shapes `(width, 10)` and
+        `(width,)`.
+    - `output`, `bias`: the weights $o$, of shape `(width,)`, and $b$, a number.
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `high`: the largest control [%], 40 by default, as published.
 
@@ -255,12 +259,13 @@ def read_published(
 ) -> Published:
     """Read the learned lung and the deep controller from a file of published weights.
 
-    The file is a NumPy `.npz` with the arrays of the two pickles of deluca-lung. The
-    names and shapes of these arrays are
+    The file is a NumPy `.npz` file with the arrays of the two pickle files in the
+    repository deluca-lung. The names and shapes of these arrays are
 
     - `sim/params/0/shallow_fc1_model1/kernel` (10, 100), and `kernel` (100, 1) and
-        `bias` (1,) of `shallow_fc2_model1`. Each of the first five steps has such
-        arrays, up to `sim/params/4/shallow_fc1_model5/kernel`.
+        `bias` (1,) of `shallow_fc2_model1`, for the first step. The next four steps
+        have arrays with the same shapes, up to
+        `sim/params/4/shallow_fc1_model5/kernel`.
     - `sim/params/5/SNN_fc0/kernel` (10, 100), `SNN_fc1` and `SNN_fc2` (100, 100), and
         `kernel` (100, 1) and `bias` (1,) of `SNN_fc3`. The first two inputs of
         `SNN_fc0` are always zero.
@@ -269,8 +274,9 @@ def read_published(
         `deep_controller/params/deep_conv`, and (100, 1) and (1,) of `deep_fc`.
 
     In these arrays the newest control, pressure and error come last. The pressure
-    before an inspiration is not in the file. This pressure is 1.51449 standard
-    deviations below the mean, which is 6.094 cmH2O with the scales of the authors.
+    before an inspiration is not in the file. `read_published` sets this pressure to
+    1.51449 standard deviations below the mean, which is 6.094 cmH2O for the mean and
+    standard deviation of the authors.
 
     **Arguments:**
 

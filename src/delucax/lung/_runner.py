@@ -29,10 +29,10 @@ _applied = eqx.filter_jit(
 
 @runtime_checkable
 class Runner(Protocol):
-    """The interface of a ventilator for [`delucax.lung.run_breaths`][].
+    """The interface between a ventilator and [`delucax.lung.run_breaths`][].
 
-    Write a class with these methods for your machine. The methods need no JAX, and may
-    block or raise an error.
+    To use your machine, write a class with these methods. The methods do not have to
+    use JAX. They may wait, and they may raise an error.
 
     **Attributes:** `dt`, the length of a step [s].
 
@@ -84,13 +84,15 @@ class Runner(Protocol):
 
 
 class SimulatedRunner:
-    """A [`delucax.lung.Runner`][] that simulates a task in place of a ventilator.
+    """A [`delucax.lung.Runner`][] that simulates a task of a lung in place of a real
+    ventilator.
 
     **Arguments:**
 
     - `environment`: a task of a lung.
     - `key`: a random key, for the noise of the sensor.
-    - `abort`: the pressure above which the run is aborted [cmH2O], 60 by default.
+    - `abort`: the pressure above which `should_abort` is true and the run stops
+        [cmH2O], 60 by default.
     - `real_time`: whether `wait` waits for the duration of a step, as on a real
         machine; `False` by default.
 
@@ -203,7 +205,8 @@ class Recording(NamedTuple):
 
     - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry for each step.
     - `aborted`: whether the run was aborted. After an abort, the last entry is the
-        reading that was too high, with the controls of the clean-up.
+        reading that was too high, with the inspiratory valve closed and the expiratory
+        valve open.
     """
 
     times: np.ndarray
@@ -223,8 +226,9 @@ def run_breaths(
     """Run a controller at a ventilator.
 
     Each step reads the pressure, stops if `runner.should_abort` is true, calls the
-    controller, sets the valves, and waits. At the end `runner.cleanup()` is called. The
-    clean-up also happens after an error or an interruption, which is then raised again.
+    controller, sets the valves, and waits. At the end `runner.cleanup()` is called.
+    `cleanup` is also called after an error or an interruption, and the error is then
+    raised again.
 
     **Arguments:**
 
@@ -233,10 +237,10 @@ def run_breaths(
     - `steps`: the number of steps, 100 by default.
     - `key`: a random key for the controller; none by default.
 
-    **Returns:** a named tuple of NumPy arrays with an entry for each step, `times` [s],
-        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`, whether the run was
-        aborted. After an abort, the last entry is the reading that was too high, with
-        the controls of the clean-up.
+    **Returns:** a named tuple. `times` [s], `pressure` [cmH2O], `u_in` [%] and `u_out`
+        are NumPy arrays with an entry for each step. `aborted` tells whether the run
+        was aborted. After an abort, the last entry is the reading that was too high,
+        with the inspiratory valve closed and the expiratory valve open.
 
     **Raises:** `ValueError` if `runner` is not a runner, `controller` is not a
         controller of both valves, or a control is not finite.

@@ -22,22 +22,22 @@ from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 class ShootingMPC(AbstractController):
     r"""Model predictive control with a learned lung, by gradient descent.
 
-    The controller simulates the learned lung in parallel to the true lung, with the
-    same controls. A fixed gain corrects the pressure of the learned lung towards the
-    measured pressure. At each step, some iterations of Adam improve the plan so that
-    the predicted pressure follows the target, and the first control of the plan is
-    applied. The controls of the plan are $u = 100 \, \sigma(z)$, where the variables
-    $z$ are free, so the controls keep the bounds of the valve.
+    While the true lung is ventilated, the controller simulates the learned lung with
+    the same controls. A fixed gain corrects the pressure of the learned lung towards
+    the measured pressure. At each step, some iterations of Adam improve a plan of the
+    next controls, so that the predicted pressure follows the target. Then the first
+    control of the plan is applied. The controls of the plan are $u = 100 \, \sigma(z)$,
+    and Adam varies $z$, so the controls always stay between 0 and 100 %.
 
     **Arguments:**
 
     - `model`: a [`delucax.lung.LearnedLung`][].
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `horizon`: the number of steps of a plan, 10 by default.
-    - `iterations`: the iterations of Adam per step, 30 by default.
+    - `iterations`: the number of iterations of Adam in each step, 30 by default.
     - `learning_rate`: the learning rate of Adam, 0.1 by default.
-    - `memory`: the weight of the predicted pressure when a measured pressure corrects
-        it, from 0 to 1; 0.7 by default.
+    - `memory`: the weight of the predicted pressure, from 0 to 1, when the mean of the
+        predicted and the measured pressure is taken; 0.7 by default.
 
     **Raises:** `ValueError` if `model` is not a `LearnedLung`, `waveform` is not a
     `BreathWaveform`, or a count is below 1.
@@ -106,16 +106,17 @@ class ShootingMPC(AbstractController):
 def least_error(
     env: Environment, *, pips: Any = PIPS, steps: int = 600, horizon: int = LENGTH
 ) -> Array:
-    """Estimate the least error that any control of the inspiratory valve can reach.
+    """Estimate the smallest error that any control of the inspiratory valve can reach.
 
-    The controls of each breath are found by gradient descent through the true lung,
-    without noise. No controller can do better, up to the accuracy of the descent.
+    The controls of each breath are optimised by gradient descent on a simulation of the
+    true lung, without noise of the sensor. If the descent has converged to the optimum,
+    no controller can have a smaller error.
 
     **Arguments:**
 
     - `env`: a task of a lung.
-    - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `steps`: the number of steps of the descent, 600 by default.
+    - `pips`: the peak pressures of the target, 10, 15, ..., 35 cmH2O by default.
+    - `steps`: the number of steps of the gradient descent, 600 by default.
     - `horizon`: the number of steps per episode, 29 by default.
 
     **Returns:** the mean error at each peak pressure [cmH2O], shape `(pips,)`.

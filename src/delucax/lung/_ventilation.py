@@ -19,7 +19,8 @@ from ._waveform import BreathWaveform, check_waveform
 
 
 class Valves(eqx.Module):
-    r"""A proportional valve that lets air in, and a valve that lets air out to PEEP.
+    r"""The two valves of a ventilator: a proportional valve that lets air in, and a
+    valve that lets air out, with PEEP behind it.
 
     The steady flow of the inspiratory valve is a smooth S-curve of its opening
     $u_\mathrm{in}$ [%]:
@@ -34,9 +35,10 @@ class Valves(eqx.Module):
     $$T_\mathrm{in} \dot q_\mathrm{in} = q(u_\mathrm{in}) - q_\mathrm{in}, \qquad
     T_\mathrm{out} \dot o = u_\mathrm{out} - o$$
 
-    The flow out is $\max(o, 0) (p - \mathrm{peep}) / R_\mathrm{out}$ through the
-    expiratory valve, and $G p$ through a leak. The flow out is not smooth at an opening
-    $o$ of 0; the lagged opening approaches 0 but does not cross it.
+    The flow out of the airway is $\max(o, 0) (p - \mathrm{peep}) / R_\mathrm{out}$
+    through the expiratory valve, and $G p$ through a leak. The flow through the
+    expiratory valve is not smooth at an opening $o$ of 0. Because of the lag, the
+    opening approaches 0 but does not cross it.
 
     **Arguments:**
 
@@ -154,10 +156,10 @@ class Valves(eqx.Module):
 
 
 class PressureSensor(AbstractWrapper):
-    """Adds the observation of the dynamics, a pressure, to the end of the state.
+    """A wrapper of dynamics that appends their observation, a pressure, to the state.
 
-    A cost can then read the pressure without knowing the lung. For a sensor delay, wrap
-    the `PressureSensor` in [`delucax.dynamics.Delayed`][].
+    A cost can then read the pressure from the state, for any kind of lung. For a sensor
+    delay, wrap the `PressureSensor` in [`delucax.dynamics.Delayed`][].
 
     **Arguments:** `dynamics`: the dynamics of a lung, whose observation is one number.
 
@@ -237,9 +239,9 @@ class BreathCost(AbstractCost):
     r"""The weighted absolute error of the pressure, $w \, |p - r(t)|$.
 
     The weight $w$ is 1 in the inspiratory phase and `expiration_weight` in the
-    expiratory phase. With a `limit`, each cmH2O above the limit costs 10 more, because
-    a pressure that is too high is worse than an error. The cost is not smooth at the
-    target and at the limit.
+    expiratory phase. If a `limit` is given, each cmH2O above the limit adds 10 to the
+    cost, because a pressure that is too high is worse than an error. The cost is not
+    smooth at the target and at the limit.
 
     **Arguments:**
 
@@ -302,7 +304,7 @@ def ventilation(
     """The task to ventilate a lung, so that the pressure tracks a waveform.
 
     The controls are (u_in [%], u_out). The observation is the pressure of the airway
-    [cmH2O]. The state holds the pressure of the airway too; see
+    [cmH2O]. The state contains the pressure of the airway too; see
     [`delucax.lung.PressureSensor`][]. The cost of a step is the absolute error of the
     pressure in the inspiratory phase; see [`delucax.lung.BreathCost`][]. The task never
     terminates.
@@ -312,14 +314,16 @@ def ventilation(
     - `dynamics`: the dynamics of the lung, whose observation is the pressure of the
         airway and whose controls are (u_in, u_out).
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]. The default waveform
-        rises to 35 cmH2O, 20 times a minute.
-    - `resting_state`: the first state of the dynamics; zero by default.
+        has 20 breaths per minute with a peak pressure of 35 cmH2O.
+    - `resting_state`: the state of the dynamics at the start of an episode; zero by
+        default.
     - `sensor_delay`: the number of steps until a pressure is observed, 0 by default.
     - `noise`: the standard deviation of the noise of the sensor [cmH2O], 0 by default.
-    - `expiration_weight`, `limit`: arguments of the cost; 0 and none by default.
+    - `expiration_weight`, `limit`: arguments of [`delucax.lung.BreathCost`][]; 0 and
+        none by default.
     - `horizon`: the number of steps per episode, 100 by default.
-    - `**options`: other arguments of [`delucax.Environment`][], which replace the
-        values that the task gives them.
+    - `**options`: other arguments of [`delucax.Environment`][], which are used in place
+        of those that the task sets.
 
     **Returns:** a [`delucax.Environment`][].
 

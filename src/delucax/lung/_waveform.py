@@ -41,30 +41,34 @@ class BreathWaveform(eqx.Module):
     \mathrm{interp}(s, \mathrm{keypoints}, \mathrm{levels}), \qquad
     s = \frac{t \bmod T}{T}, \quad T = \frac{60}{\mathrm{rate}}$$
 
-    Here $T$ is the period of a breath [s] and $s$ the elapsed share of the breath. The
-    inspiratory phase lasts while $s \le \mathrm{inspiration}$. The keypoints are shares
-    of the period, so they scale with the rate.
+    Here $T$ is the period of a breath [s], and $s$ is the fraction of the breath that
+    has passed. The inspiratory phase is the part of the breath with
+    $s \le \mathrm{inspiration}$. The keypoints are fractions of the period, so their
+    times change with the rate.
 
-    The waveform can be used like any other reference. The numbers of the waveform are
-    leaves.
+    The waveform can be used like any other reference. The numbers of the waveform, such
+    as `pip` and `rate`, are leaves of a pytree, so you can differentiate with respect
+    to them.
 
     **Arguments:**
 
     - `pip`: the peak inspiratory pressure [cmH2O], 35 by default.
     - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. This is only
-        the target. The lung exhales to the `peep` of its [`delucax.lung.Valves`][], so
-        change both together.
+        the target. The pressure to which the lung exhales is the `peep` of its
+        [`delucax.lung.Valves`][], so change both values together.
     - `rate`: breaths per minute, 20 by default.
-    - `keypoints`: increasing shares of a period, from 0 to 1; `(0, 1/3, 1/2, 1)` by
-        default. The pressure may jump from the end of a breath to the next breath.
+    - `keypoints`: the times of the keypoints as fractions of a period, increasing from
+        0 to 1; `(0, 1/3, 1/2, 1)` by default. The target may jump where one breath ends
+        and the next breath begins.
     - `levels`: the level of the target at each keypoint, from PEEP (0) to PIP (1);
-        `(1, 1, 0, 0)` by default. With the default keypoints and rate, the target is
-        then at PIP for 1 s, and falls to PEEP in 0.5 s.
-    - `inspiration`: the share of the inspiratory phase in a period, 1/3 by default.
+        `(1, 1, 0, 0)` by default. With the default levels, keypoints and rate, the
+        target stays at PIP for 1 s and then falls to PEEP within 0.5 s.
+    - `inspiration`: the fraction of a period that the inspiratory phase takes, 1/3 by
+        default.
 
     **Raises:** `ValueError` if a number is not finite, PIP is below PEEP, the rate is
-    not positive, keypoints do not increase from 0 to 1 or are not as many as the
-    levels, or `inspiration` is not between 0 and 1.
+    not positive, the keypoints do not increase from 0 to 1, the numbers of keypoints
+    and levels differ, or `inspiration` is not between 0 and 1.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).

@@ -33,8 +33,8 @@ def wrap(angle: ArrayLike) -> Array:
     $$\operatorname{wrap}(\alpha) = \alpha - 2 \pi
     \operatorname{round}\left(\frac{\alpha}{2 \pi}\right)$$
 
-    This is much faster than `%`. The gradient is 1 everywhere, also at the jumps at odd
-    multiples of pi.
+    This is much faster than `%`. The gradient of `wrap` is 1 everywhere, even at odd
+    multiples of pi, where the wrapped angle jumps.
 
     **Arguments:**
 
@@ -96,13 +96,13 @@ _cos32.defjvp(lambda p, t: (_cos32(*p), -_sin32(*p) * t[0]))
 def sin(x: ArrayLike) -> Array:
     """The sine, faster than `jnp.sin` on CPU in float32.
 
-    The function is differentiable to any order. In other precisions than float32, `sin`
-    calls `jnp.sin`.
+    The function is differentiable to any order. If `x` is not in float32, `sin` calls
+    `jnp.sin`.
 
     **Arguments:**
 
-    - `x`: angles [rad], any shape. In float32, the absolute error is at most 1.5e-7 for
-        `|x|` up to 1e4, and grows with `|x|` beyond.
+    - `x`: angles [rad], any shape. In float32, the absolute error of the sine is at
+        most 1.5e-7 for `|x|` up to 1e4. For larger `|x|`, the error grows with `|x|`.
 
     **Returns:** the sine, of the shape and dtype of `x`.
 
@@ -128,8 +128,8 @@ def sin(x: ArrayLike) -> Array:
 def cos(x: ArrayLike) -> Array:
     """The cosine, faster than `jnp.cos` on CPU in float32.
 
-    The function is differentiable to any order. In other precisions than float32, `cos`
-    calls `jnp.cos`.
+    The function is differentiable to any order. If `x` is not in float32, `cos` calls
+    `jnp.cos`.
 
     **Arguments:**
 

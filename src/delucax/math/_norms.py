@@ -19,8 +19,10 @@ def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Ar
     **Arguments:**
 
     - `x`: an array of any shape.
-    - `axis`: the axis to reduce, the last one by default; `None` for all axes.
-    - `keepdims`: keep the reduced axis with size 1; false by default.
+    - `axis`: the axis along which the norm is computed, the last axis by default;
+        `None` for the norm over all axes.
+    - `keepdims`: whether to keep the axis of the norm in the result, with size 1; false
+        by default.
 
     **Returns:** the norm along `axis`.
 
@@ -58,17 +60,19 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
     """Clip `x` to the range from `low` to `high`, either of which may be infinite.
 
     On CPU, `clip` is faster than `jnp.clip` for a batch, because it uses comparisons.
-    `jnp.clip` must also propagate NaN limits, and in a step of the pendulum this takes
-    as long as everything else. Here NaN limits are ignored. A NaN in `x` stays NaN. The
-    gradient goes to `x` if `x` is within the limits or equal to one of them, and to the
-    limit otherwise.
+    `jnp.clip` must also propagate NaN limits. In a simulation step of the pendulum,
+    this takes as long as all other operations together. `clip` ignores NaN limits. A
+    NaN in `x` stays NaN. If `x` is within the limits or equal to one of them, the
+    gradient with respect to `x` is 1. Otherwise this gradient is 0, and the gradient
+    with respect to the limit that clips `x` is 1.
 
     **Arguments:**
 
     - `x`: an array of any shape.
     - `low`, `high`: the limits, numbers or arrays that broadcast against `x`.
 
-    **Returns:** the clipped array, of the dtype to which the three arguments promote.
+    **Returns:** the clipped array. Its dtype follows from the three arguments by the
+    type promotion of JAX.
 
     !!! example
 

@@ -38,7 +38,7 @@ def matvec(matrix: ArrayLike, vector: ArrayLike) -> Array:
 
     **Returns:** the product, shape `(m,)`.
 
-    **Raises:** `ValueError` if the shapes do not fit.
+    **Raises:** `ValueError` if the shapes of the matrix and the vector do not fit.
 
     !!! example
 
@@ -83,7 +83,7 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
 
     **Returns:** a scalar.
 
-    **Raises:** `ValueError` if the shapes do not fit.
+    **Raises:** `ValueError` if the shapes of the matrix and the vector do not fit.
 
     !!! example
 

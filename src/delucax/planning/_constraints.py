@@ -17,11 +17,12 @@ from ..qp import Soft
 class SoftConstraint(eqx.Module):
     r"""A constraint that may be violated, at a cost.
 
-    If a value of the constraint is violated by $v$, it adds
-    $\mathrm{linear}\; v + \tfrac12\, \mathrm{quadratic}\; v^2$ to the cost.
+    If a value of the function violates the constraint by $v$, the cost increases by
+    $\mathrm{linear}\; v + \tfrac12\, \mathrm{quadratic}\; v^2$.
 
-    If the linear weight is larger than the multiplier of the hard constraint, the
-    solution satisfies the constraint whenever that is possible (an exact penalty).
+    If the linear weight is larger than the multiplier that the constraint would have as
+    a hard constraint, the penalty is exact. Then the solution satisfies the constraint
+    if this is possible.
 
     **Arguments:**
 
@@ -99,8 +100,8 @@ class Constraints(eqx.Module):
     Each function returns a number or a vector. To give several functions, use a
     dictionary. The keys of the dictionary name the functions in messages and in
     [`delucax.planning.Multipliers`][]. The constraints also apply at the first step,
-    where the state is given. So the given first state must already satisfy a constraint
-    on the state alone.
+    where the state is given. So a constraint that depends only on the state must
+    already hold for the given first state.
 
     **Arguments:**
 
@@ -111,15 +112,17 @@ class Constraints(eqx.Module):
         functions `(t, x)`; none by default.
     - `final_equality`: a constraint or a dictionary, as for `inequality`, with
         functions `(t, x)`; none by default.
-    - `states`: bounds `(low, high)`, each a number or an array of shape `(n,)` or
-        `(T+1, n)`; or a [`delucax.qp.Soft`][] with such bounds. The first row of the
-        bounds is ignored, because the first state is given. None by default.
-    - `controls`: bounds like `states`, of shape `(m,)` or `(T, m)`. For bounds that do
-        not vary in time, use `bounds` of the planner, which is cheaper. If the planner
-        has `bounds` too, both apply. None by default.
+    - `states`: bounds `(low, high)` of the states, each a number or an array of shape
+        `(n,)` or `(T+1, n)`; or a [`delucax.qp.Soft`][] with such bounds. The first row
+        of the bounds is ignored, because the first state is given. None by default.
+    - `controls`: bounds of the controls, given like `states`, of shape `(m,)` or
+        `(T, m)`. If the bounds of the controls are constant in time, use the argument
+        `bounds` of the planner, because this is cheaper. If you also pass `bounds` to
+        the planner, the controls must satisfy the bounds in both arguments. None by
+        default.
 
-    Only [`delucax.planning.SQP`][] takes soft constraints and the bounds `states` and
-    `controls`.
+    Only the planner [`delucax.planning.SQP`][] accepts soft constraints and the
+    arguments `states` and `controls`.
 
     To differentiate with respect to a number in a constraint, write the constraint as a
     module with this number as a [`delucax.parameter`][].

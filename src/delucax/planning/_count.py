@@ -30,25 +30,27 @@ class Evaluations(NamedTuple):
 def count_evaluations(
     function: Callable[[AbstractDynamics], Any], dynamics: AbstractDynamics
 ) -> tuple[Any, Evaluations]:
-    """Run a function of dynamics, and count its evaluations of the dynamics.
+    """Run a function of the dynamics, and count how often it evaluates the dynamics.
 
-    The function gets dynamics that report each evaluation to the host at run time. The
-    count is therefore exact in compiled loops too. Under `jax.vmap` the evaluations of
-    all members of the batch are counted. Dead code, which XLA removes, is not counted.
+    The function gets a version of the dynamics that reports each evaluation to the host
+    at run time. The count is therefore exact in compiled loops too. Under `jax.vmap`
+    the evaluations of all members of the batch are counted. Evaluations that XLA
+    removes as dead code are not counted.
 
     Do not use `count_evaluations` to measure time: each report takes microseconds, and
     each call compiles again.
 
     **Arguments:**
 
-    - `function`: a function of the dynamics, such as a call of a planner.
+    - `function`: a function that takes the dynamics as its argument, for example to
+        call a planner.
     - `dynamics`: the dynamics, a [`delucax.AbstractDynamics`][].
 
     **Returns:** `(out, evaluations)`: `out` is what the function returns, and
     `evaluations` a named tuple of whole numbers:
 
-    - `primal`: calls of the dynamics. The primal pass of a derivative counts as one
-        call.
+    - `primal`: calls of the dynamics. The evaluation of the dynamics that a derivative
+        needs also counts as one call.
     - `tangent`: products of the Jacobian of the dynamics with a vector.
     - `cotangent`: products of the transposed Jacobian of the dynamics with a vector.
 

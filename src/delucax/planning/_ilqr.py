@@ -39,91 +39,97 @@ class ILQR(AbstractPlanner):
     \quad \text{subject to} \quad
     x_{k+1} = F(t_k, x_k, u_k, w_k), \quad \mathrm{low} \le u_k \le \mathrm{high}$$
 
-    where $c_T$ is the final cost, and feedback gains about this trajectory.
+    where $c_T$ is the final cost. ILQR also finds feedback gains about this trajectory.
 
     Each iteration linearises the dynamics about the current trajectory $\bar x$,
-    $\bar u$, expands the cost to second order, cross terms included, and solves this
-    linear-quadratic problem. The iteration then applies the control
-    $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ to the true dynamics, where
-    the change $-d_k$ and the gain $K_k$ come from the solution of the linear-quadratic
-    problem.
+    $\bar u$, and approximates the cost to second order, including the cross terms
+    between state and control. Then the iteration solves the resulting linear-quadratic
+    problem. The solution gives a change $-d_k$ of the control and a gain $K_k$. With
+    these, the iteration applies the control
+    $u_k = \bar u_k - \alpha\, d_k - K_k\, (x_k - \bar x_k)$ to the true dynamics.
 
     The line search tries the steps $\alpha = 1, 1/2, \dots, 1/2048$. The line search
-    accepts a step if the cost falls by at least 1e-4 of the predicted decrease, and
+    accepts a step if the cost falls by at least 1e-4 times the predicted decrease. It
     rejects a step if the trajectory diverges. The regularisation $\mu$ rises if no step
     is accepted or the control Hessian is not positive definite. The regularisation
     falls after each accepted step, by the schedule of Tassa, Erez and Todorov.
 
-    The iteration has converged if the projected gradient with respect to each control
-    is at most `tolerance` times one plus the size of the terms that cancel in this
-    gradient. The iteration has also converged if full steps no longer lower the
-    gradient, and the predicted decrease is below the rounding error of the cost.
+    The iteration has converged if the gradient of the cost with respect to each
+    control, projected to the bounds, is at most `tolerance * (1 + size)`. Here `size`
+    is the size of the terms whose sum is the gradient. The iteration has also converged
+    if full steps ($\alpha = 1$) no longer reduce the gradient, and the predicted
+    decrease of the cost is below the rounding error of the cost.
 
     Call the planner like every [`delucax.planning.AbstractPlanner`][]. ILQR handles
     hard constraints by the method of multipliers.
 
     You can differentiate the plan, in forward and reverse mode and to any order, with
     respect to every array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`. The
-    derivative comes from the implicit function theorem. Its computation solves one
-    linear-quadratic problem at the solution, with exact second derivatives even if the
-    iteration did not use second derivatives. Derivatives are NaN unless the plan
-    converged to a strict minimum. The derivatives with respect to `controls` and
-    `states`, where the iteration starts, are zero.
+    derivative comes from the implicit function theorem. To compute this derivative,
+    ILQR solves one linear-quadratic problem at the solution. This problem has exact
+    second derivatives, even if the iteration did not use second derivatives.
+    Derivatives are NaN unless the plan converged to a strict minimum. The derivatives
+    with respect to the initial guess (`controls` and `states`) are zero.
 
-    The minimum is local, so it depends on the start. On an unstable plant, controls
-    without feedback lead far away, and the iteration may end at a stationary point far
-    from the start. If `controls` is a number of steps, the iteration starts from
-    [`delucax.planning.Start.default`][], which also tries the trajectory of an LQR.
+    ILQR finds a local minimum, so the plan depends on the initial guess. If the plant
+    is unstable, controls without feedback drive the state far away. Then the iteration
+    may end at a stationary point that is far from the first state. If `controls` is a
+    number of steps, the iteration starts from [`delucax.planning.Start.default`][],
+    which also tries the trajectory of an LQR.
 
-    For a hybrid plant, the model about a trajectory is only valid as long as the number
-    of events in each step is the same. At a trajectory where this number changes, the
-    cost may have a kink or a jump. If the iteration ends at such a trajectory without
-    convergence, the result is `events_changed`, and the plan is the best so far. To get
-    a plan with certain events, start from a trajectory that has these events.
+    For a hybrid plant, the linear-quadratic model about a trajectory is valid only for
+    trajectories with the same number of events in each step. At a trajectory where the
+    number of events in a step changes, the cost may have a kink or a jump. If the
+    iteration ends at such a trajectory without convergence, the result is
+    `events_changed`, and the plan is the best trajectory found so far. To get a plan
+    with certain events, start from a trajectory that has these events.
 
-    Under `jax.vmap` on CPU, the plans of a batch are computed one after the other. This
-    is up to six times as fast as computing all plans together, because no plan waits
-    for the line searches of another plan. On accelerators the plans are computed
-    together.
+    Under `jax.vmap` on CPU, the plans of a batch are computed one after the other. On
+    CPU, planning one after the other is up to six times as fast as computing all plans
+    together, because no plan waits for the line searches of another plan. On
+    accelerators the plans are computed together.
 
     **Arguments:**
 
     - `max_iterations`: the largest number of iterations; 500 by default.
     - `tolerance`: the relative tolerance of the gradient. By default the tolerance is
-        the square root of the machine precision (1.5e-8 in float64), or the square of
-        `finite_difference` if that is larger. With a tolerance of 0, the planner takes
-        all iterations.
+        the square root of the machine precision (1.5e-8 in float64). With
+        `finite_difference`, the default is at least the square of this spacing. With a
+        tolerance of 0, the planner takes all `max_iterations` iterations.
     - `constraint_tolerance`: the largest allowed violation of a constraint. The default
         is the machine precision to the power 0.4 (5.5e-7 in float64).
     - `second_order`: whether to use the second derivatives of dynamics and constraints
         (differential dynamic programming). With second derivatives the planner takes
         fewer but more expensive iterations. An iteration leaves the second derivatives
-        out if they make the problem nonconvex. If false, no iteration uses second
-        derivatives (Gauss-Newton), which is slow if multipliers are large. The default
-        is true if there are constraints and no `finite_difference`.
+        out if they make the problem nonconvex. If `second_order` is false, no iteration
+        uses second derivatives (Gauss-Newton). Then the convergence is slow if the
+        multipliers of the constraints are large. By default `second_order` is true if
+        there are constraints and `finite_difference` is not given.
     - `regularise`: `"control"` (default) adds $\mu$ to the control Hessian; `"state"`
         adds $\mu$ to the Hessian of the cost-to-go.
     - `line_search`: `"backtracking"` (default) tries one step size after the other;
-        `"parallel"` tries all step sizes at once, for accelerators.
-    - `parallel`: if true, the linear-quadratic problems are solved in parallel over
-        time, for long horizons on accelerators; false by default.
-    - `finite_difference`: a spacing, such as 1e-2. With a spacing, the dynamics are
-        linearised by central differences, with two calls for each state and each
-        control. By default the dynamics are differentiated automatically. The
-        derivatives of the cost and of the plan are exact in both cases.
+        `"parallel"` tries all step sizes at once, and is meant for accelerators.
+    - `parallel`: whether to solve the linear-quadratic problems in parallel over the
+        time steps, false by default. True is meant for long horizons on accelerators.
+    - `finite_difference`: a spacing, such as 1e-2. If `finite_difference` is given, the
+        planner linearises the dynamics by central differences with this spacing. These
+        need two calls of the dynamics for each state and each control. By default the
+        dynamics are differentiated automatically. The derivatives of the cost and of
+        the plan are exact in both cases.
     - `states`: states to start from, shape `(T+1, n)` (multiple shooting). These states
-        need not follow from `controls`: the iteration closes the gaps. `controls` must
-        then be an array, or a number of steps, which means a start at the constant
-        control of the equilibrium. By default the states follow from `controls`.
+        need not satisfy the dynamics, because the iteration closes the gaps between the
+        steps. If you give `states`, `controls` must be an array or a number of steps.
+        For a number of steps, the iteration starts at the constant control of the
+        equilibrium. By default the states are the trajectory under `controls`.
     - `penalty`: the first weight $\rho$ of the penalty $\rho\, c^2 / 2$ of a violation
         $c$; 10 by default. The weight grows by a factor of 10 when the violation falls
         too slowly. Choose a larger penalty if the start is near the solution, or if the
         cost is much larger than the violations.
 
-    **Raises:** `ValueError` if an option is of the wrong kind or out of its range, or
-    if `parallel` is combined with `regularise="state"` or `finite_difference` with
-    `second_order`. A call raises a `ValueError` if `parallel` is combined with
-    `bounds`.
+    **Raises:** `ValueError` if an option is of the wrong kind or out of its range, if
+    `parallel` is combined with `regularise="state"`, or if `finite_difference` is
+    combined with `second_order`. A call of the planner raises a `ValueError` if
+    `parallel` is combined with `bounds`.
 
     Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
     Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
@@ -248,19 +254,19 @@ def ilqr(
 ) -> Plan:
     r"""Plan a trajectory by the iterative linear-quadratic regulator (iLQR).
 
-    The plan is a locally optimal trajectory with feedback gains. `ilqr` calls
-    [`delucax.planning.ILQR`][], which has more options and whose page describes the
-    method.
+    The plan is a locally optimal trajectory with feedback gains. `ilqr` calls the
+    planner [`delucax.planning.ILQR`][], which has more options. The page of that
+    planner describes the method.
 
     **Arguments:**
 
     - `dynamics`: the discrete-time dynamics.
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
-    - `controls`: where to start. Give controls, shape `(T, m)`; or the number of steps
-        `T`, which starts from [`delucax.planning.Start.default`][]; or a
-        [`delucax.planning.Start`][], which holds feedback or several starts; or an
-        earlier plan, which starts from its trajectory and gains.
+    - `controls`: where to start. Pass an array of controls, shape `(T, m)`; or the
+        number of steps `T`, to start from [`delucax.planning.Start.default`][]; or a
+        [`delucax.planning.Start`][], which can hold feedback gains or several starts;
+        or an earlier plan, to start from the trajectory and the gains of this plan.
     - `t0`: the time of the first state; 0 by default.
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
     - `bounds`: the bounds `(low, high)` of the controls, each a number or an array of
@@ -270,7 +276,7 @@ def ilqr(
     - `max_iterations`: the largest number of iterations; 500 by default.
     - `tolerance`: the relative tolerance of the gradient; the square root of the
         machine precision by default (1.5e-8 in float64). With a tolerance of 0, the
-        planner takes all iterations.
+        planner takes all `max_iterations` iterations.
     - `throw`: if true (default), raise an error if the plan did not converge. If false,
         check `plan.result` yourself.
 
@@ -279,13 +285,16 @@ def ilqr(
     - `successful`: the plan is stationary.
     - `not_converged`: `max_iterations` were not enough.
     - `no_descent`: no step lowered the cost.
-    - `events_changed`: the events of a hybrid plant changed between iterates.
-    - `no_feasible_point`: no penalty weight made the constraints hold.
+    - `events_changed`: the events of a hybrid plant changed from one iteration to the
+        next.
+    - `no_feasible_point`: the constraints were violated even with the largest penalty
+        weight.
     - `diverged`: every start diverges.
 
-    If the `result` is not `successful`, the plan is the best iterate. If the control
-    Hessian at the plan is not positive definite, `plan.regularisation` is the number
-    that was added to the Hessian, and the derivatives are NaN.
+    If the `result` is not `successful`, the plan is the best trajectory of all
+    iterations. If the control Hessian at the plan is not positive definite,
+    `plan.regularisation` is the number that was added to the Hessian, and the
+    derivatives are NaN.
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is not
     finite, the horizon is 0, or a lower bound is above an upper one; with `throw`, an

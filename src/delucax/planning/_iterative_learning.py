@@ -70,10 +70,10 @@ def ilc(
         linear-quadratic problem, for $\alpha = \alpha_\mathrm{last}\, 1.1^{1 - j^2}$
         with $j = 0, \dots, 9$, until a run costs at most as much as the last run.
 
-    If all of these runs cost more, learning stops early. The final plan is close to the
-    optimal plan of the plant. The distance between the two plans grows with the error
-    of the model's derivatives. If the problem is not convex, the control Hessian is
-    regularised until it is positive definite.
+    If all of these runs cost more than the last run, learning stops early. The final
+    plan is close to the optimal plan of the plant. The distance between the two plans
+    grows with the error of the model's derivatives. If the problem is not convex, the
+    control Hessian is regularised until it is positive definite.
 
     **Arguments:**
 
@@ -82,12 +82,12 @@ def ilc(
         controls as the plant.
     - `cost`: the stage and final cost.
     - `plan`: the [`delucax.planning.Plan`][] to start from, made with the model. Each
-        run has the first state, the time and the bounds of this plan. The first run
-        follows the feedback of this plan.
+        run uses the first state, the start time and the control bounds of this plan.
+        The first run follows this plan with the feedback gains of the plan.
     - `w`: disturbances of the plant, the same in each run and unknown to the model,
         shape `(T, k)`; zero by default.
     - `iterations`: the largest number of iterations; 40 by default.
-    - `step`: the first $\alpha$; 1 by default.
+    - `step`: the value of $\alpha_\mathrm{last}$ in the first iteration; 1 by default.
     - `throw`: if true (default), raise an error if the first run diverges. If false,
         check the `result` yourself.
 
@@ -147,7 +147,8 @@ def igpc(
     anneal: bool = True,
     throw: bool = True,
 ) -> Plan:
-    r"""Iterative gradient perturbation control: `ilc` that also learns within a run.
+    r"""Iterative gradient perturbation control: like `ilc`, but it also learns during a
+    run.
 
     The control law learns from the mismatch between plant and model. The control in a
     run is
@@ -158,11 +159,12 @@ def igpc(
     where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first three terms
     are the same as in [`delucax.planning.ilc`][]. The control is clipped to the bounds.
 
-    $E$ and $o$ start at zero in each run. At step $k$, both take a gradient step of
-    size `learning_rate` over $k$. The gradient belongs to a counterfactual cost: the
-    last stage cost of `horizon` steps of the model with these $E$ and $o$ and with the
-    observed mismatch. The next iteration linearises along this run, and therefore keeps
-    what was learned in the run.
+    The parameters $E$ and $o$ are zero at the start of each run. At step $k$, gradient
+    descent with the step size `learning_rate / k` updates both. The updates lower a
+    counterfactual cost. To compute it, `igpc` simulates the last `horizon` steps again
+    on the model, with the present $E$ and $o$ and with the observed mismatch. The
+    counterfactual cost is the last stage cost of this simulation. The next iteration
+    linearises the model along this run, and therefore keeps what the run has learned.
 
     **Arguments:**
 
@@ -172,16 +174,16 @@ def igpc(
     - `memory`: the number $M$ of past disturbances; 3 by default.
     - `horizon`: the number of steps of the counterfactual cost; 3 by default.
     - `indices`: `"aligned"` (default) uses each disturbance at the step at which it
-        acted; `"deluca"`, for comparison, uses it one step early, as the original
-        library does.
+        acted; `"deluca"` uses each disturbance one step too early, as the original
+        library does, and serves for comparison.
     - `anneal`: if true (default), a line search tries up to 6 step sizes until a run
-        has a lower cost. If no run has a lower cost, the learning rate is divided by
-        100. If false, a line search tries up to 10 step sizes until a run does not have
-            a higher cost. If every run has a higher cost, learning stops.
+        costs less than the last run. If no run costs less, the learning rate is divided
+        by 100. If false, a line search tries up to 10 step sizes until a run costs at
+        most as much as the last run. If all 10 runs cost more, learning stops.
 
-    **Returns:** a [`delucax.planning.Plan`][] with the fields of
-    [`delucax.planning.ilc`][]: the best run of the plant, with the applied controls,
-    and feedback gains about this run.
+    **Returns:** a [`delucax.planning.Plan`][]: the best run of the plant, with the
+    applied controls, and with feedback gains about this run. The fields have the same
+    meaning as for [`delucax.planning.ilc`][].
 
     **Raises:** `ValueError` if an argument has the wrong kind or shape or is out of its
     range; with `throw`, an error at run time if the first run diverges.

@@ -26,21 +26,22 @@ class Multipliers(eqx.Module):
 
     **Attributes:**
 
-    - `stage`: a dictionary with the multipliers of the constraints `inequality` and
-        `equality` by name. The shape is `(T, p)` for a constraint with `p` values.
-    - `final`: a dictionary with the multipliers of `final_inequality` and
-        `final_equality` by name, each of shape `(p,)`.
+    - `stage`: the multipliers of the constraints `inequality` and `equality`, in a
+        dictionary whose keys are the names of the constraints. If a constraint has `p`
+        values, its multipliers have the shape `(T, p)`.
+    - `final`: the multipliers of the constraints `final_inequality` and
+        `final_equality`, in a dictionary like `stage`, each of shape `(p,)`.
     - `states`: the multipliers of the bounds of states, a pair `(lower, upper)` of
         arrays of shape `(T+1, n)`; `None` without such bounds.
     - `controls`: the multipliers of the bounds of controls, a pair `(lower, upper)` of
-        arrays of shape `(T, m)`; `None` without bounds, and always for
-        [`delucax.planning.ILQR`][]. If the planner has hard bounds and soft limits of
-        controls, these are the multipliers of the hard bounds.
-    - `costates`: the multipliers of the dynamics, shape `(T+1, n)`. Row `k` is minus
-        the derivative of the cost from stage `k` on with respect to $x_k$, as in
-        [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`. If the plan has
-        [`delucax.planning.Unknowns`][], a column for each unknown follows, in scaled
-        units, here and in `states`.
+        arrays of shape `(T, m)`; `None` without bounds, and always `None` for
+        [`delucax.planning.ILQR`][]. If the controls have both hard bounds and soft
+        bounds, these are the multipliers of the hard bounds.
+    - `costates`: the multipliers of the dynamics, shape `(T+1, n)`. Row `k` is the
+        negative derivative with respect to $x_k$ of the cost from stage `k` to the end,
+        as in [`delucax.qp.StagedMultipliers`][]. `None` for `ILQR`. If the plan has
+        [`delucax.planning.Unknowns`][], `costates` and `states` have one more column
+        for each unknown, in scaled units.
     - `penalty`: the last penalty weight of `ILQR`; `None` for
         [`delucax.planning.SQP`][].
 

@@ -24,8 +24,8 @@ class Plan(AbstractController):
     $$u = u_k - K_k\, (y - x_k), \qquad k = \mathrm{round}((t - t_0) / \Delta t)$$
 
     where $x_k$, $u_k$ and $K_k$ are the `states`, `controls` and `gains`. The control
-    is clipped to the bounds of the plan. Outside the horizon the control is NaN, which
-    [`delucax.rollout`][] reports.
+    is clipped to the bounds of the plan. Before the start and after the end of the
+    plan, the control is NaN, and [`delucax.rollout`][] reports this.
 
     Every [`delucax.planning.AbstractPlanner`][] returns a plan, and so do
     [`delucax.planning.ilqr`][], [`delucax.planning.ilc`][] and
@@ -36,38 +36,40 @@ class Plan(AbstractController):
 
     - `states`: $x_0, \dots, x_T$, shape `(T+1, n)`.
     - `controls`: $u_0, \dots, u_{T-1}$, shape `(T, m)`, trainable.
-    - `gains`: $K_0, \dots, K_{T-1}$, shape `(T, m, n)`, trainable. If a control is held
-        at a bound at some step, its row of the gain matrix of that step is zero.
+    - `gains`: $K_0, \dots, K_{T-1}$, shape `(T, m, n)`, trainable. If a control is at
+        one of its bounds at step $k$, the row of $K_k$ for this control is zero.
     - `cost`: the cost of the trajectory, with the final cost.
-    - `trace`: the cost of the start and of each iteration, shape
-        `(max_iterations + 1,)`. If the planner took fewer iterations, the last cost is
-        repeated. With constraints, `trace` holds the augmented Lagrangian instead of
-        the cost, or for [`delucax.planning.SQP`][] the cost with the penalty of soft
-        constraints.
+    - `trace`: the cost of the initial trajectory and the cost after each iteration,
+        shape `(max_iterations + 1,)`. If the planner took fewer iterations, the last
+        cost fills the remaining entries. With constraints, `trace` holds the augmented
+        Lagrangian instead of the cost. For [`delucax.planning.SQP`][], `trace` holds
+        the cost with the penalty of soft constraints.
     - `residual`: how far the plan is from a stationary point: the largest entry of the
         gradient of the cost with respect to the controls, projected to the bounds. For
         `SQP`, `residual` is the largest entry of the gradient of the Lagrangian. For a
-        planner that samples, it is the largest change of a control in the last
-        iteration.
+        sampling planner, such as MPPI, `residual` is the largest change of a control in
+        the last iteration.
     - `violation`: the largest violation of a constraint. For
-        [`delucax.planning.ILQR`][], `violation` also takes account of inactive
-        constraints whose multiplier is not zero. Without constraints it is 0.
+        [`delucax.planning.ILQR`][], `violation` is also above zero if a constraint is
+        inactive but its multiplier is not zero. Without constraints it is 0.
     - `multipliers`: the [`delucax.planning.Multipliers`][] of the constraints; `None`
         without constraints, or if the planner has no multipliers.
     - `result`: the status, one of `delucax.RESULTS`.
     - `iterations`: the number of iterations.
     - `rollouts`: the number of computed trajectories. Each trajectory that a line
         search tries counts as a rollout.
-    - `regularisation`: the regularisation of the last iteration. If `regularisation` is
-        above zero, the control Hessian at the solution is not positive definite, or the
-        line search had difficulties.
+    - `regularisation`: the regularisation of the last iteration. A value above zero
+        means that the control Hessian at the solution is not positive definite, or that
+        the line search recently found no step that it could accept.
     - `t0`: the time of the first state.
     - `dt`: the control interval.
     - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` without bounds.
-    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
+    - `difference`: the function `(x, x_ref) -> deviation` that computes the deviation
+        from the planned state; subtraction by default.
     - `parameters`: the values that the planner chose for
-        [`delucax.planning.Unknowns`][], by their paths. A chosen duration appears as
-        the step `dt` of the dynamics. `None` without unknowns.
+        [`delucax.planning.Unknowns`][], in a dictionary whose keys are the paths of the
+        parameters. If the planner chose the duration, the dictionary contains the step
+        `dt` of the dynamics. `None` without unknowns.
 
     !!! example
 

@@ -88,15 +88,15 @@ class AbstractPlanner(eqx.Module):
 
     - `start` may hold several starts. `start.cheapest(problem)` picks one.
     - Keep the controls within the bounds. `problem.roll_out` and `problem.clip` do.
-    - If the planner takes no constraints, raise an error if `problem.constraints` is
-        not `None`.
-    - Return `problem.plan(states, controls, cost)`. A call of the planner raises an
-        error if the `result` of the plan that `solve` returns is not `successful`.
+    - If your planner does not support constraints, raise an error if
+        `problem.constraints` is not `None`.
+    - Return `problem.plan(states, controls, cost)`. If the plan that `solve` returns
+        has a `result` other than `successful`, the call of the planner raises an error.
 
     If the planner draws random numbers, set `is_stochastic = True`.
 
-    Such a planner also works in [`delucax.controllers.MPC`][]. The derivatives of the
-    plan are the derivatives of `solve`.
+    Your planner also works in [`delucax.controllers.MPC`][]. To differentiate a plan,
+    JAX differentiates your `solve`.
 
     !!! example
 

@@ -74,11 +74,12 @@ class FreeStart(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A planning problem: minimise a cost along the trajectory of dynamics.
+    """A planning problem: minimise a cost along a trajectory of the dynamics.
 
-    [`delucax.planning.AbstractPlanner`][] passes it to the `solve` of a planner. The
-    arguments of this problem are already checked, and its arrays all have the same
-    precision. You can differentiate with respect to every array.
+    [`delucax.planning.AbstractPlanner`][] passes the problem to the method `solve` of a
+    planner. The arguments of this problem are already checked, and its arrays all have
+    the same precision. You can differentiate with respect to every array of the
+    problem.
 
     **Attributes:**
 
@@ -89,14 +90,15 @@ class Problem(eqx.Module):
     - `w`: known disturbances, shape `(T, k)`; `None` for zero.
     - `bounds`: the bounds `(low, high)` of the controls, each of shape `(m,)`; `None`
         without bounds.
-    - `difference`: `(x, x_ref) -> deviation`; `None` for subtraction.
+    - `difference`: the function `(x, x_ref) -> deviation` that computes the deviation
+        of a state from a reference; `None` for subtraction.
     - `constraints`: [`delucax.planning.Constraints`][]; `None` without constraints.
     - `multipliers`: the multipliers and the weight of the augmented Lagrangian. If
         multipliers are given, the costs of the problem include the terms of the
         augmented Lagrangian. `None` otherwise.
     - `unknowns`: [`delucax.planning.Unknowns`][]; `None` without unknowns.
     - `free`: the entries of the first state that are unknown. `x0` then holds guesses
-        of them. `None` if the first state is given.
+        of them. `free` is `None` if the whole first state is given.
 
     !!! example
 

@@ -177,16 +177,18 @@ class MPPI(AbstractSampler):
     v_i = e^{-J^i / \lambda}$$
 
     where $J^i$ is the cost of the trajectory of sequence $i$, and $\lambda$ the
-    temperature. The cost $J^i$ has no extra term for the distance from the mean. A
-    sequence that diverges has zero weight.
+    temperature. The cost $J^i$ contains no penalty on the distance of $u^i$ from the
+    mean $u$. If the trajectory of a sequence diverges, the weight of the sequence is
+    zero.
 
-    The plan is the cheapest of the means and the start, so it costs at most as much as
-    the start. Its gains are zero. You can differentiate the plan with respect to
-    everything that the costs depend on. The derivatives hold the random numbers fixed.
+    The plan is the cheapest among the initial controls and the means of all iterations.
+    So the plan costs at most as much as the initial controls. Its gains are zero. You
+    can differentiate the plan with respect to everything that the costs depend on. When
+    you differentiate the plan, the random numbers stay fixed.
 
-    Call the planner like every [`delucax.planning.AbstractPlanner`][], with a `key`.
-    MPPI takes no constraints. The result is `diverged` if the start and all means
-    diverge.
+    Call the planner like every [`delucax.planning.AbstractPlanner`][], and pass a
+    random `key`. MPPI takes no constraints. The result is `diverged` if the
+    trajectories under the initial controls and under all means diverge.
 
     **Arguments:**
 
@@ -194,10 +196,11 @@ class MPPI(AbstractSampler):
     - `iterations`: the number of iterations; 10 by default.
     - `scale`: the standard deviation of the samples, a number or an array of shape
         `(m,)`, in the unit of the control; 1 by default.
-    - `correlation`: the correlation of a sampled control with the control of the step
-        before, from 0 (white noise, the default) to 1 (constant).
-    - `temperature`: $\lambda$, in the unit of the cost; 1 by default. With a lower
-        temperature, fewer of the best sequences have weight.
+    - `correlation`: the correlation between the sampled controls of two successive
+        steps, from 0 (white noise, the default) to 1 (constant).
+    - `temperature`: the temperature $\lambda$, in the unit of the cost; 1 by default.
+        With a lower temperature, the average depends on fewer sequences, the cheapest
+        ones.
 
     **Raises:** `ValueError` if an option is out of its range.
 
@@ -262,12 +265,12 @@ class CEM(AbstractSampler):
     $$\mu_k \leftarrow \beta \mu_k + (1 - \beta)\, \mu_k^\mathrm{elite}, \qquad
     \sigma_k \leftarrow \beta \sigma_k + (1 - \beta)\, \sigma_k^\mathrm{elite}$$
 
-    where $\beta$ is the momentum. A sequence that diverges has no weight among the
-    elites.
+    where $\beta$ is the momentum. If the trajectory of a sequence diverges, the
+    sequence has no weight in the mean and the standard deviation of the elites.
 
     Call it like [`delucax.planning.MPPI`][]. The plan and its `result` are defined as
-    for [`delucax.planning.MPPI`][]. Derivatives of the plan hold the random numbers and
-    the choice of the elites fixed.
+    for [`delucax.planning.MPPI`][]. When you differentiate the plan, the random numbers
+    and the choice of the elites stay fixed.
 
     **Arguments:**
 
@@ -276,9 +279,9 @@ class CEM(AbstractSampler):
     - `elites`: the number of elites; 32 by default.
     - `scale`: the standard deviation in the first iteration, a number or an array of
         shape `(m,)`, in the unit of the control; 1 by default.
-    - `correlation`: the correlation of a sampled control with the control of the step
-        before, from 0 (white noise, the default) to 1 (constant).
-    - `momentum`: $\beta$, from 0 to 1; 0.1 by default.
+    - `correlation`: the correlation between the sampled controls of two successive
+        steps, from 0 (white noise, the default) to 1 (constant).
+    - `momentum`: the momentum $\beta$, from 0 to 1; 0.1 by default.
 
     **Raises:** `ValueError` if an option is out of its range, or there are more elites
     than samples.

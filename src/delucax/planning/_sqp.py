@@ -43,54 +43,59 @@ class SQP(AbstractPlanner):
     $$\min \sum_{k=0}^{T-1} c(t_k, x_k, u_k) + c_T(t_T, x_T)
     \quad \text{subject to} \quad x_{k+1} = F(t_k, x_k, u_k, w_k)$$
 
-    and [`delucax.planning.Constraints`][], where $c_T$ is the final cost. SQP also
-    finds feedback gains about this trajectory. The variables are the states and the
-    controls (multiple shooting). The initial guess of the states need not follow the
-    dynamics, which helps with unstable plants.
+    and subject to the [`delucax.planning.Constraints`][]. Here $c_T$ is the final cost.
+    SQP also finds feedback gains about this trajectory. The optimisation variables are
+    the states and the controls (multiple shooting). The initial guess of the states
+    need not follow the dynamics, which helps with unstable plants.
 
-    Each iteration solves a quadratic program about the current trajectory, as
-    [`delucax.qp.solve`][] does. Far from a solution, this program has the Hessian of
-    the cost. Once the relative error is below 0.01, the program has the Hessian of the
-    Lagrangian. The program always has the Hessian of the Lagrangian if the program with
-    the Hessian of the cost has no unique minimum. If the Hessian is not convex along
-    the dynamics, the planner adds the squares of the active constraints to it, and if
-    necessary a multiple of the identity.
+    Each iteration approximates the problem about the current trajectory by a quadratic
+    program, and solves this program by the method of [`delucax.qp.solve`][]. Far from a
+    solution, the quadratic program uses the Hessian of the cost. Once the relative
+    error of the optimality conditions is below 0.01, the quadratic program uses the
+    Hessian of the Lagrangian. If a quadratic program with the Hessian of the cost has
+    no unique minimum, the planner also changes to the Hessian of the Lagrangian. The
+    quadratic program may be nonconvex for changes that satisfy the linearised dynamics.
+    Then the planner adds the squares of the active constraints to the cost of the
+    program, and if necessary a multiple of the identity to the Hessian.
 
     The line search tries the steps 1, 1/2, ..., 1/2048. The line search accepts a step
-    by a funnel: the sum of all constraint violations must stay below a number, the
-    width of the funnel. Also, either the cost must fall by 1e-4 of the predicted
-    decrease, or the violations must fall below 0.9 of the width. If the step is
-    accepted because the violations fall, the width is reduced.
+    only if the sum of all constraint violations stays below a limit, the width of the
+    funnel. In addition, the cost must fall by at least 1e-4 times the predicted
+    decrease, or the sum of the violations must fall below 0.9 times the width of the
+    funnel. If a step is accepted because the violations fall, the width of the funnel
+    is reduced.
 
     If the linearised constraints have no feasible point, the planner adds the weighted
-    squares of their violations to the cost. Near a stationary point, the planner tries
-    the constraints again and increases the weight. If the constraints do not hold with
-    any weight, the result is `no_feasible_point`.
+    squares of their violations to the cost. Near a stationary point of the new cost,
+    the planner tries the linearised constraints again, and increases the weight of the
+    squares. If the constraints are violated even with the largest weight, the result is
+    `no_feasible_point`.
 
-    The iteration has converged if three conditions hold. The gradient of the Lagrangian
-    and the error of complementarity are at most `tolerance` times one plus the size of
-    the terms that cancel in these quantities. The states follow the dynamics to the
-    same relative tolerance. No constraint is violated by more than
-    `constraint_tolerance`.
+    The iteration has converged if three conditions hold. First, the gradient of the
+    Lagrangian and the error of complementarity are at most `tolerance * (1 + size)`,
+    where `size` is the size of the terms that are added up in them. Second, the states
+    satisfy the dynamics to the same relative tolerance. Third, no constraint is
+    violated by more than `constraint_tolerance`.
 
-    The initial guess of the states is the trajectory under the initial controls, or the
-    first state repeated at every stage. The planner takes the guess with the smaller
-    sum of all violations. If the planner starts from an earlier plan, it also starts
-    from the multipliers of that plan.
+    There are two initial guesses of the states: the trajectory under the initial
+    controls, and the first state repeated at every stage. The planner takes the guess
+    with the smaller sum of all constraint violations. If the planner starts from an
+    earlier plan, it also starts from the multipliers of that plan.
 
     `plan.multipliers` are the multipliers at the solution. `plan.cost` does not include
     the penalty of violated soft constraints; `plan.trace` does.
 
     You can differentiate the plan, in forward and reverse mode, with respect to every
     array in `dynamics`, `cost`, `constraints`, `x0`, `w`, `t0` and `bounds`. The
-    derivative comes from the implicit function theorem. Its computation solves one
-    quadratic program at the solution, with exact second derivatives. Derivatives are
-    NaN unless the plan converged to a strict minimum whose active constraints are
-    independent and have positive multipliers. The derivatives with respect to
-    `controls` and `states`, where the iteration starts, are zero.
+    derivative comes from the implicit function theorem. To compute this derivative, SQP
+    solves one quadratic program at the solution, with exact second derivatives.
+    Derivatives are NaN unless the plan converged to a strict minimum whose active
+    constraints are independent and have positive multipliers. The derivatives with
+    respect to the initial guess (`controls` and `states`) are zero.
 
-    The planner does not track the events of a hybrid plant. If the solution is at a
-    kink, where the events change, the result is `not_converged` or `no_descent`.
+    The planner does not track the events of a hybrid plant. At a trajectory where the
+    events change, the cost has a kink. If the solution is at such a kink, the result is
+    `not_converged` or `no_descent`.
 
     Under `jax.vmap` on CPU, the plans of a batch are computed one after the other, as
     for [`delucax.planning.ILQR`][].
@@ -104,9 +109,10 @@ class SQP(AbstractPlanner):
         a tenth of the default `tolerance`.
     - `second_order`: if true (default), use the Hessian of the Lagrangian near a
         solution. If false, always use the Hessian of the cost (Gauss-Newton).
-    - `states`: states to start from, shape `(T+1, n)`. `controls` must then be an
-        array, or a number of steps, which means a start at the constant control of the
-        equilibrium. By default the states follow from `controls`.
+    - `states`: states to start from, shape `(T+1, n)`. If you give `states`, `controls`
+        must be an array or a number of steps. For a number of steps, the iteration
+        starts at the constant control of the equilibrium. By default the states are the
+        trajectory under `controls`.
 
     **Raises:** `ValueError` if an option is of the wrong kind or out of its range.
 

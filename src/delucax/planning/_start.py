@@ -24,7 +24,7 @@ from ._problem import Problem
 
 
 class Start(eqx.Module):
-    r"""A start of a planner: the trajectory of the model under feedback.
+    r"""A start for a planner: controls, with or without feedback, and their trajectory.
 
     The control at step $k$ is
 
@@ -35,9 +35,9 @@ class Start(eqx.Module):
     drifts far away under given controls. With stabilising gains the plant stays near
     `states`.
 
-    Several starts are stacked along a first axis. The planner computes the trajectory
-    of each start and begins with the cheapest trajectory. It ignores a start that
-    diverges.
+    To give several starts, stack their arrays along a new first axis. The planner
+    computes the trajectory of each start and begins with the cheapest trajectory. It
+    ignores a start that diverges.
 
     **Arguments:**
 
@@ -45,9 +45,10 @@ class Start(eqx.Module):
     - `states`: shape `(T+1, n)` or `(c, T+1, n)`; needed with `gains`.
     - `gains`: shape `(T, m, n)` or `(c, T, m, n)`; none by default.
     - `multipliers`: [`delucax.planning.Multipliers`][] to start from, the same for all
-        starts. By default all multipliers are zero. The multipliers of a constraint are
-        also zero if its name or shape is not among the given multipliers. Planners
-        without multipliers ignore this argument.
+        starts. By default all multipliers are zero. If the given multipliers do not
+        contain a constraint, or have another shape for this constraint, the multipliers
+        of this constraint are also zero. Planners without multipliers ignore this
+        argument.
 
     **Raises:** `ValueError`, when a planner is called, if the shapes do not fit the
     problem or a number is not finite.

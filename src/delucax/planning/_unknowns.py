@@ -1,4 +1,4 @@
-"""Unknowns of a plan besides the controls: first state, parameters and duration."""
+"""What a planner chooses besides the controls: first state, parameters, duration."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -29,31 +29,33 @@ def _as_bounds(value: Any) -> Any:
 
 
 class Unknowns(eqx.Module):
-    """Unknowns of a plan besides the controls: first state, parameters and duration.
+    """What a planner chooses besides the controls: first state, parameters, duration.
 
     [`delucax.planning.SQP`][] chooses the unknowns together with the controls. Each
     unknown has bounds `(low, high)`, which may be infinite. The iteration starts from
-    the values in the problem, clipped to the bounds.
+    the value that an unknown has in the arguments of the planner, clipped to the
+    bounds.
 
     **Arguments:**
 
     - `start`: bounds of the first state: a dictionary from names of states to pairs
         `(low, high)` of numbers. `x0` gives the other states. None by default.
-    - `parameters`: a dictionary from paths to pairs `(low, high)`, each a number or of
-        the shape of the parameter. A path starts with `dynamics`, `cost` or
-        `constraints`, such as `{"dynamics.system.length": (0.5, 2.0)}`. None by
-        default.
+    - `parameters`: bounds of parameters: a dictionary from the path of a parameter to a
+        pair `(low, high)`. Each bound is a number or has the shape of the parameter. A
+        path starts with `dynamics`, `cost` or `constraints`. An example is
+        `{"dynamics.system.length": (0.5, 2.0)}`. None by default.
     - `duration`: bounds `(low, high)` of the time from the first state to the last one,
         two positive numbers. All steps have the same length. The dynamics must
         discretise a system in continuous time, such as [`delucax.Discretized`][]. Costs
-        and constraints get the true times, so a plan with the final cost `t` minimises
-        the duration. The stage cost is not multiplied by the length of a step. By
-        default the duration is not an unknown.
+        and constraints are evaluated at the times that follow from the chosen duration.
+        So a plan with the final cost `t` minimises the duration. The planner does not
+        multiply the stage cost by the length of a step. By default the duration is not
+        an unknown.
 
-    **Raises:** `ValueError` if nothing is unknown, bounds are not a pair of numbers
-    with `low <= high`, or a duration may be zero or negative. A call of the planner
-    raises a `ValueError` if a name does not exist or a parameter has no finite value to
-    start from.
+    **Raises:** `ValueError` if no unknown is given, bounds are not a pair of numbers
+    with `low <= high`, or the bounds allow a duration of zero or less. A call of the
+    planner raises a `ValueError` if a name does not exist or a parameter has no finite
+    value to start from.
 
     !!! example
 

@@ -216,28 +216,29 @@ def animate(
     dpi: float | int = 60,
     traces: bool = True,
 ) -> Animation:
-    """Animate a trajectory: the plant beside its states, controls and costs.
+    """Animate a trajectory: the moving plant, with plots of states, controls and costs.
 
     The type of the system decides how the plant looks. Register a drawing for your own
-    system with [`delucax.plotting.register_drawing`][]. A system without a drawing is
-    shown as a dot in the plane of its states if it has two states, and as bars
-    otherwise. The animation ends when the episode ends.
+    system with [`delucax.plotting.register_drawing`][]. A system with two states and no
+    drawing is shown as a dot in the plane of the states. Any other system without a
+    drawing is shown as bars, one for each state and each control. The animation ends
+    when the episode ends.
 
     If the system has events, the frame nearest to an event shows the moment just after
     the event, and the name of the event appears in colour. If the rollout did not keep
-    its events, `animate` computes the steps again to locate the events. For this, the
-    trajectory must hold its disturbances, if the run had disturbances.
+    its events, `animate` computes the steps again to locate the events. If the run had
+    disturbances, the trajectory must hold them so that `animate` can do this.
 
     **Arguments:**
 
     - `environment`: the environment that was run.
     - `trajectory`: one trajectory with its states and controls.
-    - `path`: the file to which the animation is saved at once. The name of the file
-        ends in `.gif`, `.html` (a page that needs no other file) or `.mp4` (needs
+    - `path`: the file to which `animate` saves the animation. The name of the file must
+        end in `.gif`, `.html` (a page that needs no other file) or `.mp4` (needs
         ffmpeg). By default nothing is saved.
-    - `fps`: frames per second. By default the animation plays in real time, unless real
-        time would take fewer than 5 frames per second. In this case the animation plays
-        5 frames per second, which is faster than real time.
+    - `fps`: frames per second. By default the animation plays in real time. If real
+        time would mean fewer than 5 frames per second, the animation plays 5 frames per
+        second, which is faster than real time.
     - `max_frames`: the largest number of frames, 100 by default. The frames are spread
         evenly over the steps.
     - `dpi`: pixels per inch, 60 by default. With 60 pixels per inch, the picture is 600
@@ -247,8 +248,8 @@ def animate(
 
     **Returns:** an animation. A notebook plays the animation, and
     `animation.save(path)` writes it to a file. `len(animation)` is the number of
-    frames, `animation.indices` the step that each frame shows, and `animation.fps` the
-    frames per second.
+    frames, `animation.indices` holds the step that each frame shows, and
+    `animation.fps` is the number of frames per second.
 
     **Raises:** `ValueError` if the trajectory is a batch, holds no states or controls,
     has no step, or does not fit the environment; if a number is not positive; if `path`

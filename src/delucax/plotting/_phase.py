@@ -35,14 +35,14 @@ def phase_portrait(
 ) -> Figure:
     r"""Draw the phase portrait of a system with two states, and trajectories in it.
 
-    Streamlines follow $\dot x$ at time 0. Streamlines are thicker where the state moves
-    faster. A dot marks the start of each trajectory. If a state is an angle (the
-    system's `difference` wraps it), trajectories are drawn again in every full turn
-    within the limits.
+    The streamlines follow the vector field $\dot x$ at time 0. Streamlines are thicker
+    where the state moves faster. A dot marks the start of each trajectory. If a state
+    is an angle (the system's `difference` wraps it), each trajectory is drawn several
+    times, shifted by full turns, wherever it is within the limits.
 
-    If the system has events, dashed lines show where the guards of the events are zero,
-    and no flow is drawn beyond the guards. A dotted line joins the states before and
-    after each event, if the trajectory kept its events.
+    If the system has events, dashed lines show where the guards of the events are zero.
+    Beyond these lines, no streamlines are drawn. A dotted line joins the states before
+    and after each event, if the trajectory kept its events.
 
     **Arguments:**
 

@@ -45,20 +45,21 @@ def plot(
 
     States with the same unit are drawn in the same panel. Controls are drawn as steps,
     because they are held over each step. Each member of a batch of at most 8 is drawn
-    as a thin line. A larger batch is drawn as the median and the band between the
-    quartiles of the members that have not ended. Several trajectories are drawn over
-    each other, with a panel for each state.
+    as a thin line. For a larger batch, a line shows the median and a band shows the
+    range between the quartiles. Both are computed over the members whose episode has
+    not ended. Several trajectories are drawn in the same panels, with one panel for
+    each state.
 
     A ring marks the point at which an episode terminated, and a cross the point at
     which it failed. A tick above the controls marks a step at which something went
     wrong in the controller, such as a failed plan. For a single trajectory, ticks also
-    mark the steps at which the bounds clipped the control. Events, if they were kept,
-    break the lines of the states. A dotted line across the panels of the states marks
-    each event. If there are many events, or several trajectories, a tick above the
-    panels marks each event instead.
+    mark the steps at which the bounds clipped the control. If the trajectory kept its
+    events, the lines of the states are interrupted at each event. A dotted line across
+    the panels of the states marks each event. If there are many events, or several
+    trajectories, a tick above the panels marks each event, instead of a dotted line.
 
-    The figure is not registered with pyplot. A notebook shows the figure, and
-    `figure.savefig("run.pdf")` writes it to a file.
+    The figure is not registered with pyplot, so `plt.show()` does not show it. A
+    notebook shows the figure, and `figure.savefig("run.pdf")` writes it to a file.
 
     **Arguments:**
 
@@ -71,10 +72,11 @@ def plot(
         control bounds are drawn as dashed lines. None by default.
     - `show`: what to draw, and in which order: `"states"`, `"controls"`, `"costs"`,
         `"observations"`, `"disturbances"`, or the name of one state or control. By
-        default the states, controls and costs that the trajectory holds.
+        default `plot` draws those of the states, controls and costs that the trajectory
+        holds.
 
-    **Returns:** a `matplotlib.figure.Figure`. The `axes` of the figure have one entry
-    for each panel.
+    **Returns:** a `matplotlib.figure.Figure`. The list `axes` of the figure has one
+    entry for each panel.
 
     **Raises:** `ValueError` if there is nothing to draw, if states were not kept, if
     the trajectories are not of the same plant, or if `show` names something that the

@@ -69,7 +69,8 @@ _INCHES, _DPI = (5.0, 5.0), 100
 class Renderer:
     """Draws the plant of an environment, one state at a time.
 
-    The limits of the axes fit a rollout with zero control.
+    The limits of the axes are chosen so that a rollout with zero control fits into the
+    picture.
 
     **Arguments:**
 

@@ -31,8 +31,8 @@ class Simulated(NamedTuple):
     **Attributes:**
 
     - `objective`: the objective of the simulated trajectory, a scalar.
-    - `violation`: the largest violation of a constraint along the trajectory, also
-        between the steps of the plan.
+    - `violation`: the largest violation of a constraint along the simulated trajectory,
+        also at times between the steps of the plan.
     - `times`, `states`: the simulated trajectory, shapes `(K,)` and `(K, n)`.
 
     !!! example

@@ -46,9 +46,9 @@ class CatalystMixing(AbstractSystem):
 def catalyst_mixing(steps: int = 100) -> OptimalControl:
     r"""Mix two catalysts along a tube such that as much product as possible leaves it.
 
-    The final cost $-1 + x_1 + x_2$ at time 1 is minimised, from $(1, 0)$, with
-    $0 \le u \le 1$. The published minimum is -0.0480556. The first guess is the
-    constant mixture $u = 0.5$.
+    The problem is to minimise the final cost $-1 + x_1 + x_2$ at time 1. The first
+    state is $(1, 0)$, and the bounds are $0 \le u \le 1$. The published minimum is
+    -0.0480556. The first guess is the constant mixture $u = 0.5$.
 
     **Arguments:** `steps`: T, the number of steps, 100 by default.
 
@@ -80,7 +80,8 @@ def catalyst_mixing(steps: int = 100) -> OptimalControl:
 
 
 class HangingChain(AbstractSystem):
-    r"""A hanging chain: its height $h$, length $s$ and potential energy $e$.
+    r"""A hanging chain, with the states height $h$, length $s$ and potential energy
+    $e$.
 
     $$\dot h = u, \qquad \dot s = \sqrt{1 + u^2}, \qquad \dot e = h \sqrt{1 + u^2}$$
 
@@ -110,11 +111,12 @@ class HangingChain(AbstractSystem):
 
 
 def hanging_chain(steps: int = 100) -> OptimalControl:
-    r"""Find the shape of a hanging chain, which has the least potential energy.
+    r"""Find the shape of a hanging chain: the shape with the least potential energy.
 
-    The chain has length 4 and hangs between the heights 1 at position 0 and 3 at
-    position 1. The minimum is 5.06848, the energy of the catenary. `reference` is the
-    published value, 5.06891. The first guess is a straight line between the ends.
+    The chain has length 4. Its ends are at height 1 (position 0) and at height 3
+    (position 1). The minimum energy is 5.06848, the energy of the catenary. `reference`
+    is the published value, 5.06891. The first guess is a straight line between the
+    ends.
 
     **Arguments:** `steps`: T, the number of steps, 100 by default.
 

@@ -19,8 +19,9 @@ class GoddardRocket(AbstractSystem):
     $$\dot h = v, \qquad \dot v = \frac{u - D}{m} - \frac{1}{h^2}, \qquad
     \dot m = -\frac{u}{c}, \qquad D = \mathrm{drag}\, v^2 e^{-\mathrm{decay}\,(h - 1)}$$
 
-    The height $h$ is the distance from the centre of the earth. The units are the
-    radius of the earth, the gravity at its surface, and the initial mass of the rocket.
+    The height $h$ is the distance from the centre of the earth. Lengths are in units of
+    the radius of the earth, accelerations in units of the gravity at the surface of the
+    earth, and masses in units of the initial mass of the rocket.
 
     **Arguments:**
 
@@ -66,8 +67,8 @@ def goddard_rocket(steps: int = 100) -> OptimalControl:
     maximum is 1.01283. The optimal thrust is full at first, then between its bounds (a
     singular arc), then zero.
 
-    The first guess is a straight line to height 1.01, half thrust, and a duration of
-    0.2.
+    The first guess is a straight line from the start to height 1.01, with half thrust
+    and a duration of 0.2.
 
     **Arguments:** `steps`: T, the number of steps, 100 by default.
 
@@ -115,8 +116,8 @@ class HangGlider(AbstractSystem):
     L = \frac{u \rho S v^2}{2}$$
 
     The air rises with the speed $\mathrm{updraft}\,(1 - r) e^{-r}$, where
-    $r = (x / 100 - 2.5)^2$. Relative to the air, the velocity is $(v_x, w)$, its
-    magnitude is $v$, and $\sin\eta = w / v$. Lengths are in m, times in s.
+    $r = (x / 100 - 2.5)^2$. The velocity relative to the air is $(v_x, w)$. The speed
+    relative to the air is $v$, and $\sin\eta = w / v$. Lengths are in m, times in s.
 
     **Arguments:**
 
@@ -172,8 +173,9 @@ def hang_glider(steps: int = 200) -> OptimalControl:
     r"""Glide as far as possible through an updraft.
 
     The final distance $x$ is maximised. The glider starts at $(0, 1000)$ and ends at a
-    height of 900. Its velocity is $(13.23, -1.288)$ at the start and at the end. The
-    bounds are $0 \le u \le 1.4$, $x \ge 0$ and $v_x \ge 0$; the duration is free.
+    height of 900. The velocity of the glider is $(13.23, -1.288)$ at the start and at
+    the end. The bounds are $0 \le u \le 1.4$, $x \ge 0$ and $v_x \ge 0$; the duration
+    is free.
 
     The maximum is 1248.03 m (Betts). The benchmark gives 1255.05 m, which includes the
     error of a discretisation by the trapezoidal rule. The first guess is the constant

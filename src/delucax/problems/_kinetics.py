@@ -67,17 +67,17 @@ class Reactions(AbstractSystem):
 class Sampled(AbstractWrapper):
     """A discretised system whose step `k` has the length `widths[k]`.
 
-    The time of these dynamics is the number of steps, so `dt` is 1 by default. The time
-    of the system is the sum of the lengths of the steps before.
+    These dynamics measure time in steps, so `dt` is 1 by default. The time of the
+    system inside is the sum of the lengths of all earlier steps.
 
     **Arguments:**
 
     - `inner`: a [`delucax.Discretized`][] system. Its `dt` is not used.
     - `widths`: the lengths of the steps, shape `(T,)`.
-    - `dt`: the increase of the time of these dynamics in one step, 1 by default.
+    - `dt`: the time by which these dynamics advance in one step, 1 by default.
 
     **Raises:** `ValueError` if the system has a diffusion, because its Brownian
-    increments are drawn for steps of one length.
+    increments are drawn for steps of equal length.
 
     !!! example
 
@@ -194,8 +194,8 @@ def gas_oil_cracking() -> OptimalControl:
     $$\dot y_1 = -(a + c) y_1^2, \qquad \dot y_2 = a y_1^2 - b y_2, \qquad
     y(0) = (1, 0)$$
 
-    The published sum of squares is 5.2366e-3. The first guess consists of the
-    measurements and of rates of 1.
+    The published sum of squares is 5.2366e-3. The first guess is the measurements for
+    the states and 1 for each rate.
 
     **Returns:** a [`delucax.problems.OptimalControl`][].
 
@@ -239,7 +239,7 @@ def methanol_to_hydrocarbons() -> OptimalControl:
 
     Here $q = (b + e) y_1 + y_2$ and $y(0) = (1, 0, 0)$. The rates $(a, b, c, d, e)$ are
     estimated from 16 measurements. The published sum of squares is 9.02229e-3. The
-    first guess consists of the measurements and of rates of 1.
+    first guess is the measurements for the states and 1 for each rate.
 
     **Returns:** a [`delucax.problems.OptimalControl`][].
 
@@ -289,8 +289,8 @@ def alpha_pinene() -> OptimalControl:
     \dot y_5 = d y_3 - e y_5$$
 
     The first state is $(100, 0, 0, 0, 0)$. The rates $(a, b, c, d, e)$ are estimated
-    from 8 measurements. The published sum of squares is 19.8721. The first guess
-    consists of the measurements and of rates of 1e-5 per minute.
+    from 8 measurements. The published sum of squares is 19.8721. The first guess is the
+    measurements for the states and 1e-5 per minute for each rate.
 
     **Returns:** a [`delucax.problems.OptimalControl`][].
 

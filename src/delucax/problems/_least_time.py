@@ -51,8 +51,8 @@ def particle_steering(steps: int = 100) -> OptimalControl:
 
     The particle starts at rest at the origin. The particle ends at $y = 5$ with the
     velocity $(45, 0)$. The bounds are $|u| \le \pi / 2$. The published minimum time is
-    0.554577. The first guess is a straight line between the ends, an angle of zero, and
-    a duration of 1.
+    0.554577. The first guess is a straight line from the start to the end, with an
+    angle of zero and a duration of 1.
 
     **Arguments:** `steps`: T, the number of steps, 100 by default.
 
@@ -129,13 +129,15 @@ class RobotArm(AbstractSystem):
 def robot_arm(steps: int = 90) -> OptimalControl:
     r"""Turn a robot arm from rest to rest in the least time.
 
-    The arm moves from $(\rho, \theta, \phi) = (4.5, 0, \pi/4)$ to $(4.5, 2\pi/3,
-    \pi/4)$. The bounds are $|u| \le 1$, $0 \le \rho \le 5$, $|\theta| \le \pi$ and
-    $0 \le \phi \le \pi$. The published minimum time is 9.14138. The first guess is a
-    straight line between the ends, controls of zero, and a duration of 10.
+    The arm moves from $(\rho, \theta, \phi) = (4.5, 0, \pi/4)$ to
+    $(4.5, 2\pi/3, \pi/4)$. The bounds are $|u| \le 1$, $0 \le \rho \le 5$,
+    $|\theta| \le \pi$ and $0 \le \phi \le \pi$. The published minimum time is 9.14138.
+    The first guess is a straight line from the start to the end, with controls of zero
+    and a duration of 10.
 
-    For some numbers of steps, for example 100, a control switches exactly at a step. In
-    these cases, the derivatives of the solution are NaN.
+    For some numbers of steps, for example 100, a control of the solution switches
+    exactly at the beginning of a step. In these cases, the derivatives of the solution
+    are NaN.
 
     **Arguments:** `steps`: T, the number of steps, 90 by default.
 

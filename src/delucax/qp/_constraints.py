@@ -15,10 +15,10 @@ from .._typing import Array
 class Soft(eqx.Module):
     r"""Bounds that may be violated at a cost.
 
-    A violation $t \ge 0$ of a bound costs $v\, t + \tfrac12 W t^2$. The penalty is
-    exact if $v$ is larger than the multiplier of the hard bound: with such a $v$, the
-    solution violates the bound only if no feasible point satisfies it. If both weights
-    are 0, the bound has no effect.
+    A violation $t \ge 0$ of a bound costs $v\, t + \tfrac12 W t^2$. If $v$ is larger
+    than the multiplier that the bound would have as a hard bound, the penalty is exact.
+    Then the solution violates the bound only if no feasible point satisfies the bound.
+    If both weights are 0, the bound has no effect.
 
     **Arguments:**
 
@@ -68,8 +68,8 @@ class Soft(eqx.Module):
 class Rows(eqx.Module):
     r"""General linear constraints, $l \le C x + D u \le h$.
 
-    A row whose two bounds are equal is an equation. If a row has no bound on one side,
-    give an infinite bound for this side.
+    If the two bounds of a row are equal, the row is an equality constraint. If a row
+    has no bound on one side, give an infinite bound for this side.
 
     **Arguments:**
 

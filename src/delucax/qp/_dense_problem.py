@@ -70,7 +70,7 @@ class Dense(eqx.Module):
     E x = b, \quad \mathit{low} \le x \le \mathit{high}, \quad
     \mathit{lower} \le G x \le \mathit{upper}$$
 
-    The dense form is suitable for up to some hundreds of variables. Write a problem of
+    The dense form is suitable for up to a few hundred variables. Write a problem of
     optimal control as a [`delucax.qp.Staged`][] program instead, because the time to
     solve a staged program is linear in the horizon.
 

@@ -17,12 +17,13 @@ class Solution(eqx.Module):
     negative, their combination of the constraints, $E^\top y + G^\top
     (\mu_\mathrm{upper} - \mu_\mathrm{lower})$, is zero, and the same combination of the
     right sides is $-1$. ($G$ has a row for each bound of a variable here.) A feasible
-    point would contradict this. `x` and `u` are NaN, and `cost` is infinite.
+    point would contradict this. If there is no feasible point, `x` and `u` are NaN, and
+    `cost` is infinite.
 
     If `result` is `RESULTS.unbounded`, `x` and `u` are a direction in which the cost
-    decreases without bound. Moving along this direction violates no constraint, the
-    Hessian is zero along it, and the linear cost of the direction is -1. The
-    multipliers are NaN, and `cost` is minus infinity.
+    decreases without bound. A step along this direction violates no constraint. The
+    quadratic cost of the direction is zero, and its linear cost is -1. For an unbounded
+    program, the multipliers are NaN, and `cost` is minus infinity.
 
     **Attributes:**
 
@@ -33,8 +34,9 @@ class Solution(eqx.Module):
     - `cost`: the cost of the solution, including the cost of violated soft bounds.
     - `primal_residual`: the largest violation of a constraint that is not soft.
     - `dual_residual`: the largest entry of the gradient of the Lagrangian.
-    - `complementarity`: the largest product of a multiplier and its slack.
-    - `gap`: the absolute difference of the cost and the cost of the dual program.
+    - `complementarity`: the largest product of a multiplier and the slack of its
+        constraint.
+    - `gap`: the absolute difference between the cost and the cost of the dual program.
     - `iterations`: the number of iterations, each with one factorisation.
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 

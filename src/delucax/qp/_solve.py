@@ -36,28 +36,28 @@ def solve(
 ) -> Solution:
     r"""Solve a convex quadratic program, or show that it has no solution.
 
-    The solver first guesses which sides of the constraints are active. Each guess gives
-    a linear system, whose solution gives the next guess. Most quadratic programs in
-    control are solved after a few guesses. If the guesses do not lead to a solution, a
-    predictor-corrector interior-point method on the homogeneous embedding finds a
-    solution, or a certificate that there is none.
+    The solver first guesses which lower and upper bounds of the constraints are active.
+    Each guess gives a linear system, whose solution gives the next guess. Most
+    quadratic programs in control are solved after a few guesses. If the guesses do not
+    lead to a solution, a predictor-corrector interior-point method on the homogeneous
+    embedding finds a solution, or a certificate that there is none.
 
-    The solution is differentiable in forward and reverse mode with respect to every
-    array of the problem, by the implicit function theorem: sides with positive
-    multipliers stay active. The derivative is NaN if the solution is not unique, if a
-    side is at its bound with a multiplier of zero, or if the solve failed. Residuals
-    and certificates have no derivatives, and the solution has no derivative with
-    respect to the start.
+    You can differentiate the solution, in forward and reverse mode, with respect to
+    every array of the problem. The derivative comes from the implicit function theorem,
+    where bounds with positive multipliers stay active. The derivative is NaN if the
+    solution is not unique, if an active bound has a multiplier of zero, or if the solve
+    failed. Residuals and certificates have no derivatives, and the solution has no
+    derivative with respect to the start.
 
     **Arguments:**
 
     - `problem`: a [`delucax.qp.Dense`][] or a [`delucax.qp.Staged`][].
-    - `start`: the solution of a problem with the same shapes. The active sides of this
-        solution are the first guess. If the problem has changed little, one or two
-        iterations are enough. A start that is not finite is ignored. By default the
-        first guess is that no side is active.
+    - `start`: the solution of an earlier problem with the same shapes. The bounds that
+        are active in this solution are the first guess. If the problem has changed
+        little, one or two iterations are enough. A start that is not finite is ignored.
+        By default the first guess is that no bound is active.
     - `rtol`, `atol`: tolerances. A residual may be at most `atol + rtol * size`, where
-        `size` is the size of the terms that cancel in the residual. Both tolerances are
+        `size` is the size of the terms whose sum is the residual. Both tolerances are
         `1e-8` by default, or `1e-4` in single precision.
     - `max_steps`: the largest number of iterations, 100 by default.
     - `refinements`: the largest number of refinements of each linear system, 3 by
@@ -65,15 +65,15 @@ def solve(
     - `throw`: raise an error if the solver finds no solution (default). If false, check
         `result`.
 
-    **Returns:** a [`delucax.qp.Solution`][], with the residuals in the units of the
+    **Returns:** a [`delucax.qp.Solution`][], whose residuals are in the units of the
     given problem. `result` is one of
 
     - `RESULTS.successful`: the residuals are within the tolerance.
-    - `RESULTS.no_feasible_point`, `RESULTS.unbounded`: the program has no solution; the
-        certificate of this has been checked.
+    - `RESULTS.no_feasible_point`, `RESULTS.unbounded`: the program has no solution, and
+        the solver has checked the certificate that proves this.
     - `RESULTS.inaccurate`: the iteration ended near the tolerance, but not within it.
     - `RESULTS.ill_posed`: the data are not finite, or the cost is not convex.
-    - `RESULTS.not_converged`: the solver ended in another way.
+    - `RESULTS.not_converged`: the solver stopped for another reason.
 
     **Raises:** `ValueError` if an argument has the wrong type, shape or value. With
     `throw`, an error at run time if the solver finds no solution.

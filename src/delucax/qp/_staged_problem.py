@@ -33,15 +33,18 @@ class StagedMultipliers(eqx.Module):
 
     **Attributes:**
 
-    - `costates`: the multipliers of the equations, shape `(T+1, n)`. The first costate
-        belongs to the start, and is zero if the start is free. Entry $k + 1$ belongs to
-        $x_{k+1} = A x_k + B u_k + d_k$. The derivative of the optimal cost with respect
-        to $d_k$ is `-costates[k + 1]`.
-    - `states`: a pair `(lower, upper)` of non-negative arrays of shape `(T+1, n)`;
-        `None` if there are no bounds.
-    - `controls`: a pair of arrays of shape `(T, m)`, like `states`.
-    - `rows`: a pair of arrays of shape `(T, p)`, like `states`.
-    - `final_rows`: a pair of arrays of shape `(p,)`, like `states`.
+    - `costates`: the multipliers of the dynamics, shape `(T+1, n)`. The first costate
+        is the multiplier of the given start. It is zero if the start is free. Costate
+        $k + 1$ is the multiplier of the equation $x_{k+1} = A x_k + B u_k + d_k$. The
+        derivative of the optimal cost with respect to $d_k$ is `-costates[k + 1]`.
+    - `states`: the multipliers of the bounds of the states, a pair `(lower, upper)` of
+        non-negative arrays of shape `(T+1, n)`; `None` if there are no bounds.
+    - `controls`: the multipliers of the bounds of the controls, a pair of arrays of
+        shape `(T, m)`, like `states`.
+    - `rows`: the multipliers of `rows`, a pair of arrays of shape `(T, p)`, like
+        `states`.
+    - `final_rows`: the multipliers of `final_rows`, a pair of arrays of shape `(p,)`,
+        like `states`.
 
     !!! example
 
@@ -85,13 +88,14 @@ class Staged(eqx.Module):
     + \tfrac12 u_k^\top R u_k + q^\top x_k + r^\top u_k \right)
     + \tfrac12 x_T^\top Q_T x_T + q_T^\top x_T$$
 
-    The constraints are $x_{k+1} = A x_k + B u_k + d_k$ from a given or free start
-    $x_0$, bounds of states and controls, and general rows.
+    The constraints are the dynamics $x_{k+1} = A x_k + B u_k + d_k$, bounds of states
+    and controls, and general linear constraints. The start $x_0$ is given or free.
 
-    An argument without a time axis holds at all stages. Bounds of the states hold at
-    stages 1 to T. These bounds also hold at stage 0 if the start is free. They do not
-    hold for a given start, because the program cannot change a given start. A Riccati
-    recursion solves the program in time linear in the horizon.
+    An argument without a time axis applies to all stages. Bounds of the states hold at
+    stages 1 to T. These bounds also hold at stage 0 if the start is free. The bounds do
+    not apply to a given start, because the program cannot change a given start. A
+    Riccati recursion solves the program, so the computing time is linear in the
+    horizon.
 
     **Arguments:**
 
@@ -101,24 +105,31 @@ class Staged(eqx.Module):
     - `R`: shape `(m, m)`, or `(T, m, m)`, symmetric.
     - `S`: shape `(n, m)`, or `(T, n, m)`; zero by default. `[[Q, S], [S', R]]` must be
         positive semidefinite.
-    - `d`: an offset of the next state, `(n,)` or `(T, n)`; zero by default.
-    - `q`, `r`: shapes `(n,)` or `(T, n)`, and `(m,)` or `(T, m)`; zero by default.
+    - `d`: an offset that is added to the next state, shape `(n,)` or `(T, n)`; zero by
+        default.
+    - `q`, `r`: the linear weights of the state, shape `(n,)` or `(T, n)`, and of the
+        control, shape `(m,)` or `(T, m)`; zero by default.
     - `final`: the final weight $Q_T$, shape `(n, n)`, symmetric, positive semidefinite;
         zero by default.
-    - `final_q`: $q_T$, shape `(n,)`; zero by default.
+    - `final_q`: the linear weight $q_T$ of the final state, shape `(n,)`; zero by
+        default.
     - `start`: $x_0$, shape `(n,)`; free by default.
     - `horizon`: the number of stages $T$; needed if no argument has a time axis.
-    - `states`: a pair `(low, high)` of numbers or arrays of shape `(n,)` or `(T+1, n)`,
-        which may be infinite, or a [`delucax.qp.Soft`][]; none by default. Equal bounds
-        are an equation.
-    - `controls`: bounds like `states`, of shape `(m,)` or `(T, m)`.
-    - `rows`: a [`delucax.qp.Rows`][] for stages 0 to T - 1; none by default.
-    - `final_rows`: a [`delucax.qp.Rows`][] without a `D`, for stage T; none by default.
+    - `states`: bounds of the states: a pair `(low, high)` of numbers or arrays of shape
+        `(n,)` or `(T+1, n)`, which may be infinite, or a [`delucax.qp.Soft`][]; none by
+        default. Equal bounds are an equation.
+    - `controls`: bounds of the controls, given like `states`, of shape `(m,)` or
+        `(T, m)`.
+    - `rows`: the general constraints at stages 0 to T - 1, a [`delucax.qp.Rows`][];
+        none by default.
+    - `final_rows`: the general constraints at stage T, a [`delucax.qp.Rows`][] without
+        a `D`; none by default.
 
     **Raises:** `ValueError` if an array has the wrong shape or has NaN, if it is not
     finite (only bounds may be infinite), if arrays are for different horizons, if there
     is no finite number between two bounds, or if the weights are not symmetric and
-    positive semidefinite. The error message names the stage, and the entry of a bound.
+    positive semidefinite. The error message names the stage, and for a bound also the
+    entry.
 
     Source: Rao, Wright and Rawlings, 1998.
 

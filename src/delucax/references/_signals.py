@@ -51,7 +51,8 @@ class Constant(eqx.Module):
 class Sequence(eqx.Module):
     """A reference from an array: `r(t) = values[round(t / dt)]`.
 
-    The first value is held before the start, and the last value after the end.
+    Before the first time, the reference is the first value. After the last time, it is
+    the last value.
 
     **Arguments:**
 
@@ -95,15 +96,15 @@ class Sequence(eqx.Module):
 
 
 class FigureEight(eqx.Module):
-    r"""A figure of eight in the plane, Gerono's curve.
+    r"""A figure of eight in the plane (the lemniscate of Gerono).
 
     $$r(t) = c + (a \sin s, b \sin 2 s), \qquad s = 2 \pi t / T$$
 
     **Arguments:**
 
     - `period`: $T$, in units of time.
-    - `width`, `height`: $a$ and $b$, the extent from the centre to each side, 1 by
-        default.
+    - `width`, `height`: $a$ and $b$, half of the full width and half of the full height
+        of the figure, 1 by default.
     - `centre`: $c$, shape `(2,)`, the origin by default.
 
     **Raises:** `ValueError` if the period is not positive.

@@ -34,16 +34,18 @@ def dare(
 
     and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 
-    The solver is structure-preserving doubling: each iteration doubles the horizon of
-    the Riccati recursion, from a positive final cost. Newton steps follow while the
-    residual is large. Doubling and Newton steps need only products and linear solves,
-    no eigenvalues, so they run well on accelerators and under `jax.vmap`. In a batch,
-    an equation that fails does not affect the other equations. The solution is
+    The solver uses the structure-preserving doubling algorithm, which starts from a
+    positive final cost and doubles the horizon of the Riccati recursion in each
+    iteration. If the residual is still large at the end, Newton steps reduce the
+    residual. Doubling and Newton steps need only products and linear solves, no
+    eigenvalues, so they run well on accelerators and under `jax.vmap`. In a batch, an
+    equation that fails does not affect the other equations. The solution is
     differentiable to any order, in forward and reverse mode, by the implicit function
     theorem.
 
-    If $(A, Q)$ is not detectable, the stabilising solution is not the minimal solution
-    of the equation, because a control that lets the state grow costs less.
+    If $(A, Q)$ is not detectable, a control that lets the state grow can cost less than
+    the stabilising control. The stabilising solution is then not the smallest solution
+    of the equation.
 
     **Arguments:**
 
@@ -60,12 +62,13 @@ def dare(
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. The solve is successful if the
     closed loop is stable and the relative residual, after diagonal balancing of the
-    states, is at most 1e-12 (1e-5 in single precision). A residual of up to a hundred
-    times this limit is accepted if the rounding of $X$ alone may cause it. Otherwise
-    `result` is one of `RESULTS.not_stabilisable`, `not_stabilising` (there is no
-    stabilising solution), `on_boundary` (eigenvalues on the unit circle, or so close
-    that rounding of the data removes the stabilising solution), `not_converged` and
-    `ill_posed`.
+    states, is at most 1e-12 (1e-5 in single precision). The function also accepts a
+    residual of up to a hundred times this limit if the rounding errors of $X$ alone can
+    cause such a residual. Otherwise `result` is one of `RESULTS.not_stabilisable`,
+    `not_stabilising` (there is no stabilising solution), `on_boundary`, `not_converged`
+    and `ill_posed`. The status `on_boundary` means that eigenvalues are on the unit
+    circle, or so close to it that rounding of the data removes the stabilising
+    solution.
 
     **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `Q` or
     `R` is not symmetric, or if `R` is not semidefinite. With `throw`, an error at run
@@ -115,24 +118,26 @@ def care(
 
     and the minimal cost from $x_0$ is $(E x_0)^\top X (E x_0)$.
 
-    The solver is the scaled sign iteration of the Hamiltonian matrix. If it fails, the
-    solver starts once more, with $X$ in another unit, which suits controls with a weak
-    effect. What [`delucax.riccati.dare`][] says about Newton steps, accelerators,
-    batches, derivatives and undetectable modes also holds here.
+    The solver uses the scaled sign iteration of the Hamiltonian matrix. If the sign
+    iteration fails, the solver tries again with $X$ in another unit, which is better if
+    the controls have a weak effect. The remarks in [`delucax.riccati.dare`][] about
+    Newton steps, accelerators, batches, derivatives and undetectable modes also hold
+    for this function.
 
     **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as in
     [`delucax.riccati.dare`][].
 
-    - `R`: control weight, shape `(m, m)`, symmetric, positive definite. With a singular
-        weight the optimal control may be an impulse, which no feedback gain can
-        produce.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive definite. If `R` is
+        singular, the optimal control may contain an impulse, and no feedback gain can
+        produce an impulse.
 
-    **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. The
-    criteria and the values of `result` are the same as in [`delucax.riccati.dare`][],
-    with the imaginary axis instead of the unit circle.
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`
+    instead of a spectral radius. The criteria for success and the values of `result`
+    are the same as in [`delucax.riccati.dare`][], but the boundary of stability is the
+    imaginary axis instead of the unit circle.
 
-    **Raises:** as in [`delucax.riccati.dare`][], and `ValueError` if `R` is only
-    semidefinite.
+    **Raises:** as in [`delucax.riccati.dare`][], and `ValueError` if `R` is not
+    positive definite.
 
     Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Kleinman, 1968 (Newton);
     Benner, 2001 (balancing).
@@ -181,8 +186,9 @@ def filter_dare(
 
     $X$ is the covariance of the prediction error, which is the covariance of $x_k$
     given all measurements before time $k$. The gain of the measurement update of a
-    Kalman filter is $X C^\top (V + C X C^\top)^{-1}$. The equation is the same as in
-    [`delucax.riccati.dare`][], for the transposed system.
+    Kalman filter is $X C^\top (V + C X C^\top)^{-1}$. The equation is that of
+    [`delucax.riccati.dare`][] for the transposed system, in which $A^\top$ and $C^\top$
+    take the place of $A$ and $B$.
 
     **Arguments:**
 
@@ -196,9 +202,9 @@ def filter_dare(
         false, check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. `K` has the shape `(n, p)`.
-    `closed_loop` is $A - K C$, the matrix of the prediction error. `result` is the
-    status for the transposed system: `RESULTS.not_stabilisable` means that $(A, C)$ is
-    not detectable.
+    `closed_loop` is $A - K C$, the system matrix of the prediction error. `result` is
+    the status of the Riccati equation of the transposed system, so
+    `RESULTS.not_stabilisable` means that $(A, C)$ is not detectable.
 
     **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `W` or
     `V` is not symmetric, or if `V` is not semidefinite. With `throw`, an error at run
@@ -246,8 +252,8 @@ def filter_care(
     $$\dot{\hat{x}} = A \hat{x} + K (y - C \hat{x}), \qquad
     K = (X C^\top + S) V^{-1}.$$
 
-    The equation is the same as in [`delucax.riccati.care`][], for the transposed
-    system.
+    The equation is that of [`delucax.riccati.care`][] for the transposed system, in
+    which $A^\top$ and $C^\top$ take the place of $A$ and $B$.
 
     **Arguments:** `A`, `C`, `S` and `throw`: as in [`delucax.riccati.filter_dare`][],
     with intensities instead of covariances.
@@ -256,11 +262,12 @@ def filter_care(
     - `V`: intensity of the measurement noise, shape `(p, p)`, symmetric, positive
         definite.
 
-    **Returns:** as in [`delucax.riccati.filter_dare`][], with a `spectral_abscissa`.
-    `closed_loop` is the matrix of the estimation error.
+    **Returns:** as in [`delucax.riccati.filter_dare`][], but with a `spectral_abscissa`
+    instead of a spectral radius. `closed_loop` is the system matrix of the estimation
+    error.
 
-    **Raises:** as in [`delucax.riccati.filter_dare`][], and `ValueError` if `V` is only
-    semidefinite.
+    **Raises:** as in [`delucax.riccati.filter_dare`][], and `ValueError` if `V` is not
+    positive definite.
 
     Source: Kalman and Bucy, 1961.
 

@@ -40,7 +40,7 @@ class FiniteHorizonSolution(eqx.Module):
 
     - `X`: the quadratic part of the cost-to-go, symmetric. In discrete time, `X` has
         one matrix for each step and one for the end, shape `(T+1, n, n)`. In continuous
-        time, it has one matrix for each point of the grid, shape `(N, n, n)`.
+        time, `X` has one matrix for each point of the time grid, shape `(N, n, n)`.
     - `K`: the gains, shape `(T, m, n)`, or `(N, m, n)` in continuous time.
     - `closed_loop`: the matrices $A - B K$, shape `(T, n, n)`, or `(N, n, n)` in
         continuous time.
@@ -49,7 +49,7 @@ class FiniteHorizonSolution(eqx.Module):
         zero if the problem has no linear terms, and `None` in continuous time.
     - `s`: the constant part of the cost-to-go, shape `(T+1,)`.
     - `k`: the feed-forward controls, shape `(T, m)`.
-    - `times`: the grid in continuous time, shape `(N,)`; `None` in discrete time.
+    - `times`: the time grid in continuous time, shape `(N,)`; `None` in discrete time.
 
     !!! example
 
@@ -110,12 +110,12 @@ def dre(
     $$\sum_{t=0}^{T-1} \left( x_t^\top Q x_t + 2 x_t^\top S u_t + u_t^\top R u_t
     + 2 q^\top x_t + 2 r^\top u_t \right) + x_T^\top X_f x_T + 2 q_f^\top x_T.$$
 
-    To track references $x^*$ and $u^*$, give $q = -Q x^*$, $r = -R u^*$ and
-    $q_f = -X_f x_T^*$.
+    To track references $x^*$ and $u^*$, pass $q = -Q x^*$, $r = -R u^*$ and
+    $q_f = -X_f x_T^*$ as the linear costs.
 
     All arguments except `final` and `final_q` may vary in time. The solution is
-    differentiable to any order, in forward and reverse mode. A gradient needs as much
-    memory as $X$.
+    differentiable to any order, in forward and reverse mode. The computation of a
+    gradient needs as much memory as $X$ itself.
 
     **Arguments:**
 
@@ -126,23 +126,25 @@ def dre(
         singular.
     - `S`: cross weight, shape `(n, m)`, or `(T, n, m)`; zero by default.
     - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
-    - `horizon`: the number of steps $T$; needed if no argument has a time axis.
+    - `horizon`: the number of steps $T$; required if no argument has a time axis.
     - `d`: an offset of the next state, shape `(n,)`, or `(T, n)`; zero by default.
     - `q`: linear cost of the state, shape `(n,)`, or `(T, n)`; zero by default.
     - `r`: linear cost of the control, shape `(m,)`, or `(T, m)`; zero by default.
     - `final_q`: linear cost $q_f$ of the final state, shape `(n,)`; zero by default.
     - `parallel`: if true, compute all steps in parallel, by associative scans of
         logarithmic depth. This is faster on accelerators. False by default.
-    - `throw`: raise an error if a step has no minimum (default). If false, check
-        `result`.
+    - `throw`: raise an error if the cost has no minimum at some step (default). If
+        false, check `result`.
 
     **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. If
-    $R + B^\top X_{t+1} B$ is not positive definite at a step, this step and all steps
-    before it have no minimum, and the solution is NaN at all these steps.
+    $R + B^\top X_{t+1} B$ is not positive definite at a step $t$, the cost has no
+    minimum at this step. The solution is then NaN at this step and at all steps before
+    it.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
-    weight is not symmetric, or if neither `horizon` nor a time axis gives the number of
-    steps. With `throw`, an error at run time if a step has no minimum.
+    weight is not symmetric, or if the number of steps is unknown because `horizon` is
+    not given and no argument has a time axis. With `throw`, an error at run time if the
+    cost has no minimum at some step.
 
     Source: Bertsekas, 2017; Sarkka and Garcia-Fernandez, 2023 (in parallel).
 
@@ -242,11 +244,12 @@ def cre(
     $$\int_{t_0}^{t_1} \left( x^\top Q x + 2 x^\top S u + u^\top R u \right)
     \mathrm{d}t + x(t_1)^\top X_f\, x(t_1).$$
 
-    The solution is exact except for rounding errors, even for stiff equations and
-    coarse grids. The flow of $[I; X]$ is linear, so a matrix exponential gives the flow
-    over a short interval. The solver then composes intervals and doubles their length
-    each time, in a form whose terms do not grow. The solution is differentiable to any
-    order, in forward and reverse mode.
+    The solution is exact except for rounding errors, even if the equation is stiff or
+    `times` has only a few points. The solver computes $X$ from a linear differential
+    equation, which a matrix exponential solves over a short interval. Then the solver
+    joins neighbouring intervals, which doubles the length of the intervals each time.
+    The formula that joins two intervals contains no terms that grow with time. The
+    solution is differentiable to any order, in forward and reverse mode.
 
     **Arguments:**
 
@@ -255,14 +258,14 @@ def cre(
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
     - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `times`: the times at which $X$ is computed, increasing, at least two, shape
-        `(N,)`.
+    - `times`: the times at which $X$ is computed, at least two and in increasing order,
+        shape `(N,)`.
     - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
     - `throw`: raise an error if the cost has no minimum (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. The solution is NaN at
-    the times from which the cost has no minimum.
+    each time $t$ for which the cost from $t$ to the end has no minimum.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
     weight is not symmetric, or if the times do not increase. With `throw`, an error at

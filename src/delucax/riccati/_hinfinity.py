@@ -75,20 +75,22 @@ def hinf_dare(
     $$\sum_{k=0}^\infty \left( x_k^\top Q x_k + u_k^\top R u_k \right) \le
     \gamma^2 \sum_{k=0}^\infty w_k^\top w_k.$$
 
-    The worst disturbance is $w = \gamma^{-2} D^\top X M^{-1} A x$. The control does not
-    know $w$, and $\gamma^2 I - D^\top X D$ must be positive definite.
+    The worst disturbance is $w = \gamma^{-2} D^\top X M^{-1} A x$. The control is
+    computed without knowledge of $w$. A solution exists only if
+    $\gamma^2 I - D^\top X D$ is positive definite.
 
-    The solver is doubling, followed by Newton steps. The equation also has solutions
-    that do not solve the game. Therefore the solver checks at the end that $X$ is
-    positive semidefinite, that the game has a saddle point, and that the closed loop is
-    stable. At a given `gamma` the solution is differentiable to any order, in forward
-    and reverse mode, by the implicit function theorem.
+    The solver uses the doubling algorithm and then Newton steps. The equation also has
+    solutions that do not give a controller with the level $\gamma$. Therefore the
+    solver checks at the end that $X$ is positive semidefinite, that the game has a
+    saddle point, and that the closed loop is stable. At a given `gamma` the solution is
+    differentiable to any order, in forward and reverse mode, by the implicit function
+    theorem.
 
     Without `gamma`, a search by secants and bisection finds the smallest level that a
     controller can attain. The smallest level has first derivatives only. The
-    derivatives of the other results then hold the level fixed. These derivatives may be
-    large, because the saddle point vanishes just below the level. For a design whose
-    derivatives include the change of the level, give
+    derivatives of the other results are then those at a fixed level. These derivatives
+    may be large, because there is no saddle point just below the smallest level. If the
+    derivatives should include the change of the level, pass
     `gamma=1.05 * hinf_dare(...).gamma`.
 
     **Arguments:**
@@ -98,11 +100,11 @@ def hinf_dare(
     - `D`: the input matrix of the disturbance, shape `(n, k)`; `None` for the identity.
     - `Q`: state weight, shape `(n, n)`, symmetric, positive semidefinite.
     - `R`: control weight, shape `(m, m)`, symmetric.
-    - `gamma`: the level $\gamma$, a positive number. By default the smallest level that
-        a controller can attain.
+    - `gamma`: the level $\gamma$, a positive number. By default `gamma` is the smallest
+        level that a controller can attain.
     - `tolerance`: the relative tolerance of the smallest level; by default 16 times
         machine epsilon.
-    - `throw`: raise an error unless the game is solved (default). If false, check
+    - `throw`: raise an error if the solver finds no solution (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. The matrices of the result are
@@ -111,7 +113,7 @@ def hinf_dare(
 
     **Raises:** `ValueError` if a matrix has the wrong shape or is not finite, if `Q` or
     `R` is not symmetric, if `Q` is not semidefinite, or if `gamma` or `tolerance` is
-    not positive. With `throw`, an error at run time if the game is not solved.
+    not positive. With `throw`, an error at run time if the solver finds no solution.
 
     Source: Basar and Bernhard, 1995.
 
@@ -160,22 +162,24 @@ def hinf_care(
 
     The worst disturbance is $w = \gamma^{-2} D^\top X x$.
 
-    The solver doubles the interval of the Riccati differential equation, and then takes
-    Newton steps. At the end it checks that $X$ is positive semidefinite and that the
-    closed loop is stable. The solution is differentiable to any order at a given
-    `gamma`. Without `gamma`, the smallest level has first derivatives, and the
-    derivatives of the other results hold the level fixed, as in
-    [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the smallest level, $X$ may
-    grow without bound: for a controller, take a `gamma` a few percent higher.
+    The solver solves the Riccati differential equation over an interval that doubles in
+    each iteration, and then takes Newton steps. At the end the solver checks that $X$
+    is positive semidefinite and that the closed loop is stable. The solution is
+    differentiable to any order at a given `gamma`. If you do not pass `gamma`, the
+    smallest level has first derivatives only, and the derivatives of the other results
+    are those at a fixed level, as in [`delucax.riccati.hinf_dare`][]. As `gamma`
+    approaches the smallest level, $X$ may grow without bound. To design a controller,
+    choose a `gamma` a few percent above the smallest level.
 
     **Arguments:** `A`, `B`, `D`, `Q`, `gamma` and `throw`: as in
     [`delucax.riccati.hinf_dare`][].
 
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
     - `tolerance`: the relative tolerance of the smallest level; by default 1e-6, or
-        1e-3 in float32. If $X$ grows without bound, the result is the smallest level at
-        which $X$ has enough correct digits to be accepted. This level is above the
-        exact smallest level by a relative difference of about 1e-5.
+        1e-3 in float32. If $X$ grows without bound near the smallest level, the
+        function returns the smallest level at which $X$ is still accurate enough. The
+        returned level is larger than the exact smallest level, by a relative difference
+        of about 1e-5.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. The matrices of the result are
     NaN if there is no solution.

@@ -70,13 +70,13 @@ def hinf_dre(
     $$\sum_{t=0}^{T-1} \left( x_t^\top Q x_t + u_t^\top R u_t \right)
     + x_T^\top X_f x_T \le \gamma^2 \sum_{t=0}^{T-1} w_t^\top w_t.$$
 
-    The control does not know $w$, and $\gamma^2 I - D^\top X_{t+1} D$ must be positive
-    definite at each step.
+    The control is computed without knowledge of $w$. A solution exists only if
+    $\gamma^2 I - D^\top X_{t+1} D$ is positive definite at each step.
 
     All matrices except `final` may vary in time. The solution is differentiable to any
-    order at a given `gamma`. Without `gamma`, the smallest level has first derivatives,
-    and the derivatives of the other results hold the level fixed, as in
-    [`delucax.riccati.hinf_dare`][].
+    order at a given `gamma`. If you do not pass `gamma`, the smallest level has first
+    derivatives only, and the derivatives of the other results are those at a fixed
+    level, as in [`delucax.riccati.hinf_dare`][].
 
     **Arguments:**
 
@@ -87,12 +87,12 @@ def hinf_dre(
     - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric.
     - `final`: final weight $X_f$, shape `(n, n)`, symmetric; zero by default.
-    - `horizon`: the number of steps $T$; needed if no argument has a time axis.
-    - `gamma`: the level $\gamma$, a positive number. By default the smallest level that
-        a controller can attain.
+    - `horizon`: the number of steps $T$; required if no argument has a time axis.
+    - `gamma`: the level $\gamma$, a positive number. By default `gamma` is the smallest
+        level that a controller can attain.
     - `tolerance`: the relative tolerance of the smallest level; by default 16 times
         machine epsilon.
-    - `throw`: raise an error unless the game is solved (default). If false, check
+    - `throw`: raise an error if the solver finds no solution (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. If a step has no saddle point,
@@ -100,9 +100,9 @@ def hinf_dre(
     steps before it.
 
     **Raises:** `ValueError` if an argument has the wrong shape or is not finite, if a
-    weight is not symmetric, if neither `horizon` nor a time axis gives the number of
-    steps, or if `gamma` or `tolerance` is not positive. With `throw`, an error at run
-    time if the game is not solved.
+    weight is not symmetric, if the number of steps is unknown because `horizon` is not
+    given and no argument has a time axis, or if `gamma` or `tolerance` is not positive.
+    With `throw`, an error at run time if the solver finds no solution.
 
     Source: Basar and Bernhard, 1995.
 
@@ -161,23 +161,24 @@ def hinf_cre(
     $$\int_{t_0}^{t_1} \left( x^\top Q x + u^\top R u \right) \mathrm{d}t
     + x(t_1)^\top X_f\, x(t_1) \le \gamma^2 \int_{t_0}^{t_1} w^\top w \,\mathrm{d}t.$$
 
-    The solution is exact except for rounding, as in [`delucax.riccati.cre`][]. The
-    solution is differentiable to any order at a given `gamma`. Without `gamma`, the
-    smallest level has first derivatives, and the derivatives of the other results hold
-    the level fixed, as in [`delucax.riccati.hinf_dare`][]. As `gamma` approaches the
-    smallest level, $X$ grows without bound at the first time: for a controller, take a
-    `gamma` a few percent higher.
+    The solution is exact except for rounding errors, as in [`delucax.riccati.cre`][].
+    The solution is differentiable to any order at a given `gamma`. If you do not pass
+    `gamma`, the smallest level has first derivatives only, and the derivatives of the
+    other results are those at a fixed level, as in [`delucax.riccati.hinf_dare`][]. As
+    `gamma` approaches the smallest level, $X$ grows without bound at the first time. To
+    design a controller, choose a `gamma` a few percent above the smallest level.
 
     **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as in
     [`delucax.riccati.hinf_care`][].
 
-    - `times`: the times at which $X$ is computed, increasing, at least two, shape
-        `(N,)`.
+    - `times`: the times at which $X$ is computed, at least two and in increasing order,
+        shape `(N,)`.
     - `final`: final weight $X_f$, shape `(n, n)`, symmetric, positive semidefinite;
         zero by default.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][]. The solution is NaN at the times
-    from which there is no saddle point, for example because `gamma` is too low.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. The solution is NaN at each time
+    $t$ for which the problem from $t$ to the end has no saddle point, for example
+    because `gamma` is too low.
 
     **Raises:** as in [`delucax.riccati.hinf_care`][], and `ValueError` if the times do
     not increase or `final` is not symmetric and positive semidefinite.

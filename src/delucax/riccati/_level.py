@@ -35,30 +35,33 @@ distance 0 by a polynomial in the square root of the distance."""
 class GameSolution(eqx.Module):
     r"""The saddle point of an H-infinity game, stationary or over a finite horizon.
 
-    From state $x$ at step $t$, the cost minus $\gamma^2$ times the sum of $w^\top w$ is
-    at most $x^\top X_t x$, and the worst disturbance attains this bound. Over a finite
-    horizon the matrices have a leading axis. In discrete time it runs over the $T$
-    steps, and in continuous time over the $N$ points of the grid.
+    Take the cost from state $x$ at step $t$, minus $\gamma^2$ times the sum of
+    $w^\top w$. This value is at most $x^\top X_t x$, and the worst disturbance attains
+    this bound. Over a finite horizon the matrices have a leading axis. In discrete time
+    this axis runs over the $T$ steps, and in continuous time over the $N$ points of the
+    time grid.
 
     **Attributes:**
 
     - `X`: the solution of the game equation, symmetric, shape `(n, n)`. Over a finite
-        horizon, `X` has one matrix for each step and one for the end, shape
-        `(T+1, n, n)`, or one for each point of the grid, shape `(N, n, n)`.
+        horizon in discrete time, `X` has one matrix for each step and one for the end,
+        shape `(T+1, n, n)`. In continuous time, it has one matrix for each point of the
+        time grid, shape `(N, n, n)`.
     - `K`: the gain of the control $u = -K x$, shape `(m, n)`; over a finite horizon
-        `(T, m, n)`, or `(N, m, n)`.
+        `(T, m, n)` in discrete time, or `(N, m, n)` in continuous time.
     - `L`: the gain of the worst disturbance $w = L x$, shape `(k, n)`; over a finite
-        horizon `(T, k, n)`, or `(N, k, n)`.
+        horizon `(T, k, n)` in discrete time, or `(N, k, n)` in continuous time.
     - `gamma`: the level $\gamma$ that the control attains; infinite if no level was
         found.
     - `closed_loop`: the matrix $A - B K$, shape `(n, n)`; over a finite horizon
-        `(T, n, n)`, or `(N, n, n)`.
+        `(T, n, n)` in discrete time, or `(N, n, n)` in continuous time.
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
     - `residual`: an upper bound on the relative residual: the norm of the residual of
         the equation, divided by the sum of the norms of its terms. The bound includes
-        the rounding errors of its own evaluation. `None` over a horizon.
-    - `iterations`: the number of doublings of the solver at the level `gamma`. `None`
-        over a horizon.
+        the rounding errors that the computation of the residual makes. `None` over a
+        horizon.
+    - `iterations`: the number of doubling steps that the solver takes at the level
+        `gamma`. `None` over a horizon.
     - `spectral_radius`: in discrete time, a close upper bound on the spectral radius of
         `closed_loop`. `spectral_radius` is `None` in continuous time and over a finite
         horizon.
@@ -66,7 +69,7 @@ class GameSolution(eqx.Module):
         `closed_loop`, up to rounding. `spectral_abscissa` is `None` in discrete time
         and over a finite horizon.
 
-    `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
+    `residual`, `spectral_radius` and `spectral_abscissa` are diagnostics and have no
     gradient.
 
     !!! example

@@ -41,9 +41,9 @@ class MatrixSolution(eqx.Module):
     - `X`: the solution, shape `(n, n)`, or `(n, m)` for a Sylvester equation.
     - `residual`: the norm of the residual of the equation, divided by
         $(|A| + |B|)\, |X| + |C|$, or in discrete time by $(|A|\, |B| + 1)\, |X| + |C|$.
-        The residual is the size of a relative change of the data for which $X$ would be
-        exact.
-    - `iterations`: the number of doublings, or of steps of the sign iteration.
+        This means that $X$ is the exact solution for slightly different data, and the
+        relative change of the data has the size of the residual.
+    - `iterations`: the number of steps of the solver (doubling or the sign iteration).
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
 
     `X` is differentiable. If the solve failed, the derivatives of the solution are
@@ -87,17 +87,18 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     If $A$ is stable, $X$ is the stationary covariance of $\dot{x} = A x$ driven by
     white noise of intensity $Q$.
 
-    The solver is the sign iteration if all eigenvalues of $A$ are on one side of the
-    imaginary axis. Otherwise it solves the equation as one dense linear system up to
-    $n = 16$, or to $n = 8$ for complex data, because these are solved as real matrices
-    of twice the size. If $n$ is larger, `result` is `RESULTS.not_separated`.
+    The solver uses the sign iteration if all eigenvalues of $A$ are on the same side of
+    the imaginary axis. Otherwise the solver writes the equation as one dense linear
+    system, if $n$ is at most 16. For complex data the limit is 8, because the solver
+    replaces a complex matrix by a real matrix of twice the size. If $n$ is above the
+    limit, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
     - `A`: shape `(n, n)`. `A` and `Q` may be complex. Then $^\top$ is the conjugate
         transpose.
     - `Q`: shape `(n, n)`, not necessarily symmetric.
-    - `throw`: raise an error unless the equation is solved (default). If false, check
+    - `throw`: raise an error if the solver finds no solution (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. The solve is successful if the
@@ -137,10 +138,11 @@ def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     If $A$ is stable, $X$ is the stationary covariance of $x_{k+1} = A x_k$ driven by
     white noise of covariance $Q$.
 
-    The solver is doubling if all eigenvalues of $A$ are on one side of the unit circle.
-    Otherwise it solves the equation as one dense linear system up to $n = 16$, or to
-    $n = 8$ for complex data, because these are solved as real matrices of twice the
-    size. If $n$ is larger, `result` is `RESULTS.not_separated`.
+    The solver uses the doubling algorithm if all eigenvalues of $A$ are inside the unit
+    circle, or all are outside. Otherwise the solver writes the equation as one dense
+    linear system, if $n$ is at most 16. For complex data the limit is 8, because the
+    solver replaces a complex matrix by a real matrix of twice the size. If $n$ is above
+    the limit, `result` is `RESULTS.not_separated`.
 
     **Arguments:** `A`, `Q` and `throw`: as in [`delucax.riccati.lyap`][].
 
@@ -177,18 +179,19 @@ def sylvester(
 
     $$A X + X B = C$$
 
-    The solver is a shift followed by the sign iteration if a vertical line
-    $\mathrm{Re}\, z = s$ separates the eigenvalues of $A$ from the eigenvalues of $-B$.
-    Otherwise it solves the equation as one dense linear system up to 256 unknowns, or
-    to 64 for complex data, because these are solved as real matrices of twice the size.
-    For more unknowns, `result` is `RESULTS.not_separated`.
+    If a vertical line $\mathrm{Re}\, z = s$ separates the eigenvalues of $A$ from the
+    eigenvalues of $-B$, the solver shifts the matrices by $s$ and then uses the sign
+    iteration. Otherwise the solver writes the equation as one dense linear system, if
+    $X$ has at most 256 entries. For complex data the limit is 64 entries, because the
+    solver replaces a complex matrix by a real matrix of twice the size. If $X$ has more
+    entries, `result` is `RESULTS.not_separated`.
 
     **Arguments:**
 
     - `A`: shape `(n, n)`. All matrices may be complex.
     - `B`: shape `(m, m)`.
     - `C`: shape `(n, m)`.
-    - `throw`: raise an error unless the equation is solved (default). If false, check
+    - `throw`: raise an error if the solver finds no solution (default). If false, check
         `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. The solve is successful if the
@@ -226,11 +229,12 @@ def dsylvester(
 
     $$A X B - X + C = 0$$
 
-    The solver is doubling if the product of the spectral radii of $A$ and $B$ is below
-    one, and a Cayley transform if both spectra are outside the unit circle. Otherwise
-    it solves the equation as one dense linear system up to 256 unknowns, or to 64 for
-    complex data, because these are solved as real matrices of twice the size. For more
-    unknowns, `result` is `RESULTS.not_separated`.
+    The solver uses the doubling algorithm if the product of the spectral radii of $A$
+    and $B$ is below one. If all eigenvalues of $A$ and $B$ are outside the unit circle,
+    the solver uses a Cayley transform. Otherwise the solver writes the equation as one
+    dense linear system, if $X$ has at most 256 entries. For complex data the limit is
+    64 entries, because the solver replaces a complex matrix by a real matrix of twice
+    the size. If $X$ has more entries, `result` is `RESULTS.not_separated`.
 
     **Arguments:** `A`, `B`, `C` and `throw`: as in [`delucax.riccati.sylvester`][].
 

@@ -67,20 +67,20 @@ class RiccatiSolution(eqx.Module):
         the correction $K (y - C \hat{x})$, shape `(n, p)`.
     - `residual`: an upper bound on the relative residual: the norm of the residual of
         the equation, divided by the sum of the norms of its terms. The bound includes
-        the rounding of its own evaluation.
+        the rounding errors that the computation of the residual makes.
     - `closed_loop`: the matrix of the closed loop, shape `(n, n)`: $A - B K$, or
-        $E^{-1} (A - B K)$; for a filter $A - K C$.
-    - `spectral_radius`: in discrete time, a close upper bound on the spectral radius of
-        `closed_loop`, to about eight digits. The loop is stable if the spectral radius
-        is below 1. `None` in continuous time.
-    - `iterations`: the number of doublings, or of steps of the sign iteration.
+        $E^{-1} (A - B K)$ with a descriptor matrix $E$; for a filter $A - K C$.
+    - `spectral_radius`: in discrete time, an upper bound on the spectral radius of
+        `closed_loop`, accurate to about eight digits. The loop is stable if the
+        spectral radius is below 1. `None` in continuous time.
+    - `iterations`: the number of steps of the solver (doubling or the sign iteration).
     - `result`: success, or the reason for a failure; one of `delucax.RESULTS`.
     - `spectral_abscissa`: in continuous time, a close upper bound on the largest real
         part of an eigenvalue of `closed_loop`. The loop is stable if the spectral
         abscissa is below 0. `None` in discrete time.
 
     `X`, `K` and `closed_loop` are differentiable. `residual`, `spectral_radius` and
-    `spectral_abscissa` are measurements and have no gradient. If the solve failed and
+    `spectral_abscissa` are diagnostics and have no gradient. If the solve failed and
     the loop is not stable, the derivatives are zero, so that a failed equation does not
     affect the gradient of a batch.
 

@@ -77,7 +77,7 @@ def rollout(
 
     At each step $k$, at the time $t_k = k\, \Delta t$:
 
-    1. The controller acts on the observation $y_k$.
+    1. The controller computes a control from the observation $y_k$.
     2. The environment clips the control, charges the stage cost $c(t_k, x_k, u_k)$ and
         steps to $x_{k+1}$.
     3. `controller.applied(u, cost, state)` gets the clipped control and its cost.
@@ -85,10 +85,10 @@ def rollout(
     The final cost is charged once: at the last state, or at the first state that
     terminates the episode. After termination, the state is held and costs nothing.
 
-    `rollout` is already compiled: call it directly, without `jax.jit`. A call with
-    another random key, first state or parameter does not compile it again. For a batch,
-    use `jax.vmap`. You can differentiate with respect to every array leaf of the
-    arguments.
+    `rollout` is already compiled: call it directly, without `jax.jit`. If you call
+    `rollout` with another random key, first state or value of a parameter, it does not
+    compile again. For a batch, use `jax.vmap`. You can differentiate with respect to
+    every array leaf of the arguments.
 
     **Arguments:**
 
@@ -101,26 +101,26 @@ def rollout(
     - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default. For
         a system with a diffusion, pass Brownian increments: standard normal numbers
         times `sqrt(dt / substeps)`.
-    - `keep`: the names of the arrays that the trajectory stores. By default all of
-        `"states"`, `"observations"`, `"controls"`, `"disturbances"`, `"costs"`,
-        `"terminated"`, `"incidents"` and `"controller_state"`. For a plant with events
-        you may add `"events"`; the events need memory for `2 * max_events` states per
-        step.
+    - `keep`: the names of the arrays that the trajectory stores. By default the
+        trajectory stores `"states"`, `"observations"`, `"controls"`, `"disturbances"`,
+        `"costs"`, `"terminated"`, `"incidents"` and `"controller_state"`. For a plant
+        with events you may add `"events"`; the events need memory for `2 * max_events`
+        states per step.
     - `checkpoint`: what the gradient stores. `"step"` (default) stores the state at
         each step, and computes each step a second time in the backward pass. `"sqrt"`
-        stores only about the square root of that number of states; use it for long
+        stores the states of only about $\sqrt{T}$ of $T$ steps; use it for long
         horizons. `None` stores all intermediate values and computes no step a second
         time.
-    - `gradient_decay`: a factor on the gradient that passes back through the state at
-        each step. 1 (default) gives the true gradient. 0.9 damps exploding gradients
-        over a long, unstable horizon. To let the gradient decay with the time constant
-        `tau`, whatever `dt` is, use `exp(-dt / tau)`.
-    - `truncate`: cut the gradient before every `truncate`-th step, in the state and in
-        the memory of the controller (truncated back-propagation). By default the
-        gradient is never cut.
-    - `throw`: whether to raise if a step fails, the states become NaN or infinite, or a
-        learning controller refuses an update; true by default. With `throw=False`,
-        check `trajectory.result` yourself.
+    - `gradient_decay`: a factor by which the gradient is multiplied at each step, when
+        it passes back through the state. 1 (default) gives the true gradient. 0.9 damps
+        exploding gradients over a long, unstable horizon. If the gradient should decay
+        with a time constant `tau`, for any `dt`, use `exp(-dt / tau)`.
+    - `truncate`: a number of steps for truncated back-propagation. Before every
+        `truncate`-th step, the gradient through the state and through the memory of the
+        controller is cut. By default the gradient is never cut.
+    - `throw`: whether to raise an error if a step fails, the states become NaN or
+        infinite, or a learning controller refuses an update; true by default. With
+        `throw=False`, check `trajectory.result` yourself.
 
     **Returns:** a [`delucax.Trajectory`][]. The `result` of the trajectory is the first
     of these that applies:
@@ -133,8 +133,8 @@ def rollout(
     - success.
 
     `throw` does not raise an error for `plan_failed`, `estimate_failed` and
-    `filter_failed`, because the controller handles them (see `throw=` of
-    [`delucax.controllers.MPC`][]).
+    `filter_failed`, because the controller handles these failures itself (see `throw=`
+    of [`delucax.controllers.MPC`][]).
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape. An error is
     raised at run time if the rollout fails and `throw` is true.

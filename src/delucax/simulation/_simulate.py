@@ -76,18 +76,21 @@ def simulate(
     solver.
 
     `simulate` integrates $\dot x = f(t, x, u, w)$ from `t0` to `t1` by a single call of
-    `diffrax.diffeqsolve`, so that `adjoint` applies to the gradient of the whole
-    horizon. `simulate` is already compiled: call it directly, without `jax.jit`.
+    `diffrax.diffeqsolve`, so `adjoint` determines how the gradient over the whole
+    horizon is computed. `simulate` is already compiled: call it directly, without
+    `jax.jit`.
 
     The horizon is cut into $T$ equal intervals. With `hold="zero"`, the control is held
-    constant over each interval and switches between intervals. The solve is exact at
-    the switches: no step crosses a switch, all stages of a step use the control of the
-    same interval, and a step that starts at a switch uses no slope from before.
+    constant over each interval and switches between intervals. The switches cause no
+    integration error, because no step crosses a switch, and all stages of a step use
+    the control of the same interval. A step that starts at a switch does not reuse a
+    slope from before the switch.
 
-    A large `t0` costs no precision, because the solve counts its time in intervals from
-    `t0`. In single precision, switches are rounded to about `1e-7 (t1 - t0)`, however
-    large `t0` is. A step-size controller gets the time since `t0`. A vector field whose
-    control is not held is corrected for the rounding of `t0 + s`, as in
+    A large `t0` does not reduce the precision, because the solver measures time from
+    `t0`, in intervals. In single precision, the times of the switches have rounding
+    errors of about `1e-7 (t1 - t0)`, even if `t0` is large. A step-size controller gets
+    times that are measured from `t0`. If the control is not held, the vector field is
+    corrected for the rounding error of the time `t0 + s`, as in
     [`delucax.Discretized`][]. Held controllers get the rounded time.
 
     `simulate` computes no costs: `costs` of the trajectory is `None`, and `final_cost`
@@ -100,9 +103,10 @@ def simulate(
 
         - an array of controls, shape `(T, m)`;
         - a function of time to a control, shape `(m,)`;
-        - a controller. A held controller reads the sensor at each switch. Then its
-            method `applied` is called with its own control and a cost of zero, so
-            `simulate` refuses a controller that learns from costs.
+        - a controller. If the control is held, the controller reads the sensor at each
+            switch. Then `simulate` calls the method `applied` of the controller with
+            this control and a cost of zero. Therefore `simulate` refuses a controller
+            that learns from costs.
 
     - `t0`, `t1`: start and end of the horizon, in units of time, with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
@@ -110,37 +114,38 @@ def simulate(
         `None` for a control that is a function of time, or for continuous feedback
         $u = \pi(t, h(t, x))$ by a controller that has no state.
     - `dt`: the length of an interval, in units of time; `t1 - t0` must be a whole
-        multiple of `dt`. By default it is `(t1 - t0) / T` if `controller_or_controls`
+        multiple of `dt`. By default `dt` is `(t1 - t0) / T` if `controller_or_controls`
         or `w` is an array; otherwise `dt` is required.
-    - `w`: disturbances that enter the vector field, shape `(T, k)`, held over the
-        intervals with any `hold`; zero by default.
+    - `w`: disturbances that enter the vector field, shape `(T, k)`, held constant over
+        each interval, whatever `hold` is; zero by default.
     - `solver`: a Diffrax solver; `diffrax.Tsit5()` by default.
     - `stepsize_controller`: a step-size controller of Diffrax, such as
         `diffrax.PIDController(rtol=1e-6, atol=1e-8)`; `None` (default) for fixed steps.
     - `substeps`: the number of fixed steps per interval, 1 by default.
     - `adjoint`: `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()` or
-        `diffrax.BacksolveAdjoint()`. Of these, `diffrax.BacksolveAdjoint()` needs a
-        `stepsize_controller`, and does not work with a held controller, because the
-        memory of a controller cannot run backwards. With `ts`,
+        `diffrax.BacksolveAdjoint()`. `diffrax.BacksolveAdjoint()` needs a
+        `stepsize_controller`. It does not work with a controller whose control is held,
+        because the memory of a controller cannot run backwards in time. With `ts`,
         `diffrax.BacksolveAdjoint()` raises an error if you ask for a gradient with
         respect to `t0`, `t1` or `ts`.
     - `max_steps`: the largest number of adaptive steps over the horizon; by default
-        4096, or 64 per interval if that is more.
-    - `ts`: the times to save at, shape `(S + 1,)`, increasing and between `t0` and
-        `t1`. By default the times are the `T + 1` ends of the intervals, where the
-        states are not interpolated.
+        4096, or 64 times the number of intervals if this is larger.
+    - `ts`: the times at which the trajectory is saved, shape `(S + 1,)`, increasing and
+        between `t0` and `t1`. By default these times are the `T + 1` ends of the
+        intervals. There the states are not interpolated.
     - `key`: a random key for the controller's `init`; none by default.
     - `progress_meter`: a progress meter of Diffrax, such as
         `diffrax.TqdmProgressMeter()`; none by default.
-    - `throw`: whether to raise if the solve fails or the state becomes NaN or infinite;
-        true by default. With `throw=False`, check `trajectory.result` yourself.
+    - `throw`: whether to raise an error if the solve fails or the state becomes NaN or
+        infinite; true by default. With `throw=False`, check `trajectory.result`
+        yourself.
 
-    **Returns:** a [`delucax.Trajectory`][] at the saved times. The `controls` and
-    `disturbances` of the trajectory are the values just before each saved time, without
-    the first time. With `hold=None`, the `controls` are the values just after each
-    saved time, without the last time. The `observations` are the readings of the sensor
-    at each saved time, without the last time.
+    **Returns:** a [`delucax.Trajectory`][] at the saved times. For each saved time
+    except the first, `controls` and `disturbances` hold the values just before this
+    time. With `hold=None`, `controls` instead holds the value just after each saved
+    time except the last. For each saved time except the last, `observations` holds the
+    reading of the sensor at this time.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
     adjoint that does not fit, on a controller that learns from costs, and on more than

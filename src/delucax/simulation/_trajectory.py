@@ -30,7 +30,7 @@ class Trajectory(eqx.Module):
 
     **Attributes:**
 
-    - `times`: shape `(T + 1,)`, in units of time.
+    - `times`: the times of the states, shape `(T + 1,)`, in units of time.
     - `states`: shape `(T + 1, n)`.
     - `observations`: the observations that the controller got, shape `(T, p)`.
     - `controls`: the controls that were applied, after clipping to the bounds, shape
@@ -45,15 +45,15 @@ class Trajectory(eqx.Module):
     - `ended`: whether the episode terminated within the T steps.
     - `result`: the first failure, or success if nothing failed; one of
         `delucax.RESULTS`.
-    - `incidents`: a dictionary from the name of each kind of incident to booleans of
-        shape `(T,)`, which are true at the steps at which the incident happened. The
+    - `incidents`: a dictionary from the name of each kind of incident to an array of
+        booleans, shape `(T,)`. Entry k is true if the incident happened at step k. The
         kinds are
 
         - `"clipped_control"`: the bounds of the environment changed the control.
         - `"failed_plan"`: a plan of [`delucax.controllers.MPC`][] did not succeed.
         - `"failed_estimate"`: an estimator did not succeed.
         - `"failed_filter"`: a [`delucax.controllers.SafetyFilter`][] found no control
-            that keeps its barriers.
+            that satisfies its barrier conditions.
         - `"refused_update"`: the update of a learning controller was not finite and was
             left out.
         - other incidents that a controller counts with [`delucax.controllers.Tally`][].
@@ -63,10 +63,10 @@ class Trajectory(eqx.Module):
     - `steps`, `disturbance_size`: T and k, ints.
     - `keep`: the names of the arrays that were kept.
     - `recorded_times`, `recorded_observations`, `recorded_disturbances`,
-        `recorded_terminated`, `recorded_events`: the stored arrays behind `times`,
-        `observations`, `disturbances`, `terminated` and `events`, or `None` if they
-        follow from other fields. Read `times`, `observations` and so on instead of
-        these.
+        `recorded_terminated`, `recorded_events`: the arrays that are stored for
+        `times`, `observations`, `disturbances`, `terminated` and `events`. One of them
+        is `None` if it can be computed from other fields. In your code, use `times`,
+        `observations` and so on instead of these arrays.
     - `state_names`, `control_names`, `state_units`, `control_units`, `event_names`:
         tuples of strings. `time_unit`: a string.
 

@@ -41,18 +41,19 @@ def demo(
     Deluca paper with fewer seeds and steps.
 
     The first part designs an LQR about the upright position, and trains MLPs by
-    differentiating the rollout. Then it runs zero control, the LQR and the first MLP
-    from the same 100 initial states, without and with a shock in the middle of the run.
-    The first part writes a table, the MLP, a figure and an animation. The second part
-    calls [`delucax.studies.reproduce`][] with `small=True` for all studies except the
-    ventilator, and writes to the folder `paper` inside `out`.
+    differentiating the rollout. Then it simulates zero control, the LQR and the first
+    MLP from the same 100 initial states. Each controller runs without a shock, and with
+    a shock in the middle of the run. The first part writes a table, the MLP, a figure
+    and an animation. The second part calls [`delucax.studies.reproduce`][] with
+    `small=True` for all studies except the ventilator, and writes to the folder `paper`
+    inside `out`.
 
     **Arguments:**
 
     - `out`: the folder to write to, `"demo"` by default.
     - `seeds`: the number of MLPs to train, 2 by default. The first one is compared.
     - `steps`: the number of optimiser steps for each MLP, 800 by default.
-    - `say`: a function that gets each line of text; `print` by default.
+    - `say`: a function that is called with each line of the output; `print` by default.
 
     **Returns:** a `pandas.DataFrame` with the results for the pendulum.
 

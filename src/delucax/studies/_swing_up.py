@@ -27,18 +27,18 @@ def train_swing_up(
     steps: int = STEPS,
     progress: bool = True,
 ) -> Fitted:
-    """Train an MLP that swings up a pendulum and holds it, through the ODE.
+    """Train an MLP to swing up a pendulum and balance it, by differentiating the ODE.
 
     The gradient through a long swing explodes at the unstable upright position, so
     plain gradient descent ends with a pendulum that spins. The gradient is therefore
-    damped by 0.92 per step back in time. The network has one hidden layer of width 32.
-    Each step of Adam, with cosine decay from 0.01, uses 128 new starts and a horizon of
-    100 steps.
+    multiplied by 0.92 at each step back in time. The network has one hidden layer of
+    width 32. The optimiser is Adam, with a learning rate that decays from 0.01 along a
+    cosine. Each step of Adam uses 128 new initial states and a horizon of 100 steps.
 
     **Arguments:**
 
     - `environment`: a pendulum; [`delucax.environments.pendulum`][] by default.
-    - `key`: a random key, for the first weights and the starts.
+    - `key`: a random key, for the initial weights and the initial states.
     - `steps`: the number of optimiser steps, 800 by default.
     - `progress`: whether to show a progress bar, `True` by default.
 
@@ -75,15 +75,15 @@ def holds_upright(
 ) -> Bool[Array, "..."]:
     r"""Whether the pendulum stayed upright to the end.
 
-    A pendulum counts as upright if $|\theta| < \mathrm{tolerance}$ over the last
-    `seconds`, where $\theta$ is the angle from upright.
+    A pendulum counts as upright if $|\theta| < \mathrm{tolerance}$ during the last
+    `seconds` seconds of the trajectory, where $\theta$ is the angle from upright.
 
     **Arguments:**
 
     - `trajectory`: a trajectory of a pendulum, or a batch of them.
     - `seconds`: the length of the final part of the trajectory that is checked [s], 5
         by default.
-    - `tolerance`: the largest angle [rad], 0.2 by default.
+    - `tolerance`: the largest angle from upright that is allowed [rad], 0.2 by default.
 
     **Returns:** a boolean for each trajectory.
 

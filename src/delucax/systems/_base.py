@@ -22,8 +22,9 @@ class AbstractPlant(eqx.Module):
     """The common base of systems and dynamics: the names and sizes of a plant, its
     sensor and its equilibrium.
 
-    You rarely subclass `AbstractPlant` directly. [`delucax.AbstractSystem`][] adds a
-    vector field, [`delucax.AbstractDynamics`][] adds a step.
+    You rarely subclass `AbstractPlant` directly. Its subclass
+    [`delucax.AbstractSystem`][] adds a vector field, and its subclass
+    [`delucax.AbstractDynamics`][] adds a step in discrete time.
 
     !!! example
 
@@ -176,18 +177,18 @@ class AbstractSystem(AbstractPlant):
     r"""A system in continuous time, $\dot x = f(t, x, u, w)$.
 
     To define your own system, subclass `AbstractSystem`, name the states and controls,
-    and write `vector_field`. States, controls and disturbances are vectors. The sizes
-    of these vectors follow from the names.
+    and write `vector_field`. States, controls and disturbances are vectors. The names
+    determine the sizes of these vectors.
 
     **Class attributes** (or properties, if they depend on a field):
 
     - `state_names`, `control_names`: tuples of strings.
     - `angle_names`: the names of the states that are angles; none by default. The
-        method `difference` wraps the differences of these states.
-    - `disturbance_names`: a tuple of strings, empty by default. With names, the
-        disturbance `w` enters the vector field and is held constant over a step.
-        Without names, `w` has the size of the state, and the discrete-time dynamics add
-        it to the next state.
+        method `difference` wraps the differences of these angles to +-pi.
+    - `disturbance_names`: a tuple of strings, empty by default. If you name
+        disturbances, the disturbance `w` is an input of the vector field and is held
+        constant over a step. If you name none, `w` has the size of the state, and the
+        discrete-time dynamics add `w` to the next state.
     - `state_units`, `control_units`: tuples of strings, empty by default.
     - `time_unit`: a string, `"s"` by default.
 

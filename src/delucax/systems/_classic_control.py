@@ -88,8 +88,8 @@ class CartPole(AbstractSystem):
 
     Here $p$ is the position, $\theta$ the angle, $F$ the force and $M$ the mass of cart
     and pole together. The state is (position [m], velocity [m/s], angle [rad], spin
-    [rad/s]), the control is (force [N]). The pole is upright at angle 0, and a positive
-    angle leans towards positive positions. The vector field is smooth.
+    [rad/s]), the control is (force [N]). At angle 0 the pole is upright. At a positive
+    angle, the pole leans towards positive positions. The vector field is smooth.
 
     **Arguments:**
 
@@ -169,9 +169,10 @@ class MountainCar(AbstractSystem):
 
     Here $p$ is the position and $u$ the push. The state is (position, velocity), the
     control is (push). The unit of time is one step, because Gym gives its constants per
-    step: Gym's arithmetic is semi-implicit Euler with `dt=1`. Gravity acts along the
-    position, not along the track. The vector field is smooth, and has no walls and no
-    speed limit. `equilibrium` is the bottom of the valley, $p = -\pi/6$.
+    step. Gym integrates by the semi-implicit Euler method with `dt=1`. In this model,
+    gravity acts along the position $p$, and not along the slope of the track. The
+    vector field is smooth, and has no walls and no speed limit. `equilibrium` is the
+    bottom of the valley, $p = -\pi/6$.
 
     **Arguments:**
 
@@ -251,9 +252,9 @@ class Acrobot(AbstractSystem):
 
     The state is (angle_1 [rad], angle_2 [rad], velocity_1 [rad/s], velocity_2 [rad/s]),
     the control is (torque [N m]). The disturbance (push [N m]) is added to the torque.
-    The first link hangs down at `angle_1 = 0`, and `angle_2` is measured from the line
-    of the first link. The vector field is smooth. `equilibrium` is the upright
-    position, `angle_1 = pi`.
+    At `angle_1 = 0`, the first link hangs down. The angle `angle_2` is measured from
+    the direction of the first link. The vector field is smooth. `equilibrium` is the
+    upright position, `angle_1 = pi`.
 
     **Arguments:**
 
@@ -266,8 +267,8 @@ class Acrobot(AbstractSystem):
         mass [kg m^2], 1 by default.
     - `gravity`: $g$ [m/s^2], 9.8 by default.
     - `form`: `"book"` (default) for the equations of motion; or `"nips"` for the
-        equations printed in the paper. The equations in the paper lack the term in
-        $\dot\theta_1^2$ and do not conserve energy.
+        equations that are printed in the paper of 1996. The equations in this paper
+        lack the term in $\dot\theta_1^2$ and do not conserve energy.
 
     **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
     not finite, or `form` is neither `"book"` nor `"nips"`.

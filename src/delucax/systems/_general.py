@@ -34,7 +34,7 @@ from ._base import AbstractSystem
 
 
 class LinearSystem(AbstractSystem):
-    r"""A linear system, or an affine one about an operating point.
+    r"""A linear system, or an affine system about an operating point.
 
     $$\dot x = \dot x_\mathrm{ref} + A (x - x_\mathrm{ref}) + B (u - u_\mathrm{ref})
     + E w, \qquad y = C x$$
@@ -44,9 +44,9 @@ class LinearSystem(AbstractSystem):
     - `A`: shape `(n, n)`.
     - `B`: shape `(n, m)`.
     - `C`: shape `(p, n)`; the identity by default.
-    - `E`: shape `(n, k)`, by which the disturbance `w` enters the vector field. By
-        default `w` has the size of the state, and the discrete-time dynamics add it to
-        the next state.
+    - `E`: the matrix by which the disturbance `w` enters the vector field, shape
+        `(n, k)`. If you do not give `E`, `w` has the size of the state, and the
+        discrete-time dynamics add `w` to the next state.
     - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`; zero by default.
     - `dx_ref`: $\dot x_\mathrm{ref}$, the vector field at the operating point, shape
         `(n,)`; zero by default.
@@ -191,7 +191,8 @@ def system(
 
     **Returns:** a [`delucax.systems.FunctionSystem`][].
 
-    **Raises:** `ValueError` if names are neither a number nor strings.
+    **Raises:** `ValueError` if `states`, `controls` or `disturbances` is neither a
+    number nor strings.
 
     !!! example
 
@@ -224,8 +225,9 @@ class NeuralSystem(AbstractSystem):
 
     $$\dot x = \mathrm{network}(x, u)$$
 
-    The network is fully connected and as smooth as its activation. The network is
-    trainable: [`delucax.training.fit`][] changes the network and nothing else.
+    The network is fully connected. It can be differentiated as often as its activation.
+    The network is trainable: [`delucax.training.fit`][] changes the network and nothing
+    else.
 
     **Arguments:**
 

@@ -20,8 +20,8 @@ class BouncingBall(AbstractHybridSystem):
     the control is (force [N]).
 
     If bounces lose energy, infinitely many bounces happen in finite time. The control
-    interval in which the bounces accumulate ends with `RESULTS.too_many_events`, with
-    the ball on the ground.
+    interval that would contain infinitely many bounces ends with the status
+    `RESULTS.too_many_events`, and the ball is on the ground then.
 
     **Arguments:**
 
@@ -77,10 +77,10 @@ class RimlessWheel(AbstractHybridSystem):
 
     $$\ddot\theta = \frac{g}{l} \sin\theta + \frac{\tau}{m l^2}$$
 
-    Here $\theta$ is the angle of the standing spoke from the vertical, positive
-    downhill, and $\tau$ the torque. The next spoke hits the ground at
-    $\theta = \gamma + \alpha$. Angular momentum about the new foot is conserved, so
-    that
+    Here $\theta$ is the angle of the spoke that stands on the ground, measured from the
+    vertical and positive downhill, and $\tau$ is the torque. The next spoke hits the
+    ground at $\theta = \gamma + \alpha$. Angular momentum about the new foot is
+    conserved, so that
 
     $$\theta^+ = \theta^- - 2 \alpha, \qquad
     \dot\theta^+ = \cos(2 \alpha)\, \dot\theta^-$$
@@ -88,12 +88,14 @@ class RimlessWheel(AbstractHybridSystem):
     When the wheel rolls back, the spoke behind hits the ground in the same way. The
     state is (angle [rad], velocity [rad/s]), the control is (torque [N m]).
 
-    Steady rolling is a limit cycle with the multiplier $\cos^2(2 \alpha)$.
+    Steady rolling is a limit cycle: each step multiplies a small deviation from the
+    cycle by $\cos^2(2 \alpha)$.
 
     **Arguments:**
 
     - `length`: $l$, the length of a spoke [m], 1 by default.
-    - `mass`: $m$, the mass of the wheel, all at the hub [kg], 1 by default.
+    - `mass`: $m$, the mass of the wheel, which is concentrated at the hub [kg], 1 by
+        default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
     - `half`: $\alpha$, half the angle between spokes [rad], pi / 8 by default.
     - `slope`: $\gamma$, the slope of the ground [rad], 0.08 by default.

@@ -26,31 +26,33 @@ class AbstractHybridSystem(AbstractSystem):
     systems too.
 
     Think of a guard as a distance, such as the height of a ball: the guard is normally
-    positive, and the event fires when the guard falls to zero. If the guard is zero and
-    the state moves beyond it, the event fires at once. If the state is already beyond
-    an enabled guard at the start of an interval or after a reset, the model is wrong,
-    and the status is `RESULTS.beyond_guard`. An urgent event fires instead.
+    positive, and the event fires when the guard falls to zero. If the guard is exactly
+    zero and then becomes negative, the event fires at once. If the guard of an enabled
+    event is already negative at the start of an interval or just after a reset, the
+    model is wrong, and the simulation returns the status `RESULTS.beyond_guard`. An
+    urgent event fires instead.
 
     **Class attributes** (or properties), besides those of [`delucax.AbstractSystem`][]:
 
     - `event_names`: a tuple of strings.
     - `event_directions`: for each event, -1 if it fires when its guard falls through
-        zero (the default), +1 if it fires when the guard rises, or 0 for both. With the
-        direction 0, the state may be on either side of the guard.
-    - `urgent_events`: the events that also fire when the state is already beyond their
-        guard at the start of an interval or after a reset; none by default. List an
+        zero (the default), +1 if it fires when the guard rises, or 0 for both. If the
+        direction is 0, the guard may be positive or negative between events.
+    - `urgent_events`: the events that also fire if their guard already has the wrong
+        sign at the start of an interval or just after a reset; none by default. List an
         event in `urgent_events` if its guard depends on the control, because the
         control may jump between intervals.
     - `crossing_events`: the events that only report that their guard crosses zero, such
-        as the tick of a clock or the top of a flight. They need a direction. The state
-        may be on either side of the guard, before and after the reset. None by default.
+        as the tick of a clock or the top of a flight. They need a direction. The guard
+        of such an event may be positive or negative, before and after the reset. None
+        by default.
     - `mode_names`: the names of discrete modes, none by default. With modes, one of the
         states is named `"mode"` and holds 0.0, 1.0, ...; resets change it, and its
         derivative is zero. Read it with `mode`.
 
-    **Raises:** `ValueError` at construction if the names, directions or modes do not
-    fit together, if there is not one guard and one reset for each event, or if the
-    system has a diffusion.
+    **Raises:** `ValueError` at construction if the lists of names, directions and modes
+    contradict each other, if there is not one guard and one reset for each event, or if
+    the system has a diffusion.
 
     !!! example
 

@@ -24,9 +24,10 @@ class CSTR(AbstractSystem):
     The state is (concentration [mol/l], temperature [K]), the control is (coolant [K]),
     the temperature of the jacket. Time is in minutes.
 
-    With the default constants, half the feed's concentration is an unstable
-    equilibrium: if the tank gets a little warmer, it reacts faster and gets warmer
-    still. The poles at this equilibrium are 2.83 and -0.45 per minute.
+    With the default constants, the reactor has an unstable equilibrium at half the
+    concentration of the feed. If the tank gets a little warmer there, the reaction
+    becomes faster and heats the tank even more. The poles at this equilibrium are 2.83
+    and -0.45 per minute.
 
     **Arguments:**
 
@@ -39,10 +40,10 @@ class CSTR(AbstractSystem):
         default.
     - `activation`: $E$, the activation energy divided by the gas constant [K], 8750 by
         default.
-    - `heat`: $h$, the temperature rise per concentration that reacts,
+    - `heat`: $h$, the rise of the temperature for each mol/l that reacts,
         $-\Delta H / (\rho c_p)$ [K l/mol], 209.2 by default.
-    - `cooling`: $k$, the heat conducted to the jacket divided by the heat capacity of
-        the tank [1/min], 2.092 by default.
+    - `cooling`: $k$, the heat that flows to the jacket per kelvin of temperature
+        difference, divided by the heat capacity of the tank [1/min], 2.092 by default.
 
     **Raises:** `ValueError` if a number is not positive.
 
@@ -113,8 +114,8 @@ class CSTR(AbstractSystem):
 
 
 class TwoTank(AbstractSystem):
-    r"""Two tanks in a cascade. A pump fills the upper tank, which drains into the lower
-    one, which drains away.
+    r"""Two tanks in a cascade. A pump fills the upper tank. The upper tank drains into
+    the lower tank, which has an outlet too.
 
     $$A_1 \dot h_1 = q - a_1 \sqrt{2 g}\, r(h_1), \qquad
     A_2 \dot h_2 = a_1 \sqrt{2 g}\, r(h_1) - a_2 \sqrt{2 g}\, r(h_2), \qquad
@@ -123,10 +124,11 @@ class TwoTank(AbstractSystem):
     The state is the two levels (upper [cm], lower [cm]), the control is (flow
     [cm^3/s]).
 
-    Torricelli's law has $r(h) = \sqrt h$, which has an infinite slope at an empty tank
-    and no value below. The $r$ used here is odd and smooth everywhere. The relative
-    error of this $r$ is about $(s / h)^2 / 4$: with the default $s$, 2.5e-5 at a level
-    of 1 cm. With a smaller $s$, the equations of an empty tank are stiffer.
+    Torricelli's law is $r(h) = \sqrt h$, whose slope is infinite at $h = 0$ and which
+    is not defined for $h < 0$. The function $r$ of this model is odd and smooth for all
+    $h$. Its relative difference from $\sqrt h$ is about $(s / h)^2 / 4$, which is
+    2.5e-5 at a level of 1 cm with the default $s$. A smaller $s$ makes the equations
+    stiffer when a tank is nearly empty.
 
     **Arguments:**
 
@@ -197,7 +199,7 @@ class TwoTank(AbstractSystem):
 
 class PermanentMagnetMotor(AbstractSystem):
     r"""A synchronous motor with permanent magnets, in coordinates that turn with the
-    rotor: the d axis along the magnets, the q axis across them.
+    rotor: the d axis points along the magnets, and the q axis across them.
 
     $$\begin{aligned}
     L_d \dot i_d &= v_d - R i_d + p \omega L_q i_q \\

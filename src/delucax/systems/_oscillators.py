@@ -67,9 +67,9 @@ class MassSpringDamper(AbstractSystem):
     $$m_i \ddot q_i = T_{i+1} - T_i, \qquad
     T_i = k_i (q_i - q_{i-1}) + c_i (v_i - v_{i-1})$$
 
-    The wall is $q_0 = v_0 = 0$, and $T_{n+1}$ is the force. The state is the positions
-    [m], measured from the positions at rest, followed by the velocities [m/s]. The
-    control is (force [N]).
+    The wall does not move, so $q_0 = v_0 = 0$, and $T_{n+1}$ is the force on the last
+    mass. The state holds first the positions [m], measured from the positions at rest,
+    and then the velocities [m/s]. The control is (force [N]).
 
     **Arguments:**
 
@@ -151,8 +151,8 @@ class VanDerPol(AbstractSystem):
     $$\dot x = v, \qquad \dot v = \mu (1 - x^2) v - x + u$$
 
     Without control, every trajectory that does not start at the origin converges to one
-    limit cycle, of amplitude near 2. The vector field is smooth, and stiff for large
-    $\mu$. States, control and time have no units.
+    limit cycle, of amplitude near 2. The vector field is smooth, and the system is
+    stiff for large $\mu$. States, control and time have no units.
 
     **Arguments:**
 
@@ -192,7 +192,7 @@ class VanDerPol(AbstractSystem):
 
 
 class Lorenz(AbstractSystem):
-    r"""Lorenz's model of convection with a control.
+    r"""Lorenz's model of convection, with a control input.
 
     $$\dot x = \sigma (y - x) + u, \qquad \dot y = x (\rho - z) - y, \qquad
     \dot z = x y - \beta z$$

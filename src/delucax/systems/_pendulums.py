@@ -10,8 +10,8 @@ from ._base import AbstractSystem
 
 
 class DoublePendulumCart(AbstractSystem):
-    r"""Two uniform rods in a chain on a cart. A force pushes the cart along a track
-    without friction.
+    r"""A cart that carries two uniform rods, one on top of the other. A force pushes
+    the cart along a track without friction.
 
     $$\begin{aligned}
     d_1 \ddot p + d_2 c_1 \ddot\theta_1 + d_3 c_2 \ddot\theta_2
@@ -22,15 +22,16 @@ class DoublePendulumCart(AbstractSystem):
     &= d_3 g s_2 + d_5 s_{12} \dot\theta_1^2
     \end{aligned}$$
 
-    Here $p$ is the position of the cart, and $c_i$ and $s_i$ are the cosine and sine of
-    $\theta_i$, $c_{12}$ and $s_{12}$ those of $\theta_1 - \theta_2$. The constants are
-    $d_1 = M + m_1 + m_2$, $d_2 = (m_1 / 2 + m_2) l_1$, $d_3 = m_2 l_2 / 2$,
-    $d_4 = (m_1 / 3 + m_2) l_1^2$, $d_5 = m_2 l_1 l_2 / 2$ and $d_6 = m_2 l_2^2 / 3$.
+    Here $p$ is the position of the cart. The symbols $c_i$ and $s_i$ are the cosine and
+    sine of $\theta_i$, and $c_{12}$ and $s_{12}$ are the cosine and sine of
+    $\theta_1 - \theta_2$. The constants are $d_1 = M + m_1 + m_2$,
+    $d_2 = (m_1 / 2 + m_2) l_1$, $d_3 = m_2 l_2 / 2$, $d_4 = (m_1 / 3 + m_2) l_1^2$,
+    $d_5 = m_2 l_1 l_2 / 2$ and $d_6 = m_2 l_2^2 / 3$.
 
     The state is (position [m], angle_1 [rad], angle_2 [rad], velocity [m/s], spin_1
     [rad/s], spin_2 [rad/s]), the control is (force [N]). Both angles are measured from
-    upright, and a positive angle leans towards positive positions. The vector field is
-    smooth.
+    upright. A rod with a positive angle leans in the direction of positive positions of
+    the cart. The vector field is smooth.
 
     **Arguments:**
 
@@ -124,12 +125,13 @@ class FurutaPendulum(AbstractSystem):
     $J_0 = J_1 + m L^2$ and $K = m L l$.
 
     The state is (arm [rad], angle [rad], arm_rate [rad/s], spin [rad/s]), the control
-    is (voltage [V]). The pendulum is upright at angle 0, and a positive angle leans in
-    the direction of positive arm rates. The vector field is smooth.
+    is (voltage [V]). The pendulum is upright at angle 0. With a positive angle, it
+    leans in the direction in which an arm with a positive rate turns. The vector field
+    is smooth.
 
     The default constants are those of Quanser's QUBE-Servo 2: an arm of 95 g and 85 mm,
-    and a rod of 24 g and 129 mm. The inertias of arm and rod are those of thin rods
-    about their ends.
+    and a rod of 24 g and 129 mm. The inertias of the arm and of the rod are computed as
+    those of thin rods about their ends.
 
     **Arguments:**
 

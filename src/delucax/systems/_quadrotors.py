@@ -26,17 +26,18 @@ class PlanarQuadrotor(AbstractSystem):
 
     The state is (x [m], y [m], angle [rad], vx [m/s], vy [m/s], rate [rad/s]), the
     control is (left [N], right [N]). The force $F$ is the sum of the `wind` and the
-    disturbance (force_x [N], force_y [N]). The vector field is smooth if the wind is.
-    Thrusts may have either sign.
+    disturbance (force_x [N], force_y [N]). The vector field is smooth if the wind is a
+    smooth function. Thrusts may have either sign.
 
     **Arguments:**
 
     - `mass`: $m$ [kg], 0.1 by default.
     - `length`: $l$ [m], 0.2 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
-    - `wind`: a function `(t, x) -> force` to a force of shape `(2,)` [N], such as
-        [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] or
-        [`delucax.systems.VortexWind`][]; none by default.
+    - `wind`: a function `(t, x) -> force` that returns a force of shape `(2,)` [N],
+        such as [`delucax.systems.DissipativeWind`][],
+        [`delucax.systems.ConstantWind`][] or [`delucax.systems.VortexWind`][]; none by
+        default.
 
     **Raises:** `ValueError` if a mass or length is not positive, a number is not finite
     or the wind is not a function.
@@ -123,8 +124,8 @@ class Quadrotor(AbstractSystem):
 
     The state has 13 entries: the position $p$ [m], the unit quaternion $q$ = (qw, qx,
     qy, qz) from body to world, the velocity $v$ [m/s] and the body rates $\omega$
-    [rad/s]. Position and velocity are in a world whose z axis points up. The
-    disturbance is the force $F$ [N] in the world.
+    [rad/s]. Position and velocity are those in the world frame, whose z axis points up.
+    The disturbance is the force $F$ [N] in the world frame.
 
     The control is the thrust of each rotor, (front [N], left [N], back [N], right [N]).
     The thrust $T$ of the body is their sum, and its torque is
@@ -137,22 +138,24 @@ class Quadrotor(AbstractSystem):
     (thrust [N], torque_x [N m], torque_y [N m], torque_z [N m]). The vector field is
     smooth. Thrusts may have either sign.
 
-    `project` normalises the quaternion after each control interval. `difference` uses
-    $q$ or $-q$, whichever is closer to the reference.
+    `project` normalises the quaternion after each control interval. Because $q$ and
+    $-q$ are the same rotation, `difference` uses the one that is closer to the
+    reference.
 
     To design a regulator, linearise [`delucax.Discretized`][] dynamics, not the system
     itself, and pass the `difference` of the system to the regulator. The length of the
-    quaternion is not controllable. The discrete-time dynamics project this length to 1
-    in every step. In the linearised system the length is a marginal mode, for which no
-    regulator exists.
+    quaternion is not controllable. The discrete-time dynamics set this length to 1 in
+    every step. In the linearised system the length of the quaternion is a mode that is
+    neither stable nor controllable, so no regulator exists.
 
     **Arguments:**
 
     - `mass`: $m$ [kg], 0.716 by default.
     - `arm`: $l$, distance from the centre to a rotor [m], 0.17 by default.
-    - `inertia_x`, `inertia_y`, `inertia_z`: the diagonal of $J$ [kg m^2], 0.007, 0.007
-        and 0.012 by default.
-    - `moment`: $k$, torque per thrust of a rotor [m], 0.016 by default.
+    - `inertia_x`, `inertia_y`, `inertia_z`: the diagonal entries of the inertia matrix
+        $J$ [kg m^2], 0.007, 0.007 and 0.012 by default.
+    - `moment`: $k$, the yaw torque of a rotor divided by its thrust [m], 0.016 by
+        default.
     - `drag`: $d$, drag of the air [N s/m], 0 by default.
     - `gravity`: $g$ [m/s^2], 9.81 by default.
     - `inputs`: `"rotors"` (default) or `"wrench"`.

@@ -18,8 +18,8 @@ class KinematicBicycle(AbstractSystem):
 
     Here $\beta$ is the slip angle at the centre of mass. The state is (x [m], y [m],
     heading $\psi$ [rad], speed $v$ [m/s]), the control is (acceleration $a$ [m/s^2],
-    steering $\delta$ [rad]). The vector field is smooth for steering angles inside
-    +-pi/2, where the tangent is finite.
+    steering $\delta$ [rad]). The vector field is smooth for steering angles between
+    -pi/2 and pi/2, where $\tan\delta$ is finite.
 
     **Arguments:**
 
@@ -92,9 +92,9 @@ class DynamicBicycle(AbstractSystem):
     where vx and vy are the velocities of the centre of mass along and across the car.
     The control is (acceleration $a$ [m/s^2], steering $\delta$ [rad]).
 
-    The exact slip angle, $\arctan(v / v_x)$, is not defined at rest. The speed $v_0$
-    makes the slip angle smooth at rest. The model is meant for driving forward, much
-    faster than $v_0$.
+    The exact slip angle, $\arctan(v / v_x)$, is not defined at rest. The model adds
+    $v_0^2$ under the root, so that its slip angle is smooth at rest too. Use the model
+    for driving forward, at speeds far above $v_0$.
 
     **Arguments:**
 
@@ -176,16 +176,17 @@ class Reacher(AbstractSystem):
     $$M_{11} = (m_1 + m_2) l_1^2 + m_2 l_2^2 + 2 m_2 l_1 l_2 \cos q_2, \qquad
     M_{12} = m_2 l_2^2 + m_2 l_1 l_2 \cos q_2, \qquad M_{22} = m_2 l_2^2$$
 
-    Here $h$ holds the Coriolis and centrifugal torques and $G$ those of gravity. The
-    state is (shoulder $q_1$ [rad], elbow $q_2$ [rad], shoulder_rate [rad/s], elbow_rate
-    [rad/s]), the control is (shoulder_torque [N m], elbow_torque [N m]). The angle of
-    the shoulder is measured from the x axis and the angle of the elbow from the first
-    link: if both angles are zero, the arm is stretched along the x axis. The vector
-    field is smooth.
+    Here $h$ holds the Coriolis and centrifugal torques, and $G$ holds the torques of
+    gravity. The state is (shoulder $q_1$ [rad], elbow $q_2$ [rad], shoulder_rate
+    [rad/s], elbow_rate [rad/s]), the control is (shoulder_torque [N m], elbow_torque [N
+    m]). The angle of the shoulder is measured from the x axis and the angle of the
+    elbow from the first link: if both angles are zero, the arm is stretched along the x
+    axis. The vector field is smooth.
 
-    A positive `gravity` pulls **along the x axis**, and a negative one against it. The
-    experiments of the Deluca paper change `gravity` to make a plant that differs from
-    its model. For ordinary gravity, let the x axis point down.
+    If `gravity` is positive, gravity pulls **along the x axis**. If `gravity` is
+    negative, it pulls the opposite way. In the experiments of the Deluca paper, the
+    plant and its model have different values of `gravity`. For ordinary gravity, pass
+    `gravity=9.81` and let the x axis point down.
 
     **Arguments:**
 

@@ -19,8 +19,8 @@ class Thermostat(AbstractHybridSystem):
     $$C \dot T = s P + u - k (T - T_\mathrm{outside})$$
 
     Here $s$ is 1 while the heater is on and 0 while it is off. The state is
-    (temperature $T$ [degC], mode), the control is (heat $u$ [kW]), a second source of
-    heat. The modes are `"off"` and `"on"`. Time is in hours.
+    (temperature $T$ [degC], mode). The control is (heat $u$ [kW]), the power of a
+    second source of heat. The modes are `"off"` and `"on"`. Time is in hours.
 
     If the heater is strong enough and the outside cold enough, the temperature swings
     between `low` and `high`.
@@ -31,7 +31,8 @@ class Thermostat(AbstractHybridSystem):
     - `loss`: $k$, heat loss to the outside [kW/K], 0.2 by default.
     - `power`: $P$, power of the heater [kW], 6 by default.
     - `outside`: $T_\mathrm{outside}$ [degC], 5 by default.
-    - `low`, `high`: the ends of the band [degC], 19 and 21 by default.
+    - `low`, `high`: the lower and the upper end of the band of temperatures [degC], 19
+        and 21 by default.
 
     **Raises:** `ValueError` if the capacity or the loss is not positive, `low` is not
     below `high`, or a number is not finite.
@@ -102,20 +103,22 @@ class Thermostat(AbstractHybridSystem):
 
 
 class StickSlip(AbstractHybridSystem):
-    r"""A mass on a moving belt, held by a spring and a damper, with dry friction.
+    r"""A mass on a moving belt. A spring and a damper hold the mass, and dry friction
+    acts between the mass and the belt.
 
     $$m \ddot p = u + F - k p - c \dot p$$
 
     Here $u$ is the control and $F$ the friction. While the mass slips on the belt,
-    $|F|$ is `kinetic`, and $F$ opposes the motion relative to the belt. While the mass
-    sticks, it moves with the belt, until the friction would have to exceed `static`.
+    $|F|$ is `kinetic`, and $F$ opposes the motion of the mass relative to the belt.
+    While the mass sticks, it moves with the belt. It begins to slip when a friction
+    larger than `static` would be needed to hold it.
 
     The state is (position $p$ [m], velocity [m/s], mode), the control is (force [N]).
     The modes are `"stick"`, `"slip behind"` (slower than the belt) and `"slip ahead"`
     (faster than the belt).
 
     Without damping and control, the mass settles into a cycle of sticking and slipping.
-    The mass begins to slip at `position = static / stiffness`.
+    In each cycle, the mass begins to slip at `position = static / stiffness`.
 
     **Arguments:**
 
@@ -208,28 +211,29 @@ class StickSlip(AbstractHybridSystem):
 
 
 class ValveWithStops(AbstractHybridSystem):
-    r"""A valve on a spring that bounces between two stops, closed and open.
+    r"""A valve on a spring. The valve bounces between two stops: at one it is closed,
+    at the other open.
 
     $$m \ddot p = F - k (p - p_0) - c \dot p, \qquad 0 \le p \le 1$$
 
     The position $p$ is 0 where the valve is closed and 1 where it is open. At a stop
-    the valve bounces, $\dot p^+ = -e\, \dot p^-$. If the valve would leave a stop more
-    slowly than `rest_speed`, it stays at the stop, in the mode `"closed"` or `"open"`.
+    the valve bounces, $\dot p^+ = -e\, \dot p^-$. If the speed after a bounce would be
+    below `rest_speed`, the valve stays at the stop, in the mode `"closed"` or `"open"`.
     The valve leaves the stop again when the force away from the stop exceeds
     `adhesion`.
 
     The state is (position, velocity [1/s], mode), the control is (force [N]). The modes
-    are `"free"`, `"closed"` and `"open"`. The unit of length is the travel of the
-    valve.
+    are `"free"`, `"closed"` and `"open"`. The unit of length is the distance between
+    the two stops.
 
     **Arguments:**
 
     - `mass`: $m$ [N s^2], 1 by default.
     - `stiffness`: $k$, the stiffness of the spring [N], 40 by default.
     - `damping`: $c$ [N s], 1 by default.
-    - `neutral`: $p_0$, the position where the spring is relaxed. The default, 0.5, is
-        the position for two springs that push against each other. Choose a value below
-        0 for a valve that the spring closes.
+    - `neutral`: $p_0$, the position where the spring is relaxed. The default is 0.5, as
+        if two equal springs held the valve halfway. For a spring that closes the valve,
+        choose a value below 0.
     - `restitution`: $e$, the fraction of its speed that the valve keeps in a bounce,
         0.3 by default.
     - `adhesion`: the largest force with which a stop holds the valve [N], 0.5 by

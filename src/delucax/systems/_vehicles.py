@@ -26,14 +26,13 @@ class SlungLoad(AbstractSystem):
     Here $a$ is the acceleration of the load and
     $F = (u_\mathrm{left} + u_\mathrm{right}) (-\sin\theta, \cos\theta)$ the thrust. The
     unit vector $q = (\sin\alpha, -\cos\alpha)$ points from the quadrotor to the load.
-    The cable has no mass and stays taut: where a real cable would go slack, this one
-    pushes like a rod.
+    The cable has no mass and never goes slack: it can push the load like a rod.
 
     The state is (x [m], y [m], angle $\theta$ [rad], swing $\alpha$ [rad], vx [m/s], vy
     [m/s], rate [rad/s], swing_rate [rad/s]), where x and y are the position of the
     load. The control is (left [N], right [N]), the thrusts of the two rotors. At
-    `swing = 0` the load hangs straight below. The vector field is smooth. Thrusts may
-    have either sign.
+    `swing = 0` the load hangs straight below the quadrotor. The vector field is smooth.
+    Thrusts may have either sign.
 
     **Arguments:**
 
@@ -112,8 +111,9 @@ class SlungLoad(AbstractSystem):
 
 
 class DriftingCar(AbstractSystem):
-    r"""A car with rear-wheel drive that can drift: a bicycle model on Fiala's brush
-    tyres. The rear tyre shares its grip between driving and cornering.
+    r"""A car with rear-wheel drive that can drift: a bicycle model with Fiala's brush
+    model of the tyres. The more grip the rear tyre uses for driving, the less remains
+    for cornering.
 
     $$\begin{aligned}
     m \dot v_x &= F - F_f \sin\delta + m v_y r \\
@@ -127,22 +127,25 @@ class DriftingCar(AbstractSystem):
     \frac{C_i |z_i|}{3 G_i} \text{ up to } 1, \qquad
     F_i = -G_i \operatorname{sign}(z_i) \text{ beyond}$$
 
-    At $s_i = 1$ the tyre begins to slide. The grip $G$ is $\mu N_f$ in front and
-    $\sqrt{(\mu N_r)^2 - F^2}$ at the rear, with the loads $N$ of the car at rest.
+    At $s_i = 1$ the tyre begins to slide. The grip $G$ is $\mu N_f$ at the front axle
+    and $\sqrt{(\mu N_r)^2 - F^2}$ at the rear axle, where $N_f$ and $N_r$ are the loads
+    of the axles at rest.
 
     The state is (vx [m/s], vy [m/s], rate $r$ [rad/s]), where vx and vy are the
     velocities of the centre of mass along and across the car. The control is (force $F$
     [N], steering $\delta$ [rad]), where the force acts on the rear tyre along the car.
-    The derivative of the vector field is continuous, except where the force takes all
-    of the rear tyre's grip.
+    The derivative of the vector field is continuous, except where the driving force
+    uses all the grip of the rear tyre.
 
-    In a drift the rear tyre slides, and the car turns against its steering. The
-    equilibrium of a drift is unstable: only feedback holds the car in it.
+    In a drift the rear tyre slides, and the car turns to one side while the front
+    wheels are steered to the other. A steady drift is an unstable equilibrium: only
+    feedback holds the car in the drift.
 
-    Two changes keep the model defined everywhere. First, the slip angle of a tyre is
-    not defined at rest, so its tangent is computed as $z = v / \sqrt{w^2 + v_0^2}$,
-    with the velocities $v$ across and $w$ along the tyre. Second, a rear tyre that uses
-    all its grip for driving keeps a fiftieth of this grip for cornering.
+    Two changes to the original equations make the model valid for all states and
+    controls. First, the slip angle of a tyre is not defined at rest. Its tangent is
+    therefore computed as $z = v / \sqrt{w^2 + v_0^2}$, where $v$ is the velocity across
+    the tyre and $w$ the velocity along the tyre. Second, at least a fiftieth of the
+    grip of the rear tyre is kept for cornering, even if driving uses all of the grip.
 
     **Arguments:**
 

@@ -20,11 +20,12 @@ class SimplestWalker(AbstractHybridSystem):
     + \tau$$
 
     Here $\theta$ is the angle of the stance leg, $\phi$ the angle of the swing leg from
-    the stance leg and $\tau$ the torque at the hip. Lengths are in units of the leg,
-    times in units of $\sqrt{l / g}$. The swing foot strikes at $\phi = 2 \theta$, once
-    the stance leg has passed the normal of the slope. Before that, $\phi = 2 \theta$
-    also holds when the legs pass each other, but this is not an event. The state is
-    (stance, stance rate, swing, swing rate), the control is (torque).
+    the stance leg and $\tau$ the torque at the hip. The unit of length is the length
+    $l$ of a leg, and the unit of time is $\sqrt{l / g}$. The swing foot strikes the
+    ground when $\phi = 2 \theta$ and the stance leg has already passed the normal of
+    the slope. Earlier in the step, $\phi = 2 \theta$ also holds when the legs pass each
+    other, but the foot does not strike then. The state is (stance, stance rate, swing,
+    swing rate), the control is (torque).
 
     **Arguments:**
 
@@ -83,21 +84,22 @@ class CompassGait(AbstractHybridSystem):
     q = (q_\mathrm{swing}, q_\mathrm{stance})$$
 
     Both angles are measured from the vertical, and $\tau$ is the torque at the hip. The
-    swing foot strikes at $q_\mathrm{swing} + q_\mathrm{stance} = -2 \gamma$, with the
-    swing leg ahead. Two angular momenta are then conserved: that of the whole walker
-    about the new foot, and that of the trailing leg about the hip. The legs exchange
-    their names. The state is (swing [rad], stance [rad], swing rate [rad/s], stance
-    rate [rad/s]), the control is (torque [N m]).
+    swing foot strikes the ground when
+    $q_\mathrm{swing} + q_\mathrm{stance} = -2 \gamma$ and the swing leg is ahead. This
+    impact conserves two angular momenta: that of the whole walker about the foot that
+    strikes, and that of the other leg about the hip. The legs exchange their names. The
+    state is (swing [rad], stance [rad], swing rate [rad/s], stance rate [rad/s]), the
+    control is (torque [N m]).
 
     **Arguments:**
 
-    - `leg_mass`: mass of a leg [kg], 5 by default, at the distance `lower` from the
-        foot.
+    - `leg_mass`: mass of a leg [kg], concentrated at the distance `lower` from the
+        foot; 5 by default.
     - `hip_mass`: mass at the hip [kg], 10 by default.
     - `lower`, `upper`: distances from the foot to the leg's mass and from this mass to
         the hip [m], 0.5 by default.
-    - `gravity`: [m/s^2], 9.81 by default. The numbers in the source are for a gravity
-        of 9.8.
+    - `gravity`: [m/s^2], 9.81 by default. The numbers in the cited paper were computed
+        with a gravity of 9.8.
     - `slope`: $\gamma$ [rad], 3 degrees by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not

@@ -107,9 +107,9 @@ class VortexWind(_AbstractWind):
     J = \begin{pmatrix} 0 & -1 \\ 1 & 0 \end{pmatrix}$$
 
     Here $p$ is the position. Each vortex is strongest at the distance $r$ from its
-    centre, where its force is $s$. Inside, it rotates like a solid. Outside of this
-    distance, the force decays with the inverse of the distance. The force is smooth
-    everywhere.
+    centre, where its force is $s$. Near its centre, it rotates like a solid. Far
+    outside of the core, the force is inversely proportional to the distance from the
+    centre. The force is smooth everywhere.
 
     **Arguments:**
 

@@ -22,8 +22,8 @@ def _forwarded(name: str) -> Any:
 
 
 class AbstractSystemWrapper(AbstractSystem):
-    """A system around another system. The field `system` holds the wrapped system, and
-    everything that a subclass does not override is taken from it.
+    """A system around another system. The field `system` holds the wrapped system.
+    Methods and names that a subclass does not override are those of the wrapped system.
 
     A subclass declares the field `system` and writes `vector_field`. Systems with
     events cannot be wrapped.
@@ -98,7 +98,7 @@ class AbstractSystemWrapper(AbstractSystem):
 
 
 class Calibrated(AbstractSystemWrapper):
-    r"""A system whose actuator and sensor have a scale and an offset.
+    r"""A system with a scale and an offset for each control and each output.
 
     $$\dot x = f(t, x, a_u u + b_u, w), \qquad y = a_y h(t, x) + b_y$$
 
@@ -165,8 +165,8 @@ class Calibrated(AbstractSystemWrapper):
 
 
 class Corrected(AbstractSystemWrapper):
-    r"""A grey-box model: a known system with a neural network for what its equations
-    leave out.
+    r"""A grey-box model: a known system and a neural network, which learns what the
+    equations of the system leave out.
 
     $$\dot x = f(t, x, u, w) + s \cdot \mathrm{network}\left(
     \frac{x - \bar x}{\sigma_x}, \frac{u - \bar u}{\sigma_u}\right)$$
@@ -174,14 +174,14 @@ class Corrected(AbstractSystemWrapper):
     The last layer of the network is initialised to zero, so the model starts as the
     known system. [`delucax.training.sysid.grey_box`][] fits both together.
 
-    `equilibrium()` is that of the known system. From there [`delucax.trim`][] finds the
-    equilibrium of the sum.
+    `equilibrium()` returns the equilibrium of the known system, without the network.
+    Starting there, [`delucax.trim`][] finds the equilibrium of the corrected system.
 
     **Arguments:**
 
     - `system`: the known part, a [`delucax.AbstractSystem`][].
-    - `width`, `depth`: units in each hidden layer and number of hidden layers of the
-        network, 16 and 1 by default.
+    - `width`, `depth`: the number of units in each hidden layer of the network, and the
+        number of its hidden layers; 16 and 1 by default.
     - `size`: $s$, the size of the correction to the derivative of each state, shape
         `(n,)` or a number; 1 by default. Pass 0 for a derivative that is known exactly,
         such as that of a position.

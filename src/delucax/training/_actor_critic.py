@@ -37,7 +37,7 @@ class ActorCritic(eqx.Module):
 
     **Arguments:**
 
-    - `policy`: a controller. For PPO it must draw its controls at random, as
+    - `policy`: a controller. For PPO the policy must draw its controls at random, as
         [`delucax.controllers.Gaussian`][] and [`delucax.controllers.Categorical`][] do.
     - `critic`: a controller without a memory and with one output, such as a
         [`delucax.controllers.MLP`][].
@@ -46,8 +46,8 @@ class ActorCritic(eqx.Module):
         deviation 1.
 
     **Raises:** `ValueError` if `policy` or `critic` is not a controller, or the critic
-    has a memory. `value` and `raw` raise a `ValueError` if the critic does not give one
-    output.
+    has a memory. `value` and `raw` raise a `ValueError` if the critic does not have
+    exactly one output.
 
     !!! example
 
@@ -121,9 +121,9 @@ def actor_critic(
 
     The input of both networks is `environment.encode(y)`, standardised with the
     statistics that training collects. The last layers of both networks start with
-    weights a hundred times smaller than usual. So the policy starts near the middle of
-    the bounds, and the critic starts nearly constant, because the gradient of an
-    untrained critic is misleading.
+    weights a hundred times smaller than usual. Therefore the controls of an untrained
+    policy are near the middle of their bounds. An untrained critic is kept nearly
+    constant, because its gradient would mislead the policy.
 
     **Arguments:**
 

@@ -92,18 +92,18 @@ def expected_cost(
         in [`delucax.rollout`][].
     - `gradient_decay`: the damping factor of the gradient through time, as in
         [`delucax.rollout`][]; 1 by default, which gives the true gradient.
-    - `truncate`: the gradient is cut every `truncate` steps, as in
-        [`delucax.rollout`][]; never by default.
-    - `ranges`: ranges of parameters, as in [`delucax.randomise`][]. With `ranges`, each
-        rollout draws its own plant. None by default.
+    - `truncate`: the number of steps between two cuts of the gradient, as in
+        [`delucax.rollout`][]; by default the gradient is never cut.
+    - `ranges`: ranges of parameters, as in [`delucax.randomise`][]. If you pass
+        `ranges`, each rollout draws the parameters of its own plant. None by default.
 
-    **Returns:** a function `loss(controller, key)` to a scalar. Compile it with
-    `eqx.filter_jit(loss)`. `jax.jit(loss)` raises `unhashable type`, because the loss
-    is a module that holds the arrays of the plant; `jax.jit` of a function that calls
-    the loss works.
+    **Returns:** a function `loss(controller, key)` that returns a scalar. Compile it
+    with `eqx.filter_jit(loss)`. `jax.jit(loss)` raises `unhashable type`, because the
+    loss is a module that holds the arrays of the plant. You can also apply `jax.jit` to
+    a function that calls the loss.
 
     **Raises:** `ValueError` if `batch`, `horizon` or `truncate` is below 1,
-    `environment` is not an environment, `checkpoint` has another value,
+    `environment` is not an environment, `checkpoint` is none of the values above,
     `gradient_decay` is not a finite number, or `ranges` are not valid.
 
     !!! example
@@ -181,18 +181,19 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
 
     $$L(\theta) = \sum_k \log p_\theta(u_k \mid t_k, y_k, s_k)$$
 
-    Here $s_k$ is the memory of the controller. The observations and the drawn controls
-    are held fixed in $L$. [`delucax.training.LikelihoodRatio`][] needs such a loss, and
-    the other gradient estimators accept such a loss too.
+    Here $s_k$ is the memory of the controller. The derivative of $L$ treats the
+    observations and the drawn controls as constants.
+    [`delucax.training.LikelihoodRatio`][] needs such a loss, and the other gradient
+    estimators accept such a loss too.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `horizon`: steps of the episode; the `horizon` of the environment by default.
 
-    **Returns:** a function `loss(controller, key)` to a scalar and a dictionary. The
-    controller must be a [`delucax.AbstractStochasticPolicy`][]. Compile the function
-    with `eqx.filter_jit`, as in [`delucax.training.expected_cost`][].
+    **Returns:** a function `loss(controller, key)` that returns a scalar and a
+    dictionary. The controller must be a [`delucax.AbstractStochasticPolicy`][]. Compile
+    the function with `eqx.filter_jit`, as in [`delucax.training.expected_cost`][].
 
     **Raises:** `ValueError` if `horizon` is below 1 or `environment` is not an
     environment. A `ValueError` is also raised when the loss is called, if the
@@ -259,7 +260,8 @@ def worst_case(
     iterations: int = 20,
     starts: int = 8,
 ) -> _Attack:
-    r"""The worst bounded disturbances of a closed loop, found by a local search.
+    r"""The bounded disturbances that give a closed loop the highest cost, found by a
+    local search.
 
     $$\max_{w} \; J(w) \quad \text{subject to} \quad \lVert w_k \rVert \le r
     \text{ for each } k$$
@@ -271,15 +273,16 @@ def worst_case(
 
     If the cost is convex in the disturbances, an iteration never lowers the cost. The
     cost is convex in the disturbances for a linear plant, a linear feedback and a
-    convex stage cost. The search runs from several starts at once; every second start
-    is constant over time, and the remaining starts are noise. `worst_case` returns the
-    disturbances with the highest cost among all starts and iterations.
+    convex stage cost. The search starts from several guesses of the disturbances at
+    once. Every second guess is constant over time, and the other guesses are noise.
+    `worst_case` returns the disturbances with the highest cost among all starts and
+    iterations.
 
     **Arguments:**
 
     - `environment`: the environment. Its own disturbance is not used.
-    - `controller`: the controller. If the controller adapts, the gradient includes the
-        adaptation.
+    - `controller`: the controller. If the controller adapts online, the gradient
+        includes the effect of the disturbances on this adaptation.
     - `key`: a random key, for the starts of the search, the rollout and the controller.
     - `bound`: $r$, the bound on the Euclidean norm of each $w_k$, a positive number.
     - `x0`: the initial state, shape `(n,)`; drawn by the environment by default.
@@ -287,11 +290,11 @@ def worst_case(
     - `iterations`: the number of iterations, 20 by default.
     - `starts`: the number of starts, 8 by default.
 
-    **Returns:** a named tuple. `w`, shape `(horizon, k)`, are the disturbances, to use
-    in `rollout(..., w=w)`. `total_cost` is the total cost under these disturbances,
-    infinite if they make the plant run away.
-    `costs`, shape `(iterations + 1,)`, is the total cost at each iteration of the best
-    start.
+    **Returns:** a named tuple. `w`, shape `(horizon, k)`, holds the disturbances, which
+    you can pass to `rollout(..., w=w)`. `total_cost` is the total cost under these
+    disturbances; it is infinite if the state diverges. `costs`, shape
+    `(iterations + 1,)`, holds the total cost at each iteration, for the guess that led
+    to the highest cost.
 
     **Raises:** `ValueError` if an argument has the wrong type, shape or range, or the
     environment takes no disturbance.

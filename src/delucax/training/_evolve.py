@@ -94,20 +94,21 @@ def evolve(
     r"""Train a model without derivatives, by separable natural evolution strategies.
 
     Each generation draws weights $\mu + \sigma \odot e_i$ from a normal distribution,
-    with $e_i \sim \mathcal{N}(0, I)$ in pairs of opposite sign. The losses are ranked,
-    and each draw gets a utility $v_i$ by its rank. For $d$ weights:
+    where the $e_i \sim \mathcal{N}(0, I)$ come in pairs of opposite sign. The draws are
+    ranked by their losses, and the rank of each draw gives its utility $v_i$. For $d$
+    weights:
 
     $$\mu \leftarrow \mu + \sigma \odot \sum_i v_i e_i, \qquad
     \log \sigma \leftarrow \log \sigma + \frac{\eta}{2} \sum_i v_i (e_i^2 - 1),
     \qquad \eta = \frac{3 + \log d}{5 \sqrt{d}}$$
 
-    Only the order of the losses is used. So `evolve` also works if the loss jumps or is
-    flat almost everywhere, such as a reward at the end of an episode. `evolve` works
-    best for up to a few hundred weights.
+    `evolve` uses only the order of the losses, not their values. So `evolve` also works
+    if the loss jumps or is flat almost everywhere, such as a reward at the end of an
+    episode. `evolve` works best for up to a few hundred weights.
 
     **Arguments:**
 
-    - `loss`: a function `loss(model, key)` to a scalar; for example from
+    - `loss`: a function `loss(model, key)` that returns a scalar; for example from
         [`delucax.training.expected_cost`][]. All models of a generation get the same
         key.
     - `model`: a controller or any other pytree; the initial $\mu$.
@@ -121,7 +122,7 @@ def evolve(
         blocks of 50 generations by default.
 
     **Returns:** a [`delucax.training.Fitted`][]. The `model` of the result is the mean
-    $\mu$, and its `history` has the smallest loss of each generation.
+    $\mu$, and the `history` holds the smallest loss of each generation.
 
     **Raises:** `ValueError` if an argument has the wrong type or range. `RuntimeError`
     if no model of a generation has a finite loss, unless `throw` is false.

@@ -33,7 +33,7 @@ class Fitted(eqx.Module):
 
     **Attributes:**
 
-    - `model`: the trained model. If training diverged, this is the model before the
+    - `model`: the trained model. If training diverged, `model` is the model before the
         step that failed.
     - `history`: the losses and other numbers of each step, a
         [`delucax.training.History`][].
@@ -91,18 +91,18 @@ def fit(
     r"""Train a model with a loss and an Optax optimiser.
 
     Use `fit` to train policies or any other model, such as a learned simulator. Each
-    step $k$ evaluates the loss with the key `jax.random.fold_in(key, k)`, its gradient
-    with respect to the trainable values, and the update of the optimiser. A parameter
-    with a constraint is optimised as $z = \mathrm{unconstrain}(v)$, and the model gets
-    $v = \mathrm{constrain}(z)$, so the parameter satisfies its constraint at every
-    step.
+    step $k$ computes the loss with the key `jax.random.fold_in(key, k)`, the gradient
+    of the loss with respect to the trainable values, and the update of the optimiser. A
+    parameter with a constraint is optimised as $z = \mathrm{unconstrain}(v)$, and the
+    model gets $v = \mathrm{constrain}(z)$, so the parameter satisfies its constraint at
+    every step.
 
     The steps run in compiled blocks. The result does not depend on `block`. A run that
-    resumes from its checkpoint, on the same kind of machine, gives the same bits as a
-    run without interruption. A second call of `fit` does not compile again if three
-    things are the same as in the first call: the loss function, the way in which the
-    optimiser is made, such as `optax.adam(1e-3)`, and the structure and shapes of the
-    model.
+    resumes from its checkpoint, on the same kind of machine, gives the same numbers,
+    bit for bit, as a run without interruption. A second call of `fit` does not compile
+    again if three things are the same as in the first call: the loss function, the way
+    in which the optimiser is made, such as `optax.adam(1e-3)`, and the structure and
+    shapes of the model.
 
     You cannot call `fit` under `jax.jit` or `jax.vmap`. To train an ensemble, pass a
     batch of keys and a batch of models: `fit` trains all models at once, independently
@@ -116,11 +116,12 @@ def fit(
         arrays can change without a new compilation. A loss with a memory, such as
         [`delucax.training.PPO`][], is a [`delucax.training.AbstractSurrogate`][].
     - `model`: any pytree, for example a controller, an environment, a network, or a
-        tuple of these. With a batch of keys, every array has a leading axis over the
-        seeds, as `eqx.filter_vmap(make)(keys)` returns it.
-    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. The parameters that
-        the optimiser gets are a dictionary from the path of each trainable leaf to the
-        unconstrained value of the leaf.
+        tuple of these. If `key` is a batch of keys, every array of the model must have
+        a leading axis over the seeds. `eqx.filter_vmap(make)(keys)` returns such a
+        model.
+    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. The optimiser gets
+        the parameters as a dictionary, which maps the path of each trainable leaf to
+        the unconstrained value of the leaf.
     - `steps`: the number of steps, at least 1.
     - `key`: a random key, or a batch of keys, shape `(seeds,)`.
     - `data`: a pytree of arrays with a common leading axis; none by default.
@@ -133,14 +134,15 @@ def fit(
         - a dictionary from paths to constraints: [`delucax.positive`][],
             [`delucax.bounded`][], or `None` for the constraint of the field;
         - a function of a leaf, such as `equinox.is_inexact_array`;
-        - booleans in the structure of the model.
+        - a pytree of booleans with the structure of the model.
     - `gradient`: the gradient estimator, [`delucax.training.analytic`][] by default.
         Other estimators are [`delucax.training.ClippedSamples`][],
         [`delucax.training.EvolutionStrategies`][],
         [`delucax.training.LikelihoodRatio`][], or any function
-        `gradient(loss, values, key)` to `(value, gradient)`.
-    - `block`: steps in one call to the device, at most 1000; 100 by default. The
-        progress bar, the callbacks and the checkpoints are updated after each block.
+        `gradient(loss, values, key)` that returns `(value, gradient)`.
+    - `block`: the number of steps in one compiled call to the device, at most 1000; 100
+        by default. The progress bar, the callbacks and the checkpoints are updated
+        after each block.
     - `progress`: whether to show a progress bar with the loss; true by default.
     - `callbacks`: functions `callback(step, metrics)`, called after each block; none by
         default. `step` is the number of finished steps, and `metrics` is a dictionary
@@ -148,21 +150,22 @@ def fit(
         to log to TensorBoard, for example. If a callback returns `True`, training stops
         after this block, for example because the loss is low enough or the time is up.
     - `checkpoint`: the path of a file for checkpoints; none by default. If this file
-        exists, the run resumes from the checkpoint in it. `steps` belongs to the run:
-        a call with another number of steps raises an error. A run that a callback
-        stopped resumes if you repeat the same call. So if you may want to train longer,
-        choose a large number of steps, and stop with a callback.
+        exists, the run resumes from the checkpoint in it. You cannot change `steps`
+        when you resume a run: a call with another number of steps raises an error. If a
+        callback stopped the run, repeat the same call to resume the run. If you do not
+        know how long to train, choose a large number of steps and stop the run with a
+        callback.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. A checkpoint is also written at the end of the run, unless
         the run or one of its seeds diverged.
     - `throw`: whether to raise an error if the loss, its gradient or an update is NaN
-        or infinite; true by default. If false, training stops before that step, and
-        `fitted.result` is `RESULTS.diverged`. In a batch of seeds, only the seed that
-        failed stops.
+        or infinite; true by default. If `throw` is false, training stops before the
+        step that failed, and `fitted.result` is `RESULTS.diverged`. In a batch of
+        seeds, only the training of the seed that failed stops.
 
-    **Returns:** a [`delucax.training.Fitted`][]. With a batch of keys, the arrays of
-    the model, the result, and the columns of the history except `step` and `seconds`
-    have an axis over the seeds.
+    **Returns:** a [`delucax.training.Fitted`][]. If `key` is a batch of keys, the
+    arrays of the model and the result have an axis over the seeds. The columns of the
+    history have this axis too, except `step` and `seconds`.
 
     **Raises:** `ValueError` if an argument has the wrong type or shape, nothing is
     trainable, or the checkpoint comes from another run. `RuntimeError` if training

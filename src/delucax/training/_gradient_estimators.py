@@ -27,15 +27,15 @@ def analytic(
     The gradient is exact for the given key. The mean of the gradient over keys is the
     gradient of the expected loss, if derivative and expectation can be exchanged.
 
-    All estimators are called as `estimator(loss, model, key)`. The gradient is with
-    respect to the leaves of the model marked [`delucax.weight`][]. If no leaf is
+    You call every gradient estimator as `estimator(loss, model, key)`. The gradient is
+    with respect to the leaves of the model marked [`delucax.weight`][]. If no leaf is
     marked, the gradient is with respect to all floating-point arrays.
     [`delucax.training.fit`][] passes the trainable, unconstrained values as `model`.
 
     **Arguments:**
 
-    - `loss`: a function `loss(model, key)` to a scalar, or to a scalar and a dictionary
-        of scalar metrics.
+    - `loss`: a function `loss(model, key)` that returns a scalar, or a scalar and a
+        dictionary of scalar metrics.
     - `model`: a pytree with weights.
     - `key`: a random key, for the loss.
 
@@ -88,19 +88,20 @@ class ClippedSamples(eqx.Module):
     $$g = \frac{1}{n} \sum_{i=1}^{n} \min\left(1, \frac{c}{\lVert g_i \rVert}\right)
     g_i, \qquad c = a\, \operatorname{median}_i \lVert g_i \rVert$$
 
-    If the median is zero, the median of the gradients that are not zero is used.
+    If the median of the norms is zero, the median over the nonzero gradients is used
+    instead.
 
     Use `ClippedSamples` if the plant diverges in a few episodes. The gradient of a
-    diverging episode can be larger than all other gradients together without a useful
-    direction. If it is not finite, it would end the training. Call the estimator like
-    every gradient estimator, see [`delucax.training.analytic`][], with the loss of a
-    single episode.
+    diverging episode can be larger than all other gradients together, while its
+    direction is useless. A gradient that is not finite would even end the training.
+    Call this estimator in the same way as [`delucax.training.analytic`][], with the
+    loss of a single episode.
 
     **Arguments:**
 
     - `samples`: the number of gradients in one estimate, 32 by default.
     - `factor`: $a$, 5 by default. A small factor biases the estimate towards the
-        typical episode.
+        gradient of a typical episode.
 
     **Returns:** a call returns `(value, gradient)`: the mean output of the loss over
     the finite samples, and a pytree like the model, with `None` for each leaf that is
@@ -165,7 +166,8 @@ class ClippedSamples(eqx.Module):
 
 
 class EvolutionStrategies(eqx.Module):
-    r"""The gradient from differences of the loss along random directions.
+    r"""The gradient of a loss, estimated from differences of the loss along random
+    directions.
 
     Antithetic, with $n$ = `samples / 2` directions $e_i \sim \mathcal{N}(0, I)$ and a
     key for each:
@@ -178,28 +180,29 @@ class EvolutionStrategies(eqx.Module):
     $$g = \frac{1}{n \sigma} \sum_{i=1}^{n}
     \bigl(\ell(\theta + \sigma e_i) - \ell(\theta)\bigr)\, e_i$$
 
-    Both estimates are unbiased for the gradient of the smoothed loss
-    $\mathbb{E}[\ell(\theta + \sigma e)]$. For a quadratic loss, this is the gradient of
-    the loss itself; for other losses, the difference is of the order of $\sigma^2$. The
-    loss need not be differentiable. All values of the loss are computed at once by
-    `jax.vmap`. Call the estimator like every gradient estimator, see
-    [`delucax.training.analytic`][].
+    The mean of both estimates is the gradient of the smoothed loss
+    $\mathbb{E}[\ell(\theta + \sigma e)]$. If the loss is quadratic, the smoothed loss
+    has the same gradient as the loss itself. For other losses, the two gradients differ
+    by a term of the order of $\sigma^2$. The loss need not be differentiable. All
+    values of the loss are computed at once by `jax.vmap`. Call this estimator in the
+    same way as [`delucax.training.analytic`][].
 
     **Arguments:**
 
-    - `sigma`: $\sigma$, the standard deviation of the noise, positive.
+    - `sigma`: $\sigma$, the standard deviation of the noise on the weights, positive.
         [`delucax.training.fit`][] adds the noise to the unconstrained values.
-    - `samples`: the number of perturbed losses in one estimate; even if antithetic.
-    - `antithetic`: whether to perturb along $e_i$ and $-e_i$; true by default. With
-        opposite directions, the loss itself and all even terms of its expansion in
-        $\sigma$ cancel.
+    - `samples`: the number of perturbed losses in one estimate; an even number if
+        `antithetic` is true.
+    - `antithetic`: whether to perturb the weights along both $e_i$ and $-e_i$; true by
+        default. With opposite directions, the loss itself and all even powers of
+        $\sigma$ in its Taylor series cancel.
 
     **Returns:** a call returns `(value, gradient)`: the output of the loss for the
     unperturbed weights, and a pytree like the model, with `None` for each leaf that is
     not a weight.
 
     **Raises:** `ValueError` if `sigma` is not positive, `samples` is below 1, or
-    `samples` is odd with `antithetic`.
+    `samples` is odd while `antithetic` is true.
 
     Source: Salimans, Ho, Chen, Sidor and Sutskever, 2017; Nesterov and Spokoiny, 2017
     (one-sided).
@@ -285,20 +288,20 @@ class LikelihoodRatio(eqx.Module):
     $$g = \frac{1}{n} \sum_{i=1}^{n} (c_i - b_i)\,
     \frac{\partial \log p_\theta(u_i)}{\partial \theta}$$
 
-    The baseline $b_i$ is the mean cost of the other samples, or 0. The estimate is
-    unbiased for the gradient of $\mathbb{E}[c]$, because the score has mean zero and
-    $b_i$ does not depend on $u_i$. Only the log-probability is differentiated, never
-    the cost or the plant.
+    The baseline $b_i$ is the mean cost of the other samples, or 0 if `baseline` is
+    false. The mean of the estimate is the gradient of $\mathbb{E}[c]$, because the
+    gradient of the log-probability has mean zero and $b_i$ does not depend on $u_i$.
+    Only the log-probability is differentiated, never the cost or the plant.
 
     The loss must return `(cost, {"log_prob": ...})` for one draw.
     [`delucax.training.scored_cost`][] makes a loss of this kind from an environment. If
-    you write such a loss yourself, follow two rules. Compute the log-probability of
-    `jax.lax.stop_gradient(u)`, because with a draw such as `u = mean + std * e` the
-    gradient of the log-probability would cancel. And let the cost depend on the weights
-    only through the draw.
+    you write such a loss yourself, follow two rules. First, compute the log-probability
+    of `jax.lax.stop_gradient(u)`. For a draw such as `u = mean + std * e`, the
+    log-probability of `u` itself has no gradient with respect to `mean`. Second, let
+    the cost depend on the weights only through the draw `u`.
 
-    The other gradient estimators accept this kind of loss too. Call the estimator like
-    every gradient estimator, see [`delucax.training.analytic`][].
+    The other gradient estimators accept this kind of loss too. Call this estimator in
+    the same way as [`delucax.training.analytic`][].
 
     **Arguments:**
 

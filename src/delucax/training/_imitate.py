@@ -67,8 +67,9 @@ def imitate(
     \lVert S^{-1} (\pi_\theta(t, y) - u^*(t, y)) \rVert^2$$
 
     Here $\pi_\theta$ is the policy, $u^*$ the expert, and $S$ the diagonal matrix of
-    the standard deviations of the expert's controls in the first round. A control that
-    is nearly constant has the largest of these deviations.
+    the standard deviations of the expert's controls in the first round. For a control
+    that is nearly constant, $S$ contains the largest of these standard deviations
+    instead.
 
     **Arguments:**
 
@@ -76,7 +77,8 @@ def imitate(
     - `expert`: any controller. It may have a memory.
     - `policy`: the controller to train. It must have no memory.
     - `key`: a random key.
-    - `rounds`: the number of rounds, 4 by default. 1 is behavioural cloning.
+    - `rounds`: the number of rounds, 4 by default. A single round is behavioural
+        cloning.
     - `episodes`: episodes in each round, 8 by default.
     - `steps`: steps of the optimiser in each round, 300 by default.
     - `horizon`: steps per episode; the `horizon` of the environment by default.

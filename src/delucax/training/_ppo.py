@@ -50,23 +50,25 @@ class PPO(AbstractActorCriticLoss):
     critic, $\hat V$ its target and $b$ its `scale`. $H$ is the entropy of the policy.
     PPO does not differentiate the plant.
 
-    Train with this loss like with any other loss, with any optimiser. The model is a
+    Pass this loss to `fit` like any other loss, with any optimiser. The model is a
     [`delucax.training.ActorCritic`][] with a stochastic policy. The trained controller
-    is `fitted.model.policy`, or `fitted.model.policy.base` without the noise.
+    is `fitted.model.policy`. The same controller without random noise is
+    `fitted.model.policy.base`.
 
-    At the horizon an episode is truncated: the critic estimates the remaining cost. If
-    an episode terminates, only the final cost follows. A policy with a memory is
-    trained on whole episodes, with gradients through its memory. A policy without a
-    memory is trained on single steps in random order. The previous batches set the
-    scale of the critic and each [`delucax.controllers.Standardise`][] of the model. The
-    scales stay fixed during a batch, so that $\rho$ starts at 1. An additional batch
-    before the first step sets the first scales.
+    An episode that reaches the horizon is truncated, and the critic estimates the cost
+    after the horizon. An episode that terminates has only the final cost after its last
+    step. A policy with a memory is trained on whole episodes, with gradients through
+    its memory. A policy without a memory is trained on single steps in random order.
+    The scale of the critic and the statistics of each
+    [`delucax.controllers.Standardise`][] in the model are computed from the previous
+    batches. The scales stay fixed during a batch, so that $\rho$ starts at 1. An
+    additional batch before the first step sets the first scales.
 
     In total, `fit` takes `batch * horizon * (1 + ceil(steps / (epochs * minibatches)))`
     steps of the environment. For example, 63 steps of `fit` with 4 epochs of 8
     minibatches run 3 batches. If an episode terminates before the horizon, this number
-    also counts its remaining steps, in which the state is held. They are computed, but
-    have no effect on the loss.
+    also counts its remaining steps, in which the state is held. These remaining steps
+    are computed, but have no effect on the loss.
 
     Metrics: `total_cost` of the last batch, `entropy`, `kl`, `clipped` (the fraction of
     ratios outside the clip range) and `value_loss`.
@@ -79,17 +81,18 @@ class PPO(AbstractActorCriticLoss):
     - `discount`: the discount factor of the cost to go, 0.99 by default.
     - `decay`: $\lambda$ of the advantage estimate, 0.95 by default.
     - `clip`: $\epsilon$, 0.2 by default.
-    - `epochs`: passes over a batch, 4 by default.
+    - `epochs`: the number of passes over each batch, 4 by default.
     - `minibatches`: minibatches in a pass, 8 by default. Rows that do not fill the last
         minibatch are skipped.
     - `value_weight`: $a$, 0.5 by default.
     - `entropy_weight`: $h$, 0 by default.
     - `bootstrap`: whether the critic estimates the cost after the horizon; true by
-        default. If false, the horizon terminates the episode, with the final cost.
+        default. If false, an episode that reaches the horizon terminates there, with
+        the final cost.
 
     **Raises:** `ValueError` if an argument has the wrong type or range. A `ValueError`
     is also raised in training, if the model is not an `ActorCritic`, its policy is not
-    stochastic, or a Gaussian policy lacks the bounds of the environment.
+    stochastic, or a Gaussian policy has no bounds although the environment has bounds.
 
     Source: Schulman, Wolski, Dhariwal, Radford and Klimov, 2017; Schulman, Moritz,
     Levine, Jordan and Abbeel, 2016 (the advantage estimate); Pardo, Tavakoli, Levdik

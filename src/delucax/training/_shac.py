@@ -32,27 +32,28 @@ class SHAC(AbstractActorCriticLoss):
 
     $$\frac{1}{m\, b} \Bigl(\sum_{i=0}^{m-1} \gamma^i c_i + \gamma^m V(y_m)\Bigr)$$
 
-    The loss is differentiated through the plant, the controls and $V$, but not into the
-    previous window. So the gradient cannot explode over more than a window, and $V$
-    estimates the cost after the window. The loss of the critic is the mean over all
-    steps of $(V_\phi - \hat V)^2 / b^2$. Here $V_\phi$ is the critic, $b$ its `scale`,
-    and $\hat V$ its target, the return of TD($\lambda$). The $V$ in the loss of the
-    policy and in the targets is a target network. The weights $\phi'$ of the target
-    network follow the weights $\phi$ of the critic at each step:
+    The gradient of this loss passes through the plant, the controls and $V$, but stops
+    at the beginning of the window. So the gradient cannot grow over more steps than a
+    window has. The cost after the window is estimated by $V$. The loss of the critic is
+    the mean over all steps of $(V_\phi - \hat V)^2 / b^2$. Here $V_\phi$ is the critic,
+    $b$ is its `scale`, and the target $\hat V$ is the TD($\lambda$) return. The loss of
+    the policy and the targets use a target network as $V$. The weights $\phi'$ of the
+    target network follow the weights $\phi$ of the critic at each step:
     $\phi' \leftarrow \phi' + r\, (\phi - \phi')$.
 
-    Train with this loss like with any other loss. In each step, one gradient trains
-    both the policy and the critic. The model is a [`delucax.training.ActorCritic`][],
-    whose policy may be stochastic or not. The trained controller is
-    `fitted.model.policy`. Each step of `fit` takes `batch * horizon` steps of the
-    environment. Every `refresh`-th step takes another `batch * horizon` steps, to set
-    the scale of the critic and each [`delucax.controllers.Standardise`][] of the model.
-    Metrics: `total_cost` and `value_loss`.
+    Pass this loss to `fit` like any other loss. In each step, one gradient trains both
+    the policy and the critic. The model is a [`delucax.training.ActorCritic`][], whose
+    policy may be stochastic or not. The trained controller is `fitted.model.policy`.
+    Each step of `fit` takes `batch * horizon` steps of the environment. Every
+    `refresh`-th step of `fit` takes another `batch * horizon` steps of the environment.
+    From these steps, `fit` computes the scale of the critic and the statistics of each
+    [`delucax.controllers.Standardise`][] in the model. Metrics: `total_cost` and
+    `value_loss`.
 
     The end of an episode and `bootstrap` are handled as in [`delucax.training.PPO`][].
-    Unlike in the paper, each step of training uses all windows of new, whole episodes,
-    not the next window of episodes that an older policy began. So time, disturbances
-    and the memory of the policy are consistent within an episode.
+    In the paper, each step of training uses the next window of episodes that an older
+    policy began. Here, each step uses all windows of new, whole episodes. So time,
+    disturbances and the memory of the policy are consistent within an episode.
 
     **Arguments:**
 
@@ -62,13 +63,15 @@ class SHAC(AbstractActorCriticLoss):
     - `window`: $m$, steps in a window, 16 by default. The last window of an episode may
         be shorter.
     - `discount`: $\gamma$, the discount factor of the cost to go, 0.99 by default.
-    - `decay`: $\lambda$ of the targets, 0.95 by default.
-    - `rate`: $r$, the rate of the target network, 0.2 by default. With a rate of 1, the
-        target network equals the critic.
+    - `decay`: $\lambda$ of the TD($\lambda$) return, the target of the critic; 0.95 by
+        default.
+    - `rate`: $r$, the rate at which the target network follows the critic, 0.2 by
+        default. With a rate of 1, the target network equals the critic.
     - `value_weight`: the weight of the critic's loss, 1 by default.
     - `refresh`: steps between two updates of the scales, 10 by default.
     - `bootstrap`: whether the critic estimates the cost after the horizon; true by
-        default. If false, the horizon terminates the episode, with the final cost.
+        default. If false, an episode that reaches the horizon terminates there, with
+        the final cost.
 
     **Raises:** `ValueError` if an argument has the wrong type or range. A `ValueError`
     is also raised in training, if the model is not an `ActorCritic`.

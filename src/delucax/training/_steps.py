@@ -56,8 +56,9 @@ class AbstractSurrogate(eqx.Module):
     [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] are such losses.
 
     To write a surrogate loss, subclass this class and write `init`, `update` and
-    `__call__`. All must be pure functions. Then training runs in the same compiled loop
-    as with other losses, also for several seeds, and can resume from a checkpoint.
+    `__call__`. All must be pure functions. Training then runs in the same compiled loop
+    as with any other loss. It can train several seeds at once, and can resume from a
+    checkpoint.
 
     !!! example
 

@@ -51,24 +51,26 @@ class Adaptive(AbstractController):
     Copies of `base`, the experts, run in parallel on the same observations. After each
     interval of `every` steps a new expert starts, which has learned nothing yet. The
     $i$-th expert expires after `every` $(4 \cdot 2^k + 1)$ steps, where $2^k$ is the
-    largest power of two that divides $i$. So there is always an expert that started
-    shortly after any change. The first expert never expires. If no slot is free, the
-    expert that would expire next is dropped.
+    largest power of two that divides $i$. So whenever the plant has changed, there is
+    an expert that started shortly after the change. The first expert never expires. If
+    no slot is free, the expert that would expire next is dropped.
 
     The weights of the experts follow their counterfactual losses:
 
     $$p_i \leftarrow p_i \exp(-\mathrm{rate}\, (\ell_i - \bar \ell) / \sigma)$$
 
-    Here $\bar \ell$ is the mean loss under the weights, and $\sigma$ the standard
-    deviation of the recent losses, so the weights do not depend on the scale of the
-    losses. Then a fraction `share` of the total weight is distributed evenly over all
-    active experts, so that the weight of any expert can rise quickly.
+    Here $\bar \ell$ is the mean of the losses, weighted by $p_i$, and $\sigma$ is the
+    standard deviation of the recent mean losses. Because of $\sigma$, the weights do
+    not depend on the scale of the losses. Then a fraction `share` of the total weight
+    is distributed evenly over all active experts, so that the weight of any expert can
+    rise quickly.
 
     With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` the
-    control comes from a single expert. At each step, another expert is drawn only with
-    a small probability: the fraction of its weight that the current expert has lost in
-    this step, compared with the best expert. So the expert seldom changes. With
-    [`delucax.controllers.gpc`][] as base, this is AdaGPC.
+    control comes from a single expert. At each step, another expert is drawn with a
+    probability that is usually small. This probability is the fraction of its weight
+    that the current expert lost in this step, relative to the weight of the best
+    expert. So the expert seldom changes. With [`delucax.controllers.gpc`][] as base,
+    this is AdaGPC.
 
     **Arguments:**
 
@@ -76,8 +78,8 @@ class Adaptive(AbstractController):
         [`delucax.controllers.gpc`][].
     - `slots`: the largest number of active experts, 8 by default.
     - `every`: the number of steps between the starts of two experts, 64 by default.
-    - `rate`: how fast the weights follow the losses, the $\mathrm{rate}$ above; 0.5 by
-        default.
+    - `rate`: the factor $\mathrm{rate}$ in the formula above, which sets how fast the
+        weights follow the losses; 0.5 by default.
     - `share`: the fraction of the total weight that is distributed evenly at each step,
         above 0 and at most 1; 0.02 by default.
     - `play`: `"mix"` (default) or `"switch"`.

@@ -53,10 +53,11 @@ class BPC(AbstractController):
 
     $$g_t = \frac{d}{\delta} (c_t - \bar c_t) \sum_{i < \mathrm{horizon}} e_{t-i}$$
 
-    The vector $g_t$ estimates the gradient of the cost that a fixed theta of dimension
-    $d$ would have had. Here $\bar c_t$ is the mean of the previous costs: subtracting
-    it reduces the variance of the estimate, and does not change the expectation. The
-    regret grows as $T^{3/4}$.
+    The vector $g_t$ estimates the gradient of the cost with respect to theta, as if
+    theta had been constant in the past. Here $d$ is the number of entries of theta, and
+    $\bar c_t$ is the mean of the previous costs. Subtracting this mean reduces the
+    variance of the estimate, and does not change its expectation. The regret grows as
+    $T^{3/4}$.
 
     **Arguments:**
 
@@ -64,11 +65,12 @@ class BPC(AbstractController):
     - `base`: a controller that stabilises the dynamics, such as an
         [`delucax.controllers.LQR`][].
     - `memory`: the number of past values of the signal, 5 by default. A longer memory
-        adds dimensions to the search.
+        gives theta more entries, so the search has more dimensions.
     - `horizon`: the number of past directions $e_{t-i}$ in the gradient estimate, 5 by
         default.
-    - `delta`: $\delta$, the size of the random perturbation of theta. By default 0.2
-        divided by the norm of the first response of the observation to a unit control.
+    - `delta`: $\delta$, the size of the random perturbation of theta. By default it is
+        0.2 divided by the norm of the first nonzero response of the observation to a
+        unit impulse of the control.
     - `learning_rate`: the scale of the optimiser's step; by default 0.05 divided by the
         same norm as for `delta`.
     - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by

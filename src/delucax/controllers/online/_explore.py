@@ -47,9 +47,9 @@ class Explore(AbstractController):
     r"""Explore, identify, then control: an online learner for an unknown linear plant.
 
     In the first `steps` steps the control is $u_t = -K x_t + a\, e_t$, where the
-    entries of $e_t$ are random signs. The environment may clip this control, which adds
-    $c_t$ to it. The correlations of $e_t$ with $c_t$ and with all that follows do not
-    depend on the disturbances, even if an adversary chooses them:
+    entries of $e_t$ are random signs. If the environment clips this control, $c_t$ is
+    the applied control minus $u_t$. The correlations of $e_t$ with $c_t$ and with all
+    that follows do not depend on the disturbances, even if an adversary chooses them:
 
     $$N_j = \tfrac1a \operatorname{mean}_t\, x_{t+j+1} e_t^\top, \qquad
     C_j = \tfrac1a \operatorname{mean}_t\, c_{t+j} e_t^\top$$
@@ -60,25 +60,26 @@ class Explore(AbstractController):
 
     $$(A - B K)\, [N_0 \cdots N_{q-1}] = [N_1 - B C_1 \cdots N_q - B C_q]$$
 
-    If clipping leaves nothing of a random control, the identified dynamics are not
-    finite.
+    If clipping removes the random part of a control completely, the identified dynamics
+    are not finite.
 
-    After these steps the control comes from the controller that `build` makes for
-    $x_{t+1} = A x_t + B u_t$. With [`delucax.controllers.gpc`][] and `steps` near
-    $T^{2/3}$, the regret over $T$ steps grows as $T^{2/3}$.
+    After the first `steps` steps, the control comes from the controller that `build`
+    makes for the identified dynamics $x_{t+1} = A x_t + B u_t$. With
+    [`delucax.controllers.gpc`][] and `steps` near $T^{2/3}$, the regret over $T$ steps
+    grows as $T^{2/3}$.
 
     **Arguments:**
 
     - `build`: a function that makes a controller for a [`delucax.LinearDynamics`][].
-        The function is called under `jax.jit`, so an online learner that it makes must
-        be given its `horizon`.
+        The function `build` is called under `jax.jit`. If it makes an online learner,
+        it must therefore pass a `horizon` to this learner.
     - `K`: a gain that stabilises the plant, shape `(m, n)`; zero if the plant is stable
         without control.
     - `steps`: the number of steps of exploration.
     - `scale`: $a$, the size of the random controls, 1 by default.
     - `order`: $q$, the number of matrices $N_j$ on each side of the least-squares
-        problem. By default `n`, because a controllable plant reaches any state in `n`
-        steps.
+        problem. By default $q$ is the number `n` of states, because a controllable
+        plant reaches any state in `n` steps.
     - `dt`: the control interval, 1 by default.
 
     **Raises:** `ValueError` if `build` does not make a controller, `K` is not a matrix

@@ -39,37 +39,42 @@ def gpc(
     w_{t-1} = x_t - F(t-1, x_{t-1}, u_{t-1})$$
 
     The disturbances $w$ are computed from the states, with the controls that were
-    applied. The matrices $E$ follow the gradient of the cost that each step would have
-    had if these matrices had always been used: see
-    [`delucax.controllers.OnlineLearner`][]. Compared with the best fixed $E$ in
-    hindsight, the regret over $T$ steps grows as $\sqrt T$, for any disturbances.
+    applied. At each step, the matrices $E$ move against the gradient of a
+    counterfactual cost. This is the cost that the step would have had if the same
+    matrices had always been used: see [`delucax.controllers.OnlineLearner`][]. Compared
+    with the best fixed $E$ in hindsight, the regret over $T$ steps grows as $\sqrt T$,
+    for any disturbances.
 
-    The dynamics may be linear, time-invariant or time-varying, or nonlinear with an
-    observed state. Nonlinear dynamics are linearised along the run. The disturbance of
-    nonlinear dynamics is the residual of the nonlinear map.
+    The dynamics may be linear (time-invariant or time-varying) or nonlinear, and the
+    state must be observed. Nonlinear dynamics are linearised along the run. For
+    nonlinear dynamics, the disturbance is the difference between the state and its
+    prediction by the nonlinear model.
 
     **Arguments:**
 
     - `dynamics`: the model, a [`delucax.AbstractDynamics`][] that observes its state.
     - `cost`: the stage cost, a differentiable function of `(t, x, u)` such as
         `env.cost`.
-    - `base`: a controller that stabilises the dynamics; by default the
-        [`delucax.controllers.LQR`][] for the curvature of the cost at the operating
-        point.
+    - `base`: a controller that stabilises the dynamics; by default a
+        [`delucax.controllers.LQR`][] whose weights are the curvature of the cost at the
+        operating point.
     - `memory`: the number of past disturbances. By default the smallest $h$ from 10 to
         50 with $\rho^h \le 0.1$, where $\rho$ is the spectral radius of the closed
-        loop. The default is 10 if `dynamics` are not linear and time-invariant, or
-        inside a JAX transformation, because the closed loop is not known there.
-    - `horizon`: the length of the counterfactual roll-out. By default the smallest $h$
-        from 10 to 1000 with $\rho^h \le 0.03$.
-    - `learning_rate`: the scale of the optimiser's step. For Newton's method it is the
-        length of the longest step. By default $0.15 / |B|$, where $|B|$ is the
-        Frobenius norm of the change of the state in one step by a unit control.
+        loop. The default is 10 if `dynamics` are nonlinear or time-varying, or if you
+        call `gpc` inside a JAX transformation, because in these cases $\rho$ is not
+        known.
+    - `horizon`: the number of past steps that the counterfactual cost takes into
+        account. By default it is the smallest $h$ from 10 to 1000 with
+        $\rho^h \le 0.03$.
+    - `learning_rate`: the scale of the optimiser's step. For Newton's method,
+        `learning_rate` is the length of the longest allowed step. By default it is
+        $0.15 / |B|$, where $|B|$ is the Frobenius norm of the matrix that maps a
+        control to the change of the state in one step.
     - `optimiser`: an Optax transformation. By default
         [`delucax.controllers.adagrad_norm`][] if `dynamics` are linear and
-        time-invariant, otherwise [`delucax.controllers.online_newton`][]. Neither
-        optimiser depends on the scale of the cost. `online_newton` learns faster, but
-        each of its steps takes ten times as long.
+        time-invariant, otherwise [`delucax.controllers.online_newton`][]. With both
+        optimisers, the steps do not depend on the scale of the cost. `online_newton`
+        learns faster, but computing a step takes ten times as long.
     - `radius`: the largest Frobenius norm of $E$, $50 / |B|$ by default.
 
     **Returns:** a [`delucax.controllers.OnlineLearner`][]. The state of the learner has
@@ -134,10 +139,11 @@ def drc(
 
     $\eta_t$ is nature's output: the observation that the closed loop would have given
     if nothing had been added to the control of the base. $G(v)$ is the response of the
-    closed loop to all controls that were added, after clipping. The matrices $M$ follow
-    the gradient of the cost that each step would have had if they had been used in the
-    past too: see [`delucax.controllers.OnlineLearner`][]. The regret against the best
-    fixed $M$ in hindsight grows as $\sqrt T$.
+    closed loop to all controls that were added, after clipping. At each step, the
+    matrices $M$ move against the gradient of a counterfactual cost. This is the cost
+    that the step would have had if the same matrices had been used in the past too: see
+    [`delucax.controllers.OnlineLearner`][]. The regret against the best fixed $M$ in
+    hindsight grows as $\sqrt T$.
 
     With a `base` whose control is zero, `drc` is the gradient response controller. A
     base such as [`delucax.controllers.LQG`][] gives good control from the start, and
@@ -149,21 +155,23 @@ def drc(
         not observed.
     - `cost`: the stage cost, a differentiable function of `(t, y, u)`, where `y` is the
         observation.
-    - `base`: a controller that stabilises the dynamics. By default a
-        [`delucax.controllers.LQG`][] for the curvature of the cost, and for
-        disturbances and sensor noise of unit covariance; or a
-        [`delucax.controllers.LQR`][] if the state is observed.
-    - `memory`: the number of past outputs $\eta$ that the control uses, 10 by default.
-    - `horizon`: the length of the counterfactual roll-out. By default the smallest $h$
-        from 10 to 1000 with $\rho^h \le 0.03$, where $\rho$ is the spectral radius of
-        the closed loop.
-    - `learning_rate`: the scale of the optimiser's step. For Newton's method it is the
-        length of the longest step. By default 0.15 divided by the norm of the first
-        response of the observation to a unit control.
+    - `base`: a controller that stabilises the dynamics. By default it is a
+        [`delucax.controllers.LQG`][] whose weights are the curvature of the cost, for
+        disturbances and sensor noise of unit covariance. If the state is observed, it
+        is a [`delucax.controllers.LQR`][] with these weights.
+    - `memory`: the number of values $\eta_t, \eta_{t-1}, \dots$ of nature's output that
+        the control uses, 10 by default.
+    - `horizon`: the number of past steps that the counterfactual cost takes into
+        account. By default it is the smallest $h$ from 10 to 1000 with
+        $\rho^h \le 0.03$, where $\rho$ is the spectral radius of the closed loop.
+    - `learning_rate`: the scale of the optimiser's step. For Newton's method,
+        `learning_rate` is the length of the longest allowed step. By default it is 0.15
+        divided by the norm of the first nonzero response of the observation to a unit
+        impulse of the control.
     - `optimiser`: an Optax transformation; by default
         [`delucax.controllers.online_newton`][] with a prior of 4 steps.
-    - `radius`: the largest Frobenius norm of $M$; by default 50 divided by the norm of
-        the first response of the observation to a unit control.
+    - `radius`: the largest Frobenius norm of $M$; by default 50 divided by the same
+        norm as for `learning_rate`.
 
     **Returns:** a [`delucax.controllers.OnlineLearner`][]. The state of the learner has
     nature's outputs in `loop.signal`, and the matrices $M$ side by side in `theta`,
@@ -215,7 +223,8 @@ def sfc(
     optimiser: optax.GradientTransformation | None = None,
     radius: Any = None,
 ) -> OnlineLearner:
-    r"""The spectral filtering controller, which learns from filters of a long memory.
+    r"""The spectral filtering controller, which learns from a few filters of the long
+    past.
 
     $$u_t = \mathrm{base}(y_t) + M_0 s_t + \sum_i M_i f_i(s_{t-1}, \dots,
     s_{t-\mathrm{memory}}), \qquad f_i(s) = \sigma_i^{1/4} \sum_k \phi_i(k)\, s_{t-k}$$
@@ -227,30 +236,33 @@ def sfc(
     $$H_{jk} = \frac{(1 - \mathrm{margin})^{j + k - 1}}{j + k - 1}$$
 
     For a long memory, [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][]
-    need a matrix for each step, but `sfc` needs only a few filters. So `sfc` has fewer
-    weights to learn if the closed loop is slow. The filters depend only on the memory
-    and the margin, not on the plant.
+    need one matrix for each past step, but `sfc` needs only one matrix for each filter.
+    So `sfc` has fewer weights to learn if the closed loop is slow and needs a long
+    memory. The filters depend only on the memory and the margin, not on the plant.
 
     The double spectral controller, for a state that is not observed, also adds
 
     $$\sum_i M'_i f_i(s_t, \dots) + \sum_{i \le j} M''_{ij} (f_i * f_j)(s_t, \dots)$$
 
-    where $f_i * f_j$ applies one filter after the other. These terms can represent an
-    observer, which is itself a filter of the past.
+    where $f_i * f_j$ applies one filter after the other. With these terms, the
+    controller can also represent an observer, because an observer filters the past
+    outputs.
 
     **Arguments:**
 
     - `dynamics`, `cost`, `base`, `horizon`, `learning_rate`, `optimiser`, `radius`: as
         in [`delucax.controllers.drc`][].
     - `filters`: the number of filters, 5 by default.
-    - `memory`: the number of past values that are filtered, 30 by default.
+    - `memory`: the number of past values of the signal that the filters use, 30 by
+        default.
     - `margin`: the stability margin, between 0 and 1, 0.2 by default. The filters are
-        accurate for a memory that fades as $(1 - \mathrm{margin})^k$ or faster.
+        accurate if the effect of a value $k$ steps ago fades as
+        $(1 - \mathrm{margin})^k$ or faster.
     - `double`: whether to use the double spectral controller; false by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. The state of the learner has
-    the last `memory + 1` values of the signal in `loop.signal`, or `2 memory` with
-    `double`, and the matrices $M$ side by side in `theta`.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In the state of the learner,
+    `loop.signal` holds the last `memory + 1` values of the signal (`2 memory` values
+    with `double`), and `theta` holds the matrices $M$ side by side.
 
     **Raises:** `ValueError` for the same reasons as [`delucax.controllers.drc`][], or
     if `filters` is larger than `memory`, or `margin` is not between 0 and 1.
@@ -316,14 +328,15 @@ def neural_gpc(
     optimiser: optax.GradientTransformation | None = None,
     key: PRNGKey,
 ) -> OnlineLearner:
-    r"""A neural network in place of the matrices of [`delucax.controllers.gpc`][].
+    r"""The gradient perturbation controller with a neural network in place of the
+    matrices of [`delucax.controllers.gpc`][].
 
     $$u_t = \mathrm{base}(y_t) + \mathrm{network}(s_t, \dots, s_{t-\mathrm{memory}+1})$$
 
     The signal $s$ is the last disturbance if the state is observed, and nature's output
-    otherwise. The output of the network is zero at first. The regret has no known
-    bound. Use `neural_gpc` for costs and plants for which a linear map of the past is
-    not enough.
+    otherwise. The output of the network is zero until the first learning step. The
+    regret has no known bound. Use `neural_gpc` for costs and plants for which a linear
+    map of the past is not enough.
 
     **Arguments:**
 

@@ -39,7 +39,8 @@ def best_in_hindsight(
     iterations: int = 30,
     tolerance: float | None = None,
 ) -> Hindsight:
-    r"""The fixed controller with the lowest cost, once the disturbances are known.
+    r"""The fixed controller that would have had the lowest cost in a given run, found
+    after the run when its disturbances are known.
 
     $$\min_\theta \; \sum_t c(t, x_t(\theta), u_t(\theta)) + c_f(x_T(\theta))$$
 
@@ -48,16 +49,17 @@ def best_in_hindsight(
     Every run of the search has the same first state, disturbances and sensor noise as
     `trajectory`.
 
-    The search is Newton's method with Levenberg's damping, with derivatives through the
-    rollout. The search finds the global minimum if the cost is convex in $\theta$. The
-    cost is convex for a disturbance-action policy on a linear plant with a convex cost,
-    but in general not for a linear gain.
+    The search uses Newton's method with Levenberg's damping, and differentiates through
+    the rollout. The search finds the global minimum if the cost is convex in $\theta$.
+    The cost is convex for a disturbance-action policy on a linear plant with a convex
+    cost, but in general not for a linear gain.
 
     - `gpc(...).fixed()`: the best disturbance-action policy.
     - `drc(...).fixed()`: the best disturbance-response policy.
     - `Linear(K)` or `LQR(...)`: the best gain, with the given gain as the start of the
         search.
-    - `OpenLoop(controls)`: the best open loop, for short horizons.
+    - `OpenLoop(controls)`: the best sequence of controls without feedback, for short
+        horizons.
 
     **Arguments:**
 

@@ -59,21 +59,21 @@ class OnlineLearner(AbstractLearner):
 
     $$u_t = \mathrm{base}(y_t) + \mathrm{policy}(\theta_t, \phi_t)$$
 
-    The features $\phi_t$ are filters of a signal that does not depend on the added
-    control: the past disturbances, or nature's output. Before each control, $\theta$
-    takes a step against the gradient of a counterfactual loss. This loss is the cost
-    that the current step would have if $\theta$ had been used in the last $h$ steps
-    too, where $h$ is the `horizon`.
+    The features $\phi_t$ are filtered values of a signal. This signal is the past
+    disturbances, or nature's output; it does not depend on the added control. Before it
+    computes a control, the learner moves $\theta$ against the gradient of a
+    counterfactual loss. This loss is the cost that the current step would have if
+    $\theta$ had been used in the last $h$ steps too, where $h$ is the `horizon`.
 
     $$\begin{aligned}
     \ell_t(\theta) &= c(t, y_t(\theta), u_t(\theta)) \\
     y_t(\theta) &= y_t + \sum_{j < h} G_j\, (v_{t-1-j}(\theta) - v_{t-1-j})
     \end{aligned}$$
 
-    Here $G_j$ is the response of the closed loop to an impulse $j$ steps ago,
-    $v_s(\theta)$ the control that $\theta$ would have added at step $s$, and $v_s$ the
-    control that was added, after clipping. The control $u_t(\theta)$ is computed like
-    $y_t(\theta)$. Nonlinear dynamics are linearised along the run.
+    Here $G_j$ is the response of the closed loop to an impulse $j$ steps ago. The
+    control that $\theta$ would have added at step $s$ is $v_s(\theta)$, and the control
+    that was added there, after clipping, is $v_s$. The control $u_t(\theta)$ is
+    computed like $y_t(\theta)$. Nonlinear dynamics are linearised along the run.
 
     [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
     [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make online
@@ -90,9 +90,9 @@ class OnlineLearner(AbstractLearner):
         trainable.
     - `learning_rate`: the scale of the optimiser's step, an array. You can
         differentiate with respect to `learning_rate`.
-    - `optimiser`: an Optax transformation. Its `update` gets two extra arguments:
-        `learning_rate`, and `curvature`, a function that returns a square root $L$ of
-        the curvature $L L^\top$ of the loss.
+    - `optimiser`: an Optax transformation. The `update` function of the optimiser gets
+        two extra arguments: `learning_rate`, and `curvature`, a function that returns a
+        square root $L$ of the curvature $L L^\top$ of the loss.
 
     The state of the controller has `theta`, the learned weights, and `loop.signal`, the
     last values of the signal, newest first.

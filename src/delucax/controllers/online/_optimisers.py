@@ -164,7 +164,8 @@ class _OnlineNewtonUpdate(eqx.Module):
 
 
 def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
-    r"""Newton's method online, with the curvature of all losses so far.
+    r"""Newton's method for online learning, with the sum of the curvatures of all
+    losses so far.
 
     $$\theta_{t+1} = \theta_t - P_t g_t, \qquad
     P_t^{-1} = n c I + \sum_{s \le t} J_s^\top H_s J_s$$
@@ -173,19 +174,20 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     derivative of the observation and control of step $s$ with respect to $\theta$.
     $H_s$ is the curvature of the cost at them, or its positive part if the cost is not
     convex. $c$ is the mean curvature per weight over the first $n$ steps that have any.
-    So the prior has the weight of $n$ average steps, for any scale of cost, disturbance
-    and weights.
+    So the prior counts as much as $n$ average steps, whatever the scale of the cost,
+    the disturbance and the weights.
 
     With quadratic costs, the optimiser is recursive least squares, and its regret grows
     as $\log T$.
 
-    Only a [`delucax.controllers.OnlineLearner`][] can use it, because it provides the
-    curvature. The memory and the time of a step grow with the square of the number of
-    weights.
+    Only a [`delucax.controllers.OnlineLearner`][] can use this optimiser, because such
+    a learner provides the curvature. The memory and the time of a step grow with the
+    square of the number of weights.
 
-    **Arguments:** `prior`: $n$, the weight of the prior in steps, 100 by default. With
-    a small prior the optimiser learns fast if the features are similar to each other. A
-    large prior makes the learned weights less sensitive to noise.
+    **Arguments:** `prior`: $n$, the number of average steps that the prior counts as,
+    100 by default. If the features are similar to each other, a small prior makes the
+    optimiser learn fast. A large prior makes the learned weights less sensitive to
+    noise.
 
     **Returns:** an `optax.GradientTransformationExtraArgs`. Two optimisers with the
     same prior are equal, so learners with the same prior share compiled code.

@@ -77,7 +77,7 @@ def _check_protocol(env: Any, where: str) -> None:
 
 
 class GymnaxDynamics(AbstractDynamics):
-    """The step of an environment in gymnax's protocol, as dynamics.
+    """Dynamics that call the step of an environment in gymnax's protocol.
     [`delucax.interop.gymnax.from_gymnax`][] makes it.
 
     The state is a vector with these parts, in this order:
@@ -86,11 +86,11 @@ class GymnaxDynamics(AbstractDynamics):
     - four numbers for a random key, if steps draw random numbers;
     - one entry that is 1 if the episode is over, otherwise 0.
 
-    Integers and booleans are stored as floats, which are exact up to 2^24 in float32.
-    The disturbance `w` is added to the next state.
+    Integers and booleans are stored as floats. In float32, integers up to 2^24 are
+    exact. The disturbance `w` is added to the next state.
 
-    The step is differentiable if the step of the environment is. Derivatives with
-    respect to integers are 0.
+    The dynamics are differentiable if the step of the environment is differentiable.
+    Derivatives with respect to integers are 0.
 
     **Arguments:**
 
@@ -282,34 +282,36 @@ def from_gymnax(
     """Convert an environment in gymnax's protocol to a [`delucax.Environment`][].
 
     `env` may be any object with `reset_env`, `step_env`, `action_space`, and `observe`
-    or `get_obs`, if these methods run under `jax.jit`. Environments of gymnax before
-    and after 1.0 are examples.
+    or `get_obs`, if these methods run under `jax.jit`. The environments of gymnax have
+    these methods, both before and after version 1.0.
 
     Controllers observe the whole state as a vector, as in
     [`delucax.interop.gymnax.GymnaxDynamics`][]. The names of the entries of this vector
-    come from the leaves of the state. `encode` returns the observation of the
-    environment. The cost is minus the reward, and a step that returns `done` terminates
-    the episode. A discrete action space becomes the table `actions`; a control between
-    two actions is rounded.
+    come from the leaves of the state. The `encode` of the result computes, from this
+    vector, the observation that `env` would return. The cost is minus the reward, and a
+    step that returns `done` terminates the episode. A discrete action space becomes the
+    table `actions` of the result. A control between two actions of the table is
+    rounded.
 
-    If a step uses the random key of `step_env`, the state carries this key. At the
-    start of an episode, the key is drawn from the key of the rollout.
+    If `step_env` uses its random key, the state holds this key too. At the start of an
+    episode, the key is drawn from the key of the rollout.
 
     The reward may depend on the next state, so `step_env` is evaluated twice: for the
-    dynamics and for the cost. Both the dynamics and the cost hold the parameters. To
-    change the parameters, or to differentiate with respect to them, convert the
+    dynamics and for the cost. Both the dynamics and the cost hold a copy of `params`.
+    To change the parameters, or to differentiate with respect to them, convert the
     environment again.
 
-    Gradients pass through a step if the environment does not stop them. Environments of
-    gymnax stop gradients. In gymnax 1.0, some environments have a method
-    `with_transition_gradients`, which `from_gymnax` uses if it exists.
+    Gradients pass through a step if `step_env` does not stop them with
+    `jax.lax.stop_gradient`. Environments of gymnax stop gradients. In gymnax 1.0, some
+    environments have a method `with_transition_gradients`, which `from_gymnax` uses if
+    it exists.
 
     **Arguments:**
 
     - `env`: the environment.
     - `params`: the parameters of the environment; `env.default_params` by default.
-    - `dt`: the duration of a step, 1 by default. The protocol does not define a
-        duration.
+    - `dt`: the duration of a step, 1 by default. Gymnax's protocol does not define the
+        duration of a step.
     - `**environment`: other arguments of [`delucax.Environment`][], such as `encode`,
         or `horizon`, which is `params.max_steps_in_episode` by default.
 

@@ -25,7 +25,8 @@ from .._spaces import (
 
 
 class GymnaxParams(eqx.Module):
-    """The numbers of an environment, as the `params` of gymnax's protocol.
+    """The numbers of an environment, in a form that gymnax's protocol takes as
+    `params`.
 
     **Arguments:**
 
@@ -89,14 +90,16 @@ class GymnaxEnv:
 
     - `env`: the environment. Its numbers are the `default_params`.
     - `discrete`: whether actions are whole numbers, which are indices into
-        `env.actions`. By default true if the environment has a table of actions.
+        `env.actions`. By default `discrete` is true if the environment has a table of
+        actions.
     - `separate_ends`: whether `step` returns `terminated` and `truncated`, as in gymnax
         1.0, in place of `done`. [`delucax.interop.gymnax.to_gymnax`][] describes the
         default.
 
     **Raises:** `ValueError` if an argument is wrong, or `env` is being traced. A step
     raises a `ValueError` if the action has the wrong size or type, or is not in the
-    table. Traced actions are truncated to whole numbers and clamped to the table.
+    table. Under `jax.jit`, actions cannot be checked, so they are truncated to whole
+    numbers and clamped to the table.
 
     !!! example
 
@@ -337,28 +340,31 @@ def to_gymnax(
     """Convert an environment to gymnax's protocol. This does not need gymnax.
 
     Libraries such as rejax and PureJaxRL, which train on environments of gymnax, can
-    train on the converted environment. The observation is `encode` of the observation
-    of the environment. The reward is minus the cost. The reward of the last step also
-    includes minus the final cost. The horizon truncates an episode, and `step` then
-    starts the next episode. Gradients pass through a step, but not through a reset.
+    train on the converted environment. Each observation is passed through the `encode`
+    of the environment. The reward is minus the cost. In the last step, the final cost
+    is also subtracted from the reward. When the horizon is reached, the episode is
+    truncated, and `step` starts the next episode. Gradients pass through a step, but
+    not through a reset.
 
     The numbers of the environment are in `params`, a
     [`delucax.interop.gymnax.GymnaxParams`][]. Use `jax.vmap` over `params` to run many
     plants at once.
 
     A reset draws the disturbances and the sensor noise of a whole episode from its key,
-    and the state carries these arrays. Under `jax.vmap`, each `step` computes a reset
-    for every environment, whether its episode ends or not. If drawing is slow, use
-    `step_env`, which draws nothing.
+    and stores these arrays in the state. Under `jax.vmap`, each `step` computes a reset
+    for every environment, whether its episode ends or not. If drawing these random
+    numbers is slow, use `step_env`, which never resets and draws nothing.
 
     **Arguments:**
 
     - `env`: the environment.
     - `discrete`: whether actions are whole numbers, which are indices into
-        `env.actions`. By default true if the environment has a table of actions.
+        `env.actions`. By default `discrete` is true if the environment has a table of
+        actions.
     - `separate_ends`: whether `step` returns `terminated` and `truncated`, as in gymnax
-        1.0, instead of `done`, which rejax and PureJaxRL expect. By default true if
-        gymnax 1.0 or later has been imported and rejax has not been imported.
+        1.0, instead of `done`, which rejax and PureJaxRL expect. By default
+        `separate_ends` is true if gymnax 1.0 or later has been imported and rejax has
+        not been imported.
 
     **Returns:** a [`delucax.interop.gymnax.GymnaxEnv`][].
 

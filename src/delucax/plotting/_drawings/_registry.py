@@ -156,7 +156,7 @@ def register_drawing(
     draw: Callable[..., Any],
     setup: Callable[..., Any] | None = None,
 ) -> None:
-    """Set how [`delucax.animate`][] draws a kind of plant.
+    """Register a function by which [`delucax.animate`][] draws plants of a class.
 
     The drawing is used for environments whose system or dynamics is of the class
     `system_class` or of a subclass. Registering the class again replaces its drawing.
@@ -165,15 +165,15 @@ def register_drawing(
 
     - `system_class`: a subclass of [`delucax.AbstractSystem`][] or of
         [`delucax.AbstractDynamics`][].
-    - `draw`: a function `draw(ax, x, u)` that draws one moment on Matplotlib axes of
-        equal aspect. `x` is the state, shape `(n,)`, and `u` the control, shape `(m,)`,
-        both NumPy arrays. `draw` is called for each frame, after the drawing of the
-        previous frame has been removed.
+    - `draw`: a function `draw(ax, x, u)` that draws the plant at one moment, on
+        Matplotlib axes of equal aspect. `x` is the state, shape `(n,)`, and `u` the
+        control, shape `(m,)`, both NumPy arrays. `draw` is called for each frame, after
+        the drawing of the previous frame has been removed.
     - `setup`: a function `setup(ax, environment, trajectory)` that is called once.
-        `setup` draws the parts that do not move and sets the limits of the axes. It may
-        return a dictionary, for example with the lengths of the plant, and `draw` gets
-        the entries as keyword arguments. None by default. Without `setup`, the limits
-        of the axes fit everything that is drawn.
+        `setup` draws the parts that do not move and sets the limits of the axes.
+        `setup` may return a dictionary, for example with the lengths of the plant. Then
+        `draw` gets the entries of this dictionary as keyword arguments. None by
+        default. Without `setup`, the limits of the axes fit everything that is drawn.
 
     **Raises:** `ValueError` if the class is not a subclass of `AbstractSystem` or
     `AbstractDynamics`, or if `draw` or `setup` is not a function.

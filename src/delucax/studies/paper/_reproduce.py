@@ -38,8 +38,8 @@ def reproduce(
     """Regenerate the figures and tables of the Deluca paper, and check its claims.
 
     The report says whether each claim holds, with the measured number. If a study
-    raises an error, the report lists a claim that does not hold, and the other studies
-    are still run.
+    raises an error, the report lists this as a claim that does not hold. The other
+    studies still run.
 
     **Arguments:**
 
@@ -48,8 +48,9 @@ def reproduce(
         `lq-perturbations`.
     - `out`: the folder to write to, `"paper"` by default. The function writes
         `report.html`, `claims.csv` and the figures to it. The folder `lung` (or
-        `lung-small`) in it contains the files of [`delucax.studies.lung_study`][],
-        which continues from these files if it was interrupted.
+        `lung-small`) inside `out` contains the files of
+        [`delucax.studies.lung_study`][], which continues from these files if it was
+        interrupted.
     - `small`: whether to use fewer seeds and steps; `False` by default.
     - `say`: a function that gets each line of text; `print` by default.
 

@@ -42,17 +42,18 @@ def lung_study(
 ) -> list[dict[str, Any]]:
     """Learn simulators of lungs from breaths, and train controllers in the simulators.
 
-    The controllers are then tested in the lungs themselves, and compared with the best
-    PIDs. The lungs are the lungs of the task `lung/double_compartment`, with the nine
-    pairs of resistance and compliance in the public data set. The valves of these lungs
-    respond with a lag, and the sensor is two samples late and adds noise of 0.2 cmH2O.
+    Then the controllers are tested on the original lungs, from which the breaths came,
+    and compared with the best PIDs. The original lungs are those of the task
+    `lung/double_compartment`, with the nine pairs of resistance and compliance in the
+    public data set. The valves of these lungs respond with a lag, and the sensor is two
+    samples late and adds noise of 0.2 cmH2O.
 
-    With `data`, the breaths come from a file. In this case the lungs themselves are
-    unknown. The controllers are therefore tested on grey-box lungs that are fitted to
-    the same breaths, and not on lungs with intermediate parameters. The study assumes
-    that the sensor of the ventilator is `sensor_delay` samples late with noise of 0.2
-    cmH2O, that the PEEP is about 5 cmH2O, and, except for the learned lungs, that the
-    valves behave like [`delucax.lung.Valves`][].
+    If you give `data`, the breaths come from a file. In this case the original lungs
+    are unknown. The controllers are therefore tested on grey-box lungs that are fitted
+    to the same breaths. They are not tested on lungs with intermediate parameters. The
+    study assumes that the sensor of the ventilator is `sensor_delay` samples late and
+    has noise of 0.2 cmH2O, and that the PEEP is about 5 cmH2O. Except for the learned
+    lungs, the study also assumes that the valves behave like [`delucax.lung.Valves`][].
 
     Each part of the study is stored in the folder when it is finished, so that an
     interrupted study continues from the last finished part.
@@ -63,8 +64,8 @@ def lung_study(
         `simulators.csv`, `summary.json`, figures, `breath.gif`, the learned lungs
         (`simulators.dlx`), and the controllers that stayed below the abort limit
         (`controllers/*.dlx`), which `delucax.load` reads.
-    - `small`: whether to study two lungs with short trainings, in about a minute;
-        `False` by default.
+    - `small`: whether to study only two lungs with short trainings, which takes about a
+        minute; `False` by default.
     - `data`: a file that [`delucax.lung.read_breaths`][] reads; none by default.
     - `seeds`: the number of controllers of each kind to train; 3 by default, or 1 with
         `small`.

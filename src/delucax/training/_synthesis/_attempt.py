@@ -11,11 +11,13 @@ class Attempt(NamedTuple):
     **Attributes:**
 
     - `structure`: the structure of the policy, as in [`delucax.training.Synthesis`][].
-    - `method`: the training method. `"gradient"` is the gradient of the rollout, and
-        `"gradient, 0.5 s"` the same with a damping that has the time constant 0.5 s.
-        `"evolution"` is [`delucax.training.evolve`][]. `"none"` is no training.
+    - `method`: the training method. `"gradient"` follows the gradient of the rollout.
+        `"gradient, 0.5 s"` does the same, but damps the gradient with a time constant
+        of 0.5 s. `"evolution"` is [`delucax.training.evolve`][]. `"none"` is no
+        training.
     - `cost`: the mean cost over 64 initial states that are only used to choose a
-        policy. It is the lowest one of all rounds of this training.
+        policy. If the training had several rounds, `cost` is the lowest mean cost of
+        all rounds.
     - `seconds`: the time that the training took, including compilation [s].
 
     !!! example

@@ -44,25 +44,27 @@ class Synthesis(NamedTuple):
     **Attributes:**
 
     - `policy`: the controller that was chosen.
-    - `structure`: its structure: `"zero"`, `"LQR"`, `"LQG"`, `"network"`, `"memory"` (a
-        recurrent network), `"LQR + network"`, `"LQR + memory"` or `"LQG + memory"`.
-    - `costs`: a dictionary of the total costs of `"policy"`, `"zero"`, `"LQR"` or
-        `"LQG"`, `"MPC"` and `"plan"`, with an entry for each episode. All controllers
-        run the same episodes, which were not used for training or for the choice of the
-        policy. A controller is missing if it does not exist for the environment or if
-        the budget left no time for it. MPC and the plan know the plant, and the plan
-        also knows the whole state and all disturbances in advance. So a policy may not
-        be able to reach the cost of the plan. But the plan is a local minimum: iLQR
-        starts from the controls of the policy, and without a gradient it stays there.
-    - `tried`: a list of [`delucax.training.Attempt`][], in the order of the trainings;
-        the first ones are zero control and the LQR or LQG. `pandas.DataFrame(tried)`
-        makes a table of it.
+    - `structure`: the structure of the policy: `"zero"`, `"LQR"`, `"LQG"`, `"network"`,
+        `"memory"` (a recurrent network), `"LQR + network"`, `"LQR + memory"` or
+        `"LQG + memory"`.
+    - `costs`: a dictionary from the name of a controller to its total cost in each
+        episode; the names are `"policy"`, `"zero"`, `"LQR"` or `"LQG"`, `"MPC"` and
+        `"plan"`. All controllers run the same episodes, which were not used for
+        training or for the choice of the policy. A controller is missing if it does not
+        exist for the environment or if the budget left no time for it. MPC and the plan
+        know the plant, and the plan also knows the whole state and all disturbances in
+        advance. So a policy may not be able to reach the cost of the plan. But the plan
+        is only a local minimum: iLQR improves the controls of the policy, and cannot
+        improve them where the gradient of the cost is zero.
+    - `tried`: a list of [`delucax.training.Attempt`][], in the order in which they were
+        trained; the list begins with zero control and the LQR or LQG.
+        `pandas.DataFrame(tried)` makes a table of it.
     - `seconds`: the time it took.
-    - `plants`: for a family of plants, a dictionary from each path of `ranges` to the
-        value of this parameter in each episode of the comparison; otherwise empty.
-    - `ended`: why the training ended: `"the time was over"`, `"no training lowered the
-        cost any more"`, `"the LQR was as good as a plan"` (MPC, with disturbances), or
-        `"interrupted"`.
+    - `plants`: a dictionary from each path of `ranges` to the value of this parameter
+        in each episode of the comparison; empty if there are no `ranges`.
+    - `ended`: why the training ended: `"the time was over"`,
+        `"no training lowered the cost any more"`, `"the LQR was as good as a plan"` (or
+        `"the LQR was as good as MPC"`, if there are disturbances), or `"interrupted"`.
 
     !!! example
 
@@ -143,75 +145,82 @@ def synthesise(
 
     1. Baselines: zero control, and the LQR of [`delucax.controllers.local_lqr`][]. If
         the state is not observed, or the sensor has noise, the state is called hidden.
-        Then the second baseline is the LQG of [`delucax.controllers.local_lqg`][]. A
-        baseline is left out, with a warning, if it does not exist for the environment.
-    2. Trials. The policies are a network that corrects the LQR
-        ([`delucax.controllers.Residual`][]) and a network alone. The correction is
-        recurrent with `ranges`, so that it can identify the plant from past
-        observations. If the state is hidden, both policies are recurrent. Each
-        policy is trained from the start in two ways. The first way is the gradient of a
-        rollout of at most 200 steps ([`delucax.training.ClippedSamples`][]). At first
-        it is damped with a time constant of a thirtieth of the rollout, then of a tenth
-        and of a quarter, and then it is not damped. The second way is
-        [`delucax.training.evolve`][], which needs no gradient. It comes first if the
-        plant has events. Evolution trains the weights of the network, and the gradient
-        also its bounds and the scales of its features; the LQR stays. If neither the
-        first two trials nor a plan is better than the LQR, the training ends.
-    3. Refinement. The better half of the trained policies is trained further, until one
-        of them is left, and then the others if time is left. A policy that costs more
-        than one and a half times the best goes to the end of the queue. Each method is
-        tried once for a policy, and then the method that lowered the cost most comes
-        first. If a method lowers the cost by less than 0.1%, its learning rate (or, of
-        an evolution, the standard deviation) is reduced to a tenth once, and then it is
-        not used any more for this policy.
-    4. Choice. The candidates are the four best policies, the best of each structure and
-        the baselines. The criterion is the mean cost over 64 initial states that also
-        chose between the rounds of the training, and up to 448 new ones. Each cost $c$
-        counts as $20 s \log(1 + c / 20 s)$, where $s$ is about the lowest median cost
-        so far, so that a rare episode of a huge cost does not outweigh all others. If
-        the cost of a baseline is at most half a percent higher than the best, the
-        search returns the baseline.
-    5. Comparison. The policy and the baselines run new episodes. If time is left, so do
-        MPC, and a plan for each episode that starts from the controls of the policy.
-        MPC needs an observed state.
+        If the state is hidden, the LQG of [`delucax.controllers.local_lqg`][] replaces
+        the LQR as a baseline. A baseline is left out, with a warning, if it does not
+        exist for the environment.
+    2. Trials. Two policies are tried: a network that corrects the LQR
+        ([`delucax.controllers.Residual`][]), and a network alone. If you pass `ranges`,
+        the network that corrects the LQR is recurrent, so that it can identify the
+        plant from past observations. If the state is hidden, both networks are
+        recurrent. Each policy is trained in two ways, each time from its initial
+        weights. The first way is the gradient of a rollout of at most 200 steps
+        ([`delucax.training.ClippedSamples`][]). At first this gradient is damped with a
+        time constant of a thirtieth of the rollout, then with a tenth and a quarter of
+        the rollout. In the end the gradient is not damped. The second way is
+        [`delucax.training.evolve`][], which needs no gradient. If the plant has events,
+        evolution comes before the gradient. Evolution trains only the weights of a
+        network. The gradient also trains the bounds of the network and the scales of
+        its features. Neither of them changes the LQR. If neither the first two trials
+        nor a plan is better than the LQR, the training ends.
+    3. Refinement. The better half of the trained policies is trained further, and then
+        the better half of these, until one policy is left. If there is still time, the
+        other policies are trained after it. A policy whose cost is more than one and a
+        half times the lowest cost also waits until then. For each policy, every method
+        is tried once. After that, the method that lowered the cost most is used first.
+        If a method lowers the cost by less than 0.1%, its learning rate (in evolution,
+        its standard deviation) is reduced to a tenth. If this happens again, the method
+        is not used any more for this policy.
+    4. Choice. The candidates are the four best policies, the best policy of each
+        structure, and the baselines. They are compared by their mean cost over up to
+        448 new initial states, and over the 64 initial states that were already used to
+        compare policies during the training. Each cost $c$ counts as
+        $20 s \log(1 + c / 20 s)$, so that a rare episode of a huge cost does not
+        outweigh all others. Here $s$ is about the lowest median cost so far. If the
+        cost of a baseline is at most half a percent higher than the best, the search
+        returns the baseline.
+    5. Comparison. The chosen policy and the baselines run new episodes. If time is
+        left, MPC runs the same episodes, and iLQR computes a plan for each of them,
+        which starts from the controls of the policy. MPC needs an observed state.
 
-    An interrupt (`KeyboardInterrupt`) ends the training. Then the choice and the
-    comparison follow; a further interrupt ends each of them. In any case the best
-    policy so far is returned.
+    An interrupt (`KeyboardInterrupt`) ends the training. The choice and the comparison
+    still follow, but a further interrupt ends the one that is running. In any case
+    `synthesise` returns the best policy so far.
 
     **Arguments:**
 
     - `environment`: the environment. The dynamics and the cost must be differentiable.
-        If a control has no bounds, the range of a network is the median of the LQR's
-        control plus and minus two standard deviations. If the LQR's control hardly
-        varies, two takes the place of two deviations, and without an LQR the range is
-        -2 to 2. If the control has one bound, the range has the same width and begins
-        at the bound.
+        If a control has no bounds, a network keeps it in a range: the median of the
+        LQR's control plus or minus two of its standard deviations. If the LQR's control
+        hardly varies, the range is the median plus or minus 2. Without an LQR, the
+        range is -2 to 2. If the control has only one bound, the range has the same
+        width, but begins at this bound.
     - `key`: a random key.
     - `budget`: the time for everything, including compilation, in seconds; 75 by
-        default, at least 10. Training may take 70% of it, and the rest is for the
-        choice and the comparison. If MPC and a plan are likely to take longer than
-        that, they are left out, and training may take 90%. They may take a tenth more
-        than the budget, and a program that compiles when the time is over finishes
-        first. If the budget ends before the first training, you get a warning, and a
-        single policy is trained. The number of trials depends on the speed of the
-        machine, so the same key can give another policy on another machine, or when
-        the programs are compiled already.
+        default, at least 10. Training may take 70% of the budget, and the rest is for
+        the choice and the comparison. If MPC and the plans are likely to take longer
+        than this rest, both are left out, and training may take 90% of the budget. MPC
+        and the plans may exceed the budget by a tenth. If a program is being compiled
+        when the time is over, its compilation is finished first. If the budget ends
+        before the first training, you get a warning, and a single policy is trained.
+        The number of trials depends on the speed of the machine, so the same key can
+        give another policy on another machine, or when the programs are compiled
+        already.
     - `ranges`: ranges of parameters, as in [`delucax.randomise`][], for a policy that
-        works on a family of plants: each episode draws a plant. The LQR is designed for
-        the nominal plant; MPC and the plan know each plant. None by default: one plant.
+        works on a family of plants; each episode draws its own plant from the ranges.
+        The LQR is designed for the nominal plant; MPC and the plan know each plant.
+        None by default: one plant.
     - `width`, `depth`: the units in a hidden layer, and the number of hidden layers of
         the networks; 32 and 1 by default. A recurrent network has one layer.
-    - `progress`: whether to show a bar with the seconds and the cost so far; true by
-        default.
+    - `progress`: whether to show a progress bar with the time and the lowest cost so
+        far; true by default.
 
     **Returns:** a [`delucax.training.Synthesis`][].
 
-    **Raises:** `ValueError`, before any training, if an argument has the wrong type,
-    if the dynamics or the cost are not differentiable, if an initial state or its cost
-    is not finite, or if none of about 16 controls keeps the first step finite. Warns if
-    the cost of the policy is not finite in some episodes of the choice or the
-    comparison.
+    **Raises:** `ValueError`, before any training, if an argument has the wrong type, if
+    the dynamics or the cost are not differentiable, if an initial state or its cost is
+    not finite, or if the first step is not finite with any of about 16 controls that
+    are tried. Warns if the cost of the policy is not finite in some episodes of the
+    choice or the comparison.
 
     !!! example
 

@@ -104,11 +104,11 @@ def bootstrap(
     the new record, starting at `fitted`. The spread of the estimates over all draws
     gives the intervals.
 
-    The intervals of [`delucax.training.sysid.physical`][] assume white normal noise and
-    a model that is nearly linear in the parameters across the interval. The bootstrap
-    does not assume that the noise is normal or the model linear. If the noise is not
-    white, draw blocks of neighbouring residuals together with `block`. The cost is one
-    fit for each draw.
+    The intervals of [`delucax.training.sysid.physical`][] assume that the noise is
+    white and normal, and that the model is nearly linear in the parameters within the
+    interval. The bootstrap assumes neither normal noise nor a linear model. If the
+    noise is not white, draw blocks of neighbouring residuals together with `block`. The
+    cost is one fit for each draw.
 
     **Arguments:**
 
@@ -116,8 +116,8 @@ def bootstrap(
     - `record`: the data to which the parameters were fitted, a
         [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters of the fit, in the form that `physical` takes; by
-        default the names in `fitted`. If you gave `physical` a dictionary with
-        constraints, give it here again.
+        default the names in `fitted`. If you passed a dictionary with constraints to
+        `physical`, pass the same dictionary here.
     - `draws`: the number of draws, at least 2; 100 by default.
     - `block`: the number of neighbouring residuals that are drawn together, 1 by
         default. A good choice is several times the number of samples over which the

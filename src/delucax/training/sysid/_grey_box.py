@@ -45,17 +45,17 @@ class GreyBox(NamedTuple):
     **Attributes:**
 
     - `model`: the dynamics, [`delucax.Discretized`][] of a
-        [`delucax.systems.Corrected`][] system; the physics alone if no network is
-        better.
+        [`delucax.systems.Corrected`][] system; if no network reduces the error, it is
+        the model without a network.
     - `physics`: the fit without the network, a
         [`delucax.training.sysid.Identified`][].
-    - `errors`: a dictionary from each `spread` that was tried to the relative
-        root-mean-square error of a free run over the last part of the records. The
-        entry for the spread 0 is the error of the physics alone.
+    - `errors`: a dictionary with an entry for each `spread` that was tried: the
+        relative root-mean-square error of a free run over the last part of the records.
+        The entry for the spread 0 is the error of the physics alone.
     - `spread`: the spread that was chosen; 0 for the physics alone.
     - `result`: success, or the reason why the last fit ended before it had converged.
-        If it had not converged, the model is the best one so far: try a larger
-        `max_steps`.
+        If the last fit did not converge, `model` is the best model so far, and you can
+        try a larger `max_steps`.
 
     The confidence intervals in `physics` belong to the fit of the physics alone. The
     parameters in `model` were estimated together with the network, and have no
@@ -99,7 +99,8 @@ def grey_box(
     max_steps: int = 50,
     key: PRNGKey,
 ) -> GreyBox:
-    r"""Fit physical parameters, and a network for what the equations leave out.
+    r"""Fit physical parameters together with a network, which learns what the equations
+    leave out.
 
     $$\min_{\theta, \phi, z} \sum_k \left|\frac{y_k - h(x_k)}{\mathrm{noise}}\right|^2
     + \left|\frac{\phi - \phi_0}{s}\right|^2, \qquad
@@ -111,12 +112,14 @@ def grey_box(
        noise.
     2. The physics and the network are fitted together to the first part of each record,
         once for each of `spreads`, by the Levenberg-Marquardt method. The last layer of
-        the network starts at zero. The weights have a normal prior, with standard
-        deviation $s$: in the inner layers, the mean is the random initial weights and
-        $s = 1$; in the last layer, the mean is zero and $s$ is the spread.
+        the network starts at zero. The weights have a normal prior with the standard
+        deviation $s$. In the inner layers, the mean of the prior is the random initial
+        weights, and $s = 1$. In the last layer, its mean is zero, and $s$ is the
+        spread.
     3. The spread with the smallest error in a free run over the last part of the
         records is chosen, and the model is fitted once more to the whole records. If no
-        network reduces this error by 1%, the physics alone is returned.
+        network reduces this error by 1%, `grey_box` returns the model without a
+        network.
 
     **Arguments:**
 
@@ -124,19 +127,20 @@ def grey_box(
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate, as in
         [`delucax.training.sysid.physical`][].
-    - `width`, `depth`: units in each hidden layer and number of hidden layers of the
-        network, 8 and 1 by default.
+    - `width`, `depth`: the number of units in each hidden layer of the network, and the
+        number of its hidden layers; 8 and 1 by default.
     - `corrected`: the names of the states whose derivatives the network corrects; all
         by default. Leave out derivatives that are known exactly, such as the derivative
         of a position. The size of each correction is by default the standard deviation
         of the derivative along the record.
-    - `spreads`: the spreads to try; 0.01, 0.03, 0.1 and 0.3 by default.
+    - `spreads`: the standard deviations to try for the prior of the last layer; 0.01,
+        0.03, 0.1 and 0.3 by default.
     - `x0`, `window`: as in `physical`; a `window` of `None` takes each record as one
         window.
     - `share`: the fraction of each record to which the model is fitted while the spread
         is chosen, between 0 and 1; 0.75 by default.
-    - `max_steps`: the maximum number of iterations of each fit, 50 by default. The fit
-        of the physics alone may take at least 100 iterations.
+    - `max_steps`: the maximum number of iterations of each fit, 50 by default. For the
+        fit of the physics alone, this maximum is never below 100.
     - `key`: a random key for the initial weights.
 
     **Returns:** a [`delucax.training.sysid.GreyBox`][].

@@ -31,15 +31,17 @@ _LOADS = 0.02
 class Identified(eqx.Module):
     r"""A model that was fitted to data, and how well the data determine it.
 
-    A direction is a combination of relative changes of the parameters (in a linear fit,
-    of changes in units of the size of the regressors). The directions are the singular
-    vectors of the sensitivity of the data to relative changes of the parameters. The
-    spread of a direction is the standard deviation of the estimate along it. A
-    direction is not identifiable if the data do not depend on it, or if its spread is
-    as large as the parameters themselves. In such a direction, the parameters can
-    change together without a clear effect on the data. A parameter without a constraint
-    may be zero, so its size is not used for this test. If its estimate is near zero,
-    its change is measured in units of a hundred standard deviations.
+    A direction is a combination of relative changes of the parameters. In a linear fit,
+    the changes are not relative, but scaled with the size of the regressors. The
+    directions are the singular vectors of the sensitivity of the data to relative
+    changes of the parameters. The spread of a direction is the standard deviation of
+    the estimate along this direction. A direction is not identifiable if the data do
+    not depend on it, or if its spread is as large as the parameters themselves. Along a
+    direction that is not identifiable, the parameters can change together without a
+    clear effect on the data. A parameter without a constraint may be zero, so the
+    spread is not compared with the size of such a parameter. If its estimate is near
+    zero, its relative change is the change divided by a hundred of its standard
+    deviations, not by the estimate.
 
     Printing the object prints the table of `report`.
 
@@ -49,25 +51,27 @@ class Identified(eqx.Module):
     - `names`: the names of the p parameters.
     - `estimate`: the values of the parameters, shape `(p,)`; `(outputs, p)` in a linear
         fit.
-    - `std`: the standard deviations of the estimates, same shape. Infinite if a
-        parameter is not identifiable, NaN if the fit did not converge.
+    - `std`: the standard deviations of the estimates, same shape. A standard deviation
+        is infinite if the parameter is not identifiable, and NaN if the fit did not
+        converge.
     - `low`, `high`: the ends of the confidence intervals of the parameters, same shape.
         If a parameter is not identifiable, its interval spans all valid values, for
-        example 0 to infinity. NaN if the fit did not converge.
-    - `directions`: shape `(p, p)`, a unit vector in each row, starting with the
+        example 0 to infinity. If the fit did not converge, both ends are NaN.
+    - `directions`: a unit vector in each row, shape `(p, p)`; the first row is the
         direction that the data determine least.
     - `spread`: the standard deviation along each direction, shape `(p,)`; NaN if the
         fit did not converge.
     - `identifiable`: whether each direction is identifiable, shape `(p,)`; false if the
         fit did not converge.
     - `noise`: the standard deviation of the residuals of each output.
-    - `correlation`: a test of whether the residuals are white: $\sqrt N\, r$, where $r$
-        is the correlation coefficient of the residuals at lag one over $N$ samples, for
-        the output with the largest $r$. For white residuals, this number is
-        approximately standard normal. Above 4, the model is wrong or the noise is
-        correlated. In both cases the confidence intervals are too narrow, and the
-        report says so. The number is 0 if the residuals are rounding errors, or less
-        than half of the `noise` that was given; `None` in linear fits.
+    - `correlation`: the number $\sqrt N\, r$, a test of whether the residuals are
+        white. Here $N$ is the number of samples, and $r$ is the correlation coefficient
+        of the residuals at lag one, for the output where it is largest. For white
+        residuals, this number has approximately a standard normal distribution. If it
+        is above 4, the model is wrong or the noise is correlated. In both cases the
+        confidence intervals are too narrow, and `report` says so. The number is 0 if
+        the residuals are only rounding errors, or less than half of the `noise` that
+        you passed. In linear fits it is `None`.
     - `x0`: the estimated first state, shape `(n,)`, or `(runs, n)` for a list of
         records; `None` in linear fits, which do not estimate the first state.
     - `window`, `burn_in`: the options of the fit, in steps; `None` and 0 in linear

@@ -37,8 +37,8 @@ class LatentDynamics(AbstractDynamics):
     **Arguments:**
 
     - `A`, `B`, `C`: the linear part, shapes `(n, n)`, `(n, m)` and `(p, n)`.
-    - `width`, `depth`: units in each hidden layer and number of hidden layers, 16 and 1
-        by default.
+    - `width`, `depth`: the number of units in each hidden layer, and the number of
+        hidden layers; 16 and 1 by default.
     - `dt`: the step, 1 by default.
     - `u_mean`, `u_size`: $\bar u$ and $\sigma_u$, shape `(m,)` or a number; 0 and 1 by
         default.
@@ -146,8 +146,8 @@ class Encoder(eqx.Module):
         outputs, earliest first, and the other columns to all past controls.
     - `past`: the number of samples.
     - `outputs`: the number of outputs, p.
-    - `width`, `depth`: units in each hidden layer and number of hidden layers, 16 and 1
-        by default.
+    - `width`, `depth`: the number of units in each hidden layer, and the number of
+        hidden layers; 16 and 1 by default.
     - `u_mean`, `u_size`: $\bar u$ and $\sigma_u$, shape `(m,)` or a number; 0 and 1 by
         default.
     - `y_mean`, `y_size`: $\bar y$ and $\sigma_y$, shape `(p,)` or a number; 0 and 1 by

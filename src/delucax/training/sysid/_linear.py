@@ -108,7 +108,7 @@ def arx(
     **Arguments:**
 
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
-        time. `controls[k]` affects `outputs[k + 1]` at the earliest.
+        time. `controls[k]` must not affect an output before `outputs[k + 1]`.
     - `outputs_back`: $a$, the number of past outputs.
     - `controls_back`: $b$, the number of past controls.
     - `delay`: the number of steps from a control to its first effect, 1 by default.

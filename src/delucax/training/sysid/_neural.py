@@ -36,7 +36,8 @@ class NeuralDynamics(AbstractDynamics):
 
     **Arguments:**
 
-    - `states`, `controls`: the names of the states and controls, or their numbers.
+    - `states`, `controls`: the names of the states and of the controls, or how many of
+        them there are.
     - `width`: units in each hidden layer, 64 by default.
     - `depth`: the number of hidden layers, 2 by default.
     - `dt`: the step, 1 by default.
@@ -45,7 +46,7 @@ class NeuralDynamics(AbstractDynamics):
     - `u_scale`: $\sigma_u$, shape `(m,)` or a number; 1 by default.
     - `step_scale`: $\sigma_\mathrm{step}$, the typical change of the state in a step,
         shape `(n,)` or a number; 1 by default.
-    - `activation`: the activation of the hidden layers, `jnp.tanh` by default.
+    - `activation`: the activation function of the hidden layers, `jnp.tanh` by default.
     - `key`: a random key for the initial weights.
 
     **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
@@ -127,7 +128,7 @@ class NeuralDynamics(AbstractDynamics):
 def windows(
     record: Records, steps: int, *, stride: int = 1
 ) -> tuple[Array, Array, Array]:
-    """Cut records of the state into windows, the data of a multi-step fit.
+    """Cut records of the state into windows, which are the data for a multi-step fit.
 
     **Arguments:**
 
@@ -182,7 +183,7 @@ def _cut(groups: list[Record], steps: int, stride: int) -> tuple[Array, Array, A
 
 
 class PredictionError(eqx.Module):
-    r"""The mean squared error of the predictions of dynamics, a loss to train them.
+    r"""A loss for training dynamics: the mean squared error of their predictions.
 
     $$\frac{1}{N K} \sum_{i=1}^N \sum_{k=1}^K
     \left|\frac{x_{i,k} - \hat x_{i,k}}{\mathrm{scale}}\right|^2$$
@@ -190,11 +191,11 @@ class PredictionError(eqx.Module):
     The sums run over the $N$ windows of a batch and their $K$ steps. The prediction
     $\hat x_{i,k}$ is a simulation of the model with the recorded controls, from the
     first state of window $i$. With windows of one step, the loss measures one-step
-    predictions. Longer windows also penalise errors that accumulate. Angles are
-    compared by `model.difference`.
+    predictions. With longer windows, the loss also penalises errors that accumulate
+    from step to step. Angles are compared by `model.difference`.
 
-    **Arguments:** `scale`: the size of each state, a number or shape `(n,)`; 1 by
-    default.
+    **Arguments:** `scale`: the typical size of each state, by which the error of this
+    state is divided; a number or shape `(n,)`, 1 by default.
 
     **Returns:** a call `loss(model, batch, key)` returns a scalar. `model` is any
     dynamics, and `batch` has the form that [`delucax.training.sysid.windows`][]

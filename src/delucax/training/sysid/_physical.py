@@ -68,8 +68,8 @@ def physical(
     wrong parameters from drifting far from the record. Unlike in the original method,
     the end of a window need not match the beginning of the next window, so each window
     adds one unknown state. If some states are not measured, a fit with `window=None` is
-    often several times as precise. A fit on short windows gives a good first guess for
-    it.
+    often several times as precise as a fit on short windows. A fit on short windows
+    gives a good first guess for the fit with `window=None`.
 
     The method is Levenberg-Marquardt. The steps of the method are scaled by the
     sensitivities of the data, so that parameters of very different size can be
@@ -77,30 +77,30 @@ def physical(
     as in [`delucax.training.fit`][], so their confidence intervals satisfy the
     constraints.
 
-    The fit has converged if no step of the linearised problem is longer than a
+    The fit has converged if the next step would change the estimate by at most a
     twentieth of the standard deviation that the noise causes. If the fit has not
     converged, or if its residuals are correlated from step to step, a second attempt
     starts from fits on shorter windows. These windows have two steps if the state is
-    measured. Otherwise they have eight steps at first, and then a length between eight
-    and `window`. If the second attempt does not converge either, `result` gives the
-    reason, and the result has no intervals. In this case try a better first guess, a
-    shorter window, or smaller steps of the integrator.
+    measured. Otherwise the windows have eight steps in the first of these fits, and
+    between eight and `window` steps in the next one. If the second attempt does not
+    converge either, `result` gives the reason, and the result has no intervals. In this
+    case try a better first guess, a shorter window, or smaller steps of the integrator.
 
     **Arguments:**
 
-    - `dynamics`: the dynamics; their parameters are the first guess. If the dynamics
-        and the record have different steps, or if the controls are interpolated, the
-        dynamics must be a [`delucax.Discretized`][] system without events. The step of
-        the dynamics, with the same solver and substeps, is then stretched to the length
-        of each step of the record.
+    - `dynamics`: the dynamics; their parameters are the first guess. If the time steps
+        of the dynamics and of the record differ, or if the controls are interpolated,
+        the dynamics must be a [`delucax.Discretized`][] system without events. The
+        dynamics then take one step for each step of the record, with the same solver
+        and the same number of substeps.
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them.
     - `parameters`: the parameters to estimate: a path such as `"system.length"`, a list
         of paths, or a dictionary from path to constraint, like the argument `trainable`
         of [`delucax.training.fit`][].
     - `x0`: a guess of the first state, shape `(n,)`, or one guess for each record. A
         simulation from `x0` gives the first guess of the states at which the windows
-        begin. By default the first guess consists of the measurements, which must then
-        be the state.
+        begin. By default the measurements are this first guess, which is possible only
+        if the outputs are the state.
     - `window`: the number of steps of a window, 20 by default. `None` takes each record
         as one window, which is the output-error method.
     - `burn_in`: the number of samples at the beginning of each window that are left out
@@ -118,9 +118,10 @@ def physical(
     each record.
 
     **Raises:** `ValueError` on arguments of the wrong shape or kind, or if one of
-    `parameters` does not exist; if `throw`, also if the record has fewer measurements
-    than unknowns, and `RuntimeError` if the fit fails (under a transformation, an error
-    at run time).
+    `parameters` does not exist. If `throw` is true, a `ValueError` is also raised if
+    the record has fewer measurements than unknowns, and a `RuntimeError` if the fit
+    fails. Under a transformation such as `jax.jit`, a failed fit gives an error at run
+    time.
 
     Source: Bock, 1983 (multiple shooting); Moré, 1978 (scaling); Ljung, 1999.
 

@@ -45,7 +45,7 @@ class Record(eqx.Module):
     - `dt`: the time between two samples, for uniform samples; or
     - `times`: the times of the samples, shape `(N,)`, increasing. Steps may differ.
     - `allow_gaps`: accept gaps in `times`; false by default. A gap is a step that is
-        more than five times as long as nine tenths of all steps.
+        more than five times as long as the 90% quantile of all steps.
     - `hold`: the control between two samples, `"zero"` by default:
         - `"zero"`: the control of the sample before, as a digital controller holds it;
         - `"linear"`: the straight line between the two samples;
@@ -53,8 +53,8 @@ class Record(eqx.Module):
             band-limited signals.
 
     **Raises:** `ValueError` if an array has the wrong shape, a sample is not finite,
-    the times do not increase or have a gap, or an output or one of several controls
-    never changes. The error message names the row and the column.
+    the times do not increase or have a gap, an output never changes, or one of several
+    controls never changes. The error message names the row and the column.
 
     !!! example
 

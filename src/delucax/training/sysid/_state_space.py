@@ -42,8 +42,8 @@ class StateSpace(NamedTuple):
         validation part, shape `(p,)`.
     - `start_error`: the same error before training.
     - `history`: the record of the training, a [`delucax.training.History`][]. The
-        metric `"validation"` in it is the validation error divided by the spread of the
-        outputs.
+        metric `"validation"` of this history is the validation error divided by the
+        spread of the outputs.
     - `result`: success, or `RESULTS.diverged` if the training ended early or no free
         run was finite.
 
@@ -88,7 +88,8 @@ def state_space(
     progress: bool = True,
     key: PRNGKey,
 ) -> StateSpace:
-    r"""Train a neural state-space model of outputs and controls, with its encoder.
+    r"""Train a neural state-space model together with its encoder, on records of
+    outputs and controls.
 
     $$x_{k+1} = A x_k + B u_k + f(x_k, u_k), \qquad y_k = C x_k + h(x_k)$$
 
@@ -98,8 +99,8 @@ def state_space(
     The networks $f$ and $h$, the matrices and the encoder are trained together. The
     loss is the mean squared error of predictions over windows of `horizon` steps, which
     begin anywhere in the records. The encoder gives the state at the beginning of a
-    window. Each step of Adam draws new windows, and the learning rate decays as a
-    cosine. Training starts with the linear model of
+    window. Each step of Adam draws new windows at random, and the learning rate follows
+    a cosine decay. Training starts with the linear model of
     [`delucax.training.sysid.subspace`][] with $f = h = 0$, or at random weights if the
     data do not give such a model.
 
@@ -107,10 +108,10 @@ def state_space(
     free run over this part is simulated, from a state that the encoder gives.
     `state_space` returns the weights with the smallest error in these free runs.
 
-    The state has no unit, and another training gives another state; `model.observe`
-    gives the outputs. As in `subspace`, a control affects the outputs from the next
-    sample on. The plant must be stable, because the errors in a free run of an unstable
-    plant grow even for a good model.
+    The state has no unit and no physical meaning, because another training gives
+    another state. To get the outputs, call `model.observe`. As in `subspace`, a control
+    affects the outputs from the next sample on. The plant must be stable, because the
+    errors in a free run of an unstable plant grow even for a good model.
 
     **Arguments:**
 
@@ -120,9 +121,10 @@ def state_space(
     - `past`: the number of past samples that the encoder uses; a few times n is a good
         choice.
     - `horizon`: the number of steps of a window, 50 by default. A good choice is the
-        number of steps after which the plant has forgotten its state.
-    - `width`, `depth`: units in each hidden layer and number of hidden layers of each
-        network, 16 and 1 by default.
+        number of steps after which an initial state of the plant has almost no effect
+        any more.
+    - `width`, `depth`: the number of units in each hidden layer of a network, and the
+        number of its hidden layers; 16 and 1 by default.
     - `steps`: the number of training steps, 2000 by default.
     - `batch_size`: the number of windows in a training step, 64 by default.
     - `learning_rate`: the initial learning rate, 0.01 by default.

@@ -25,20 +25,20 @@ class Subspace(eqx.Module):
 
     **Attributes:**
 
-    - `model`: a [`delucax.LinearDynamics`][], $x_{k+1} = A x_k + B u_k$, $y_k = C x_k$;
-        about an operating point if the fit was affine.
+    - `model`: a [`delucax.LinearDynamics`][], $x_{k+1} = A x_k + B u_k$, $y_k = C x_k$.
+        With `affine=True`, `x`, `u` and `y` are deviations from an operating point.
     - `singular_values`: shape `(horizon p,)`, in descending order, in units of the
         spread of the outputs. If the values have a clear gap, the number of values
         before the gap is the order that the model needs.
     - `x0`: the first state, shape `(n,)`, or `(records, n)` for a list of records.
     - `gain`: $K$ of the Kalman predictor $x_{k+1} = A x_k + B u_k + K (y_k - C x_k)$,
         shape `(n, p)`.
-    - `start_gain`: the gain of the predictor with which $B$ and the first states were
-        fitted, shape `(n, p)`. For a stable model the gain is nearly zero, so that the
-        predictor is a free run. For an unstable model the gain makes the predictor
-        stable.
-    - `error`: the root-mean-square error `y - C x` of the predictor with `start_gain`,
-        shape `(p,)`.
+    - `start_gain`: the gain of a second predictor, shape `(n, p)`. $B$ and the first
+        states were fitted to the errors of this predictor. For a stable model the gain
+        is nearly zero, so that the predictor is a free run. For an unstable model the
+        gain makes the predictor stable.
+    - `error`: the root mean square of the errors `y - C x` of the predictor with the
+        gain `start_gain`, shape `(p,)`.
     - `result`: success; `RESULTS.unexciting` if the controls do not excite the system
         enough; `RESULTS.diverged` if the model is not finite.
 
@@ -111,10 +111,12 @@ def subspace(
     The method needs no first guess and no iterations. The method predicts the outputs
     of the next `horizon` steps from the past, and removes the effect of the controls of
     these steps. The remaining prediction has as many independent directions as the
-    system has states. These directions are the singular vectors of a block of a
-    triangular factor of the Hankel matrices, and the vectors give $A$, $C$ and $K$.
-    Then linear least squares gives $B$, the first states and the operating point, based
-    on the errors of a free run. Time and memory are linear in the number of samples.
+    system has states. To find these directions, the Hankel matrices are factorised into
+    a triangular and an orthogonal matrix. The directions are the singular vectors of a
+    block of the triangular matrix, and they give $A$, $C$ and $K$. Then $B$, the first
+    states and the operating point are computed by linear least squares, so that a free
+    run of the model has the smallest squared error. The computing time and the memory
+    grow linearly with the number of samples.
 
     The model is strictly proper: a control affects the outputs from the next sample on,
     as in all dynamics of this library. If your control affects the output of the same
@@ -126,19 +128,19 @@ def subspace(
 
     - `record`: a [`delucax.training.sysid.Record`][] or a list of them, uniform in
         time, with any number of outputs and controls.
-    - `order`: n, the number of states. `singular_values` of the result show how many
-        are needed; they do not depend on `order` if you give `horizon`.
+    - `order`: n, the number of states. The `singular_values` of the result show how
+        many states are needed. They do not depend on `order` if you pass `horizon`.
     - `horizon`: the number of future steps that are predicted, and also the number of
-        past steps that are used. A longer horizon averages over more noise. By default
-        the horizon is the larger of 10 and twice the order, or shorter if the records
-        have too few samples.
+        past steps that are used. A longer horizon reduces the effect of noise, because
+        it averages over more samples. By default the horizon is the larger of 10 and
+        twice the order, or shorter if the records have too few samples.
     - `affine`: whether to estimate an operating point too, for outputs and controls
         that are not measured from an equilibrium; false by default.
     - `throw`: raise an error if the controls do not excite the system enough; true by
         default. If false, check `result`.
 
-    **Returns:** [`delucax.training.sysid.Subspace`][]. The states of the model are
-    balanced, and ordered by how much they contribute to the outputs.
+    **Returns:** [`delucax.training.sysid.Subspace`][]. The model is in balanced
+    coordinates: its states are ordered by how much they contribute to the outputs.
 
     **Raises:** `ValueError` if `record` is not a uniform record or a list of them, a
     count is below 1, `order` exceeds `(horizon - 1)` times the number of outputs, or

@@ -36,8 +36,8 @@ def read_csv(
     - `dt`: the time from one row to the next.
     - `by`: the name of a column that labels the experiments. Neighbouring rows with the
         same label make one record. By default the file is one record.
-    - `hold`: the control between samples, as in [`delucax.training.sysid.Record`][];
-        `"zero"` by default.
+    - `hold`: the form of the control between two samples, as in
+        [`delucax.training.sysid.Record`][]; `"zero"` by default.
     - `allow_gaps`: accept gaps in the times; false by default.
     - `delimiter`: the character between columns, a comma by default.
 

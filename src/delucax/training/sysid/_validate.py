@@ -43,9 +43,9 @@ class Validation(eqx.Module):
     - `autocorrelation`: the correlation of the errors of the free run at lags 1, 2,
         ..., shape `(lags, p)`.
     - `cross_correlation`: the correlation of the errors of the free run with the
-        controls 0, 1, ... steps before, shape `(lags + 1, p, m)`.
-    - `bound`: if the errors and controls are white and independent, 95% of the
-        correlations are within `-bound` and `bound`.
+        controls 0, 1, ... steps earlier, shape `(lags + 1, p, m)`.
+    - `bound`: the 95% bound of the correlations: if the errors and controls are white
+        and independent, 95% of the correlations lie between `-bound` and `bound`.
     - `p_value`: the p-value of the Ljung-Box test that the errors are white, shape
         `(p,)`. A small value means that the errors are correlated in time.
 
@@ -101,9 +101,10 @@ def validate(
 
     Use a record to which the model was not fitted. The first state is estimated from
     the first samples by least squares. From this state, the free run simulates the
-    model with the recorded controls. With `ahead`, shorter predictions are compared
-    too. These predictions begin throughout the record, at states that are estimated in
-    the same way.
+    model with the recorded controls. If `ahead` is positive, predictions over 1 to
+    `ahead` steps are compared with the record too. These predictions start at many
+    times in the record. The state at the start of each prediction is estimated in the
+    same way as the first state.
 
     **Arguments:**
 
