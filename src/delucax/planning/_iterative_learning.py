@@ -159,9 +159,9 @@ def igpc(
     where $F$ is the model, $w$ the mismatch and $M$ the `memory`. The first three terms
     are the same as in [`delucax.planning.ilc`][]. The control is clipped to the bounds.
 
-    The parameters $E$ and $o$ are zero at the start of each run. At step $k$, gradient
-    descent with the step size `learning_rate / k` updates both. The updates lower a
-    counterfactual cost. To compute it, `igpc` simulates the last `horizon` steps again
+    The parameters $E$ and $o$ are zero at the start of each run. From step `horizon`
+    on, gradient descent updates both, with the step size `learning_rate / k` at step
+    $k$. The updates lower a counterfactual cost. To compute it, `igpc` simulates the last `horizon` steps again
     on the model, with the present $E$ and $o$ and with the observed mismatch. The
     counterfactual cost is the last stage cost of this simulation. The next iteration
     linearises the model along this run, and therefore keeps what the run has learned.

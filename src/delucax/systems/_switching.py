@@ -218,9 +218,9 @@ class ValveWithStops(AbstractHybridSystem):
 
     The position $p$ is 0 where the valve is closed and 1 where it is open. At a stop
     the valve bounces, $\dot p^+ = -e\, \dot p^-$. If the speed after a bounce would be
-    below `rest_speed`, the valve stays at the stop, in the mode `"closed"` or `"open"`.
-    The valve leaves the stop again when the force away from the stop exceeds
-    `adhesion`.
+    below `rest_speed` and the force away from the stop is below `adhesion`, the valve
+    stays at the stop, in the mode `"closed"` or `"open"`. The valve leaves the stop
+    again when the force away from the stop exceeds `adhesion`.
 
     The state is (position, velocity [1/s], mode), the control is (force [N]). The modes
     are `"free"`, `"closed"` and `"open"`. The unit of length is the distance between

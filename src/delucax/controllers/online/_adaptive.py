@@ -60,8 +60,8 @@ class Adaptive(AbstractController):
     $$p_i \leftarrow p_i \exp(-\mathrm{rate}\, (\ell_i - \bar \ell) / \sigma)$$
 
     Here $\bar \ell$ is the mean of the losses, weighted by $p_i$, and $\sigma$ is the
-    standard deviation of the recent mean losses. Because of $\sigma$, the weights do
-    not depend on the scale of the losses. Then a fraction `share` of the total weight
+    standard deviation of the recent mean losses. The quotient is clipped to $[-1, 1]$.
+    Because of $\sigma$, the weights do not depend on the scale of the losses. Then a fraction `share` of the total weight
     is distributed evenly over all active experts, so that the weight of any expert can
     rise quickly.
 
