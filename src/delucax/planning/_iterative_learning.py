@@ -161,10 +161,11 @@ def igpc(
 
     The parameters $E$ and $o$ are zero at the start of each run. From step `horizon`
     on, gradient descent updates both, with the step size `learning_rate / k` at step
-    $k$. The updates lower a counterfactual cost. To compute it, `igpc` simulates the last `horizon` steps again
-    on the model, with the present $E$ and $o$ and with the observed mismatch. The
-    counterfactual cost is the last stage cost of this simulation. The next iteration
-    linearises the model along this run, and therefore keeps what the run has learned.
+    $k$. The updates lower a counterfactual cost. To compute it, `igpc` simulates the
+    last `horizon` steps again on the model, with the present $E$ and $o$ and with the
+    observed mismatch. The counterfactual cost is the last stage cost of this
+    simulation. The next iteration linearises the model along this run, and therefore
+    keeps what the run has learned.
 
     **Arguments:**
 

@@ -61,9 +61,9 @@ class Adaptive(AbstractController):
 
     Here $\bar \ell$ is the mean of the losses, weighted by $p_i$, and $\sigma$ is the
     standard deviation of the recent mean losses. The quotient is clipped to $[-1, 1]$.
-    Because of $\sigma$, the weights do not depend on the scale of the losses. Then a fraction `share` of the total weight
-    is distributed evenly over all active experts, so that the weight of any expert can
-    rise quickly.
+    Because of $\sigma$, the weights do not depend on the scale of the losses. Then a
+    fraction `share` of the total weight is distributed evenly over all active experts,
+    so that the weight of any expert can rise quickly.
 
     With `play="mix"` the control is $u = \sum_i p_i u_i$. With `play="switch"` the
     control comes from a single expert. At each step, another expert is drawn with a
