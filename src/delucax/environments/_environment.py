@@ -79,6 +79,7 @@ def _as_horizon(value: Any) -> int:
 
 
 def _identity(y: Any) -> Any:
+    """The observation `y` itself."""
     return y
 
 
