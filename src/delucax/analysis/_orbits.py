@@ -198,8 +198,8 @@ def periodic_orbit(
 ) -> PeriodicOrbit:
     """A periodic orbit of a hybrid system and its multipliers, by Newton's method.
 
-    The orbit is a fixed point of [`delucax.analysis.poincare_map`][] near a guess. The
-    vector field must not depend on time. The fixed point is differentiable with respect
+    Newton's method starts from a guess of the state and finds a state that
+    [`delucax.analysis.poincare_map`][] maps to itself. The vector field must not depend on time. The fixed point is differentiable with respect
     to the dynamics, by the implicit function theorem.
 
     **Arguments:**

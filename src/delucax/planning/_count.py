@@ -32,8 +32,8 @@ def count_evaluations(
 ) -> tuple[Any, Evaluations]:
     """Run a function of the dynamics, and count how often it evaluates the dynamics.
 
-    The function gets a version of the dynamics that reports each evaluation to the host
-    at run time. The count is therefore exact in compiled loops too. Under `jax.vmap`
+    `count_evaluations` calls the function with dynamics that count their evaluations
+    while the program runs. The count is therefore exact in compiled loops too. Under `jax.vmap`
     the evaluations of all members of the batch are counted. Evaluations that XLA
     removes as dead code are not counted.
 

@@ -81,9 +81,9 @@ def gpc(
     the disturbances in `loop.signal`, and the matrices $E$ side by side in `theta`,
     shape `(m, memory n)`.
 
-    **Raises:** `ValueError` if `base` does not stabilise the dynamics, does not fit
-    them or cannot be computed, the cost is not a scalar, the state is not observed, or
-    a number is out of its range.
+    **Raises:** `ValueError` if `base` does not stabilise the dynamics or has the wrong
+    sizes, if there is no default for it, if the cost is not a scalar or the state is
+    not observed, or if a number is out of its range.
 
     Source: Agarwal, Bullins, Hazan, Kakade and Singh, 2019.
 
@@ -177,9 +177,9 @@ def drc(
     nature's outputs in `loop.signal`, and the matrices $M$ side by side in `theta`,
     shape `(m, memory p)`.
 
-    **Raises:** `ValueError` if `base` does not stabilise the dynamics, does not fit
-    them or cannot be computed, the cost is not a scalar, or a number is out of its
-    range.
+    **Raises:** `ValueError` if `base` does not stabilise the dynamics or has the wrong
+    sizes, if there is no default for it, if the cost is not a scalar, or if a number is
+    out of its range.
 
     Source: Simchowitz, Singh and Hazan, 2020.
 
