@@ -199,8 +199,9 @@ def periodic_orbit(
     """A periodic orbit of a hybrid system and its multipliers, by Newton's method.
 
     Newton's method starts from a guess of the state and finds a state that
-    [`delucax.analysis.poincare_map`][] maps to itself. The vector field must not depend on time. The fixed point is differentiable with respect
-    to the dynamics, by the implicit function theorem.
+    [`delucax.analysis.poincare_map`][] maps to itself. The vector field must not depend
+    on time. The fixed point is differentiable with respect to the dynamics, by the
+    implicit function theorem.
 
     **Arguments:**
 

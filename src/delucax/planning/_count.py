@@ -33,9 +33,9 @@ def count_evaluations(
     """Run a function of the dynamics, and count how often it evaluates the dynamics.
 
     `count_evaluations` calls the function with dynamics that count their evaluations
-    while the program runs. The count is therefore exact in compiled loops too. Under `jax.vmap`
-    the evaluations of all members of the batch are counted. Evaluations that XLA
-    removes as dead code are not counted.
+    while the program runs. The count is therefore exact in compiled loops too. Under
+    `jax.vmap` the evaluations of all members of the batch are counted. Evaluations that
+    XLA removes as dead code are not counted.
 
     Do not use `count_evaluations` to measure time: each report takes microseconds, and
     each call compiles again.
