@@ -1,4 +1,5 @@
-"""Check the built site, after `make docs`, and the links of the pages beside it.
+"""Check the built site, after `make docs`, and the links of the pages beside it. An
+argument names another folder of the site.
 
 Every link inside the site leads to a page, and to an anchor of it; every image is there
 and has a text for those who do not see it; no two pages share a title; and no line of
@@ -127,6 +128,7 @@ def broken(root: Path, name: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    wrong = faults(SITE) + broken(ROOT, "README.md") + broken(ROOT, "CONTRIBUTING.md")
+    site = Path(sys.argv[1]) if len(sys.argv) > 1 else SITE
+    wrong = faults(site) + broken(ROOT, "README.md") + broken(ROOT, "CONTRIBUTING.md")
     print("\n".join(wrong) or "the site is sound")
     sys.exit(bool(wrong))

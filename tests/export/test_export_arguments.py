@@ -135,7 +135,7 @@ LAW = dlx.controllers.Linear(jnp.array([[1.0, 2.0]]))
         ),
         (
             dict(function_or_controller=dlx.controllers.Zero(1)),
-            "example must be an observation",
+            "size of the observation is not known from this controller",
         ),
     ],
 )

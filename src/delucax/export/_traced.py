@@ -154,6 +154,6 @@ def _observation(
     if size is not None:
         return jax.ShapeDtypeStruct((size,), dtype)
     raise ValueError(
-        "export.c: example must be an observation (zeros of its shape are enough), or "
-        "plant must be given, because the controller does not fix the size."
+        "export.c: the size of the observation is not known from this controller. Pass "
+        "plant=env.dynamics, or example=jnp.zeros(n) for n observations."
     )

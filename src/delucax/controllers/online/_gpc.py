@@ -42,8 +42,8 @@ def gpc(
     applied. At each step, the matrices $E$ move against the gradient of a
     counterfactual cost. This is the cost that the step would have had if the same
     matrices had always been used: see [`delucax.controllers.OnlineLearner`][]. Compared
-    with the best fixed $E$ in hindsight, the regret over $T$ steps grows as $\sqrt T$,
-    for any disturbances.
+    with the best fixed $E$ in hindsight, the regret over $T$ steps is at most of the
+    order $\sqrt T$ for a linear plant and a convex cost, whatever the disturbances.
 
     The dynamics may be linear (time-invariant or time-varying) or nonlinear, and the
     state must be observed. Nonlinear dynamics are linearised along the run. For
@@ -143,7 +143,7 @@ def drc(
     matrices $M$ move against the gradient of a counterfactual cost. This is the cost
     that the step would have had if the same matrices had been used in the past too: see
     [`delucax.controllers.OnlineLearner`][]. The regret against the best fixed $M$ in
-    hindsight grows as $\sqrt T$.
+    hindsight is at most of the order $\sqrt T$ for a linear plant and a convex cost.
 
     With a `base` whose control is zero, `drc` is the gradient response controller. A
     base such as [`delucax.controllers.LQG`][] gives good control from the start, and
