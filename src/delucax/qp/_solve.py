@@ -40,7 +40,7 @@ def solve(
     Each guess gives a linear system, whose solution gives the next guess. Most
     quadratic programs in control are solved after a few guesses. If the guesses do not
     lead to a solution, a predictor-corrector interior-point method on the homogeneous
-    embedding finds a solution, or a certificate that there is none.
+    embedding finds a solution, or a certificate that no solution exists.
 
     You can differentiate the solution, in forward and reverse mode, with respect to
     every array of the problem. The derivative comes from the implicit function theorem,
