@@ -1,5 +1,6 @@
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import pytest
 from helpers import once, user_error
@@ -122,6 +123,9 @@ def test_an_open_loop_says_where_it_fails():
     first = r"^open_loop: The states .* The state 2 is the first that is not finite"
     with user_error(RuntimeError, match=first):
         dlx.open_loop(dynamics, [3.0], jnp.zeros((50, 1)))
+    last = lambda x0: dlx.open_loop(dynamics, x0, jnp.zeros((50, 1)))[-1, 0]
+    with user_error(RuntimeError, match=first):
+        jax.grad(last)(jnp.array([3.0]))
     ball = dlx.make("bouncing_ball").dynamics
     guard = r"^open_loop: A state is beyond .* It was the event bounce at t = 0\.$"
     with user_error(RuntimeError, match=guard):

@@ -40,6 +40,7 @@ from ._derivatives import (
     nan_tangent as nan_tangent,
     operations as operations,
     value_and_jacobians as value_and_jacobians,
+    without_tangents as without_tangents,
 )
 from ._loops import bounded_while as bounded_while, in_parts as in_parts
 from ._normal import normal as normal

@@ -108,6 +108,12 @@ def is_constant(f: Callable[..., Any], *args: Any) -> bool:
 _nan_tangent = Primitive("nan_tangent")
 
 
+def without_tangents(tree: Any) -> Any:
+    """The tree without the derivatives that its arrays carry."""
+    floats, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lax.stop_gradient, floats), rest)
+
+
 def nan_tangent(tangent: Array, ok: Array) -> Array:
     """The tangent where `ok` holds; NaN elsewhere, unless the tangent is zero.
 

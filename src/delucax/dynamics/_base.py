@@ -17,7 +17,13 @@ from .._check import (
     finite_rows,
     finite_vector,
 )
-from .._jax import by_components, join_state, split_state, stack_steps
+from .._jax import (
+    by_components,
+    join_state,
+    split_state,
+    stack_steps,
+    without_tangents,
+)
 from .._module import as_float_array, check_parameters
 from .._results import (
     choose,
@@ -234,12 +240,14 @@ def open_loop(
         run = _open_loop(dynamics, x0, controls, w, t0)
 
     def facts() -> str:
-        bad = ~np.all(np.isfinite(run.states), axis=-1)
+        given = dynamics, controls, w, t0, run.states
+        plant, u, disturbances, start, states = without_tangents(given)
+        bad = ~np.all(np.isfinite(states), axis=-1)
         said = f"The state {np.argmax(bad)} is the first that is not finite."
-        if not dynamics.event_names:
+        if not plant.event_names:
             return said if bad.any() else ""
-        times = t0 + jnp.arange(len(controls)) * dynamics.dt
-        fault = dynamics.describe_fault(times, run.states[:-1], controls, w)
+        times = start + jnp.arange(len(u)) * plant.dt
+        fault = plant.describe_fault(times, states[:-1], u, disturbances)
         return fault or (said if bad.any() else "")
 
     return raise_on_failure(run, where, it=None, facts=facts).states

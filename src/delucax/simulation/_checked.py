@@ -3,11 +3,10 @@
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.lax as lax
 import numpy as np
 
 from .._check import is_concrete
+from .._jax import without_tangents
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
 from ..systems import AbstractPlant
@@ -42,7 +41,7 @@ def checked(
     if failed:
         # Under `jax.grad` without a jit the arrays have values, but NumPy cannot read
         # them.
-        trajectory, dynamics = _without_tangents((trajectory, dynamics))
+        trajectory, dynamics = without_tangents((trajectory, dynamics))
         message = f"{where}: {RESULTS[trajectory.result]}"
         if trajectory.states is not None:
             bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
@@ -66,9 +65,3 @@ def checked(
                 message = f"{message} {dynamics.describe_fault(*steps)}".rstrip()
         raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
     return trajectory
-
-
-def _without_tangents(tree: Any) -> Any:
-    """The tree without the derivatives that its arrays carry."""
-    floats, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.tree.map(lax.stop_gradient, floats), rest)
