@@ -1,5 +1,6 @@
 """Every Python block of the pages and of the README runs, page by page, except those
-marked `notest`, which need what is not there.
+marked `notest`, which need what is not there. Blocks `py` are code of other libraries,
+which the pages show beside ours.
 
 A `text` block right under a block is what it shows, as under the cell of a notebook. A
 comment `<!-- raises -->` before a block says that it raises the error that the `text`
@@ -15,6 +16,7 @@ import importlib.util
 import itertools
 import re
 import symtable
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = pages_of(ROOT)
 BLOCK = re.compile(
     r"^(?:<!-- (?P<mark>notest|elsewhere|raises)(?:: )?(?P<why>[^\n]*?) -->\n)?"
-    r"```(?P<language>python|text)[^\n]*\n(?P<code>.*?)^```$",
+    r"```(?P<language>python|py|text)[^\n]*\n(?P<code>.*?)^```$",
     re.DOTALL | re.MULTILINE,
 )
 
@@ -42,13 +44,13 @@ class Block(NamedTuple):
     raises: bool
 
 
-def _blocks(page):
-    """The Python blocks of a page that are to run."""
+def _blocks(page, language="python"):
+    """The blocks of a page in this language that are to run."""
     text = page.read_text()
     blocks = list(BLOCK.finditer(text))
     for block, after in itertools.zip_longest(blocks, blocks[1:]):
         mark = block.group("mark")
-        if block.group("language") != "python" or mark in MARKS:
+        if block.group("language") != language or mark in MARKS:
             continue
         shown = None
         if after is not None and after.group("language") == "text":
@@ -103,6 +105,7 @@ MARKS = ("notest", "elsewhere")
 
 
 RUNNABLE = [page for page in PAGES if list(_blocks(page))]
+OF_OTHERS = [page for page in PAGES if list(_blocks(page, "py"))]
 
 
 def _run(page, blocks):
@@ -155,6 +158,17 @@ def test_page_runs(page, in_a_folder, pytestconfig):
         shown = [i for i, block in enumerate(blocks) if block.shown is not None]
         blocks = _with_needed(blocks, shown)
     _run(page, blocks)
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, id=name_of(ROOT, p)) for p in OF_OTHERS]
+)
+def test_code_of_other_libraries_runs(page, in_a_folder, pytestconfig):
+    if pytestconfig.getoption("only_outputs"):
+        pytest.skip("it shows no outputs")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # theirs are not ours to mend
+        _run(page, list(_blocks(page, "py")))
 
 
 def test_wheels_have_the_name_of_this_version():
