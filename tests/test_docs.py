@@ -5,7 +5,8 @@ which the pages show beside ours.
 A `text` block right under a block is what it shows, as under the cell of a notebook. A
 comment `<!-- raises -->` before a block says that it raises the error that the `text`
 block after it shows; `<!-- elsewhere: file -->` that another test runs it, in another
-precision or in part; and `<!-- notest: why -->` that it is left out.
+precision or in part; and `<!-- notest: why -->` that it is left out. A block of C after
+`<!-- part of: file -->` is in this file, which the page writes.
 
 The blocks of a page share one namespace. With `--only-outputs` those run that show
 something, and those that they need, so that a writer need not wait for the rest.
@@ -31,8 +32,8 @@ import delucax as dlx
 ROOT = Path(__file__).parents[1]
 PAGES = pages_of(ROOT)
 BLOCK = re.compile(
-    r"^(?:<!-- (?P<mark>notest|elsewhere|raises)(?:: )?(?P<why>[^\n]*?) -->\n)?"
-    r"```(?P<language>python|py|text)[^\n]*\n(?P<code>.*?)^```$",
+    r"^(?:<!-- (?P<mark>notest|elsewhere|raises|part of)(?:: )?(?P<why>[^\n]*?) -->\n)?"
+    r"```(?P<language>python|py|text|c)[^\n]*\n(?P<code>.*?)^```$",
     re.DOTALL | re.MULTILINE,
 )
 
@@ -127,6 +128,19 @@ def _run(page, blocks):
         check_output(f"{raised.type.__name__}: {raised.value}", shown)
 
 
+def _check_part(code, text):
+    """The text has these lines, with nearly the same numbers."""
+    number = r"\d+\.\d+"
+    pattern = r"\s*".join(
+        f"({number})" if re.fullmatch(number, token) else re.escape(token)
+        for token in re.findall(rf"{number}|\w+|\S", code)
+    )
+    found = re.search(pattern, text)
+    assert found, f"{code} is not in\n{text}"
+    values = [float(value) for value in re.findall(number, code)]
+    assert [float(value) for value in found.groups()] == pytest.approx(values, rel=1e-3)
+
+
 def test_blocks_that_are_left_out_need_what_is_not_there():
     marks = [m for page in PAGES for m in BLOCK.finditer(page.read_text())]
     why = {kind: [m["why"] for m in marks if m["mark"] == kind] for kind in MARKS}
@@ -158,6 +172,9 @@ def test_page_runs(page, in_a_folder, pytestconfig):
         shown = [i for i, block in enumerate(blocks) if block.shown is not None]
         blocks = _with_needed(blocks, shown)
     _run(page, blocks)
+    for block in BLOCK.finditer(page.read_text()):
+        if block["mark"] == "part of":
+            _check_part(block["code"], Path(block["why"]).read_text())
 
 
 @pytest.mark.parametrize(
