@@ -1,8 +1,12 @@
 """Unknown first states, parameters and durations of a plan."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import pytest
+from examples import check_output, output_of
 from helpers import assert_close, needs_x64, once, user_error
 
 import delucax as dlx
@@ -48,6 +52,16 @@ def test_derivatives_of_a_least_time():
         moved[1][i] -= step
         ends = [duration(*at) for at in moved]
         assert_close(slope, (ends[0] - ends[1]) / (2 * step), rtol=1e-6)
+
+
+@needs_x64
+def test_the_derivative_of_the_page():
+    page = Path(__file__).parents[2] / "docs" / "optimal_control.md"
+    pattern = r"(?ms)^```python\n(.*?)^```\n\n(?:```text\n(.*?)```)?"
+    blocks = re.findall(pattern, page.read_text())
+    namespace = {}
+    for code, shown in (*blocks[:2], next(b for b in blocks if "jax.grad(" in b[0])):
+        check_output(output_of(code, namespace), shown)
 
 
 def test_times_of_the_user():
