@@ -97,6 +97,7 @@ class Environment(eqx.Module):
         reward.
     - `disturbance`: a [`delucax.AbstractDisturbance`][]. By default, dynamics with a
         diffusion get Brownian increments, and all other dynamics get no disturbance.
+        A disturbance that you pass replaces the Brownian increments.
     - `sensor_noise`: a [`delucax.AbstractDisturbance`][] that is added to the
         observation; none by default.
     - `initial_state`: the first state, shape `(n,)`, or a function that draws the first

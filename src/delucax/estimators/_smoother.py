@@ -141,10 +141,12 @@ def smooth(
     The belief of the filter is $N(\mu_k, \Sigma_k)$ before the observation $y_k$ and
     $N(m_k, P_k)$ after it. The smoother goes backwards:
 
-    $$\mathrm{mean}_k = m_k + G_k (\mathrm{mean}_{k+1} - \mu_{k+1}), \qquad
-    \mathrm{covariance}_k = P_k
-    + G_k (\mathrm{covariance}_{k+1} - \Sigma_{k+1}) G_k^T, \qquad
-    G_k = P_k A^T \Sigma_{k+1}^{-1}$$
+    $$\mathrm{mean}_k = m_k + G_k (\mathrm{mean}_{k+1} - \mu_{k+1}),$$
+
+    $$\mathrm{covariance}_k = P_k
+    + G_k (\mathrm{covariance}_{k+1} - \Sigma_{k+1}) G_k^T,$$
+
+    where $G_k = P_k A^T \Sigma_{k+1}^{-1}$.
 
     The covariance is computed in a form that stays semidefinite. For a nonlinear
     filter, $P_k A^T$ is replaced by the cross-covariance of the states at steps $k$ and

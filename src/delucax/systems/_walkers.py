@@ -53,7 +53,7 @@ class SimplestWalker(AbstractHybridSystem):
     slope: Real = parameter(0.009)
 
     state_names = ("stance", "stance rate", "swing", "swing rate")
-    control_names = ("torque",)
+    control_names, time_unit = ("torque",), "sqrt(l/g)"
     event_names, event_directions = ("step",), (1,)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:

@@ -65,7 +65,8 @@ def policy_gradient(small: bool = False) -> Finding:
     claims = [
         descent_claim(first, faster),
         Claim(
-            "Evolution strategies need more rollouts at every setting and seed",
+            "For every setting and seed, evolution strategies need more rollouts than "
+            "the gradient",
             f"{len(fewest)} of {seeds * len(curves)} runs get there"
             + ("" if least is None else f", the fastest after {least:,} rollouts"),
             least is None or (first is not None and least > first),
@@ -197,14 +198,14 @@ def estimator_variance(small: bool = False) -> Finding:
         ),
         Claim(
             "The variance of REINFORCE does not depend on the number of parameters "
-            "(slope -0.2 to 0.2), and it adds to the variance that the problem itself "
-            "has",
+            "(slope -0.2 to 0.2), and is not zero",
             f"slope {flat:.2f}, {last:.3g} times the squared gradient",
             abs(flat) <= 0.2 and last > 0,
         ),
         Claim(
-            "Over a long horizon with random starts the analytic gradient loses: its "
-            "variance grows above that of REINFORCE, at equal rollouts",
+            "Over a long horizon with random starts, the variance of the analytic "
+            "gradient is larger than that of REINFORCE, for the same number of "
+            "rollouts",
             f"{exploding:.1e} times from {over[0]['horizon']} to {over[-1]['horizon']} "
             f"steps; above from {lost[0]} steps on"
             if lost

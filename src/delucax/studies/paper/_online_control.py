@@ -93,7 +93,7 @@ def pendulum_shock(small: bool = False) -> Finding:
             bool(plan[2] <= 1.001),
         ),
         _at_most(
-            "Without noise MPC costs at most 1.01 times what the plan does",
+            "Without noise the cost of MPC is at most 1.01 times the cost of the plan",
             *(quiet["MPC"], quiet["iLQR, with gains"], 1.01, 4),
         ),
         in_shock("During the shock GPC costs less than LQR", "GPC", "LQR"),
@@ -106,7 +106,8 @@ def pendulum_shock(small: bool = False) -> Finding:
             *("GPC", "MPC"),
         ),
         _at_most(
-            "AdaGPC costs at most 1.02 times what GPC does over the run with the shock",
+            "Over the run with the shock the cost of AdaGPC is at most 1.02 times the "
+            "cost of GPC",
             *(means["AdaGPC", "shock"], means["GPC", "shock"], 1.02),
         ),
         in_shock(
@@ -223,8 +224,8 @@ def lq_perturbations(small: bool = False) -> Finding:
     ratio, _, high = gpc_over("LQR", "Gaussian")
     claims = [
         Claim(
-            "Under Gaussian noise GPC costs at most 1.05 times what LQR does, which is "
-            "optimal there",
+            "Under Gaussian noise, where LQR is optimal, the cost of GPC is at most "
+            "1.05 times the cost of LQR",
             f"{ratio:.3f} times (to {high:.3f})",
             bool(high <= 1.05),
         )
@@ -232,8 +233,8 @@ def lq_perturbations(small: bool = False) -> Finding:
     for kind in ("sinusoidal", "constant"):
         lqr, robust = gpc_over("LQR", kind), gpc_over("H-infinity", kind)
         statement = (
-            f"Under a {kind} perturbation GPC costs at most 0.25 times what LQR does, "
-            "and less than H-infinity"
+            f"Under a {kind} perturbation the cost of GPC is at most 0.25 times the "
+            "cost of LQR, and lower than the cost of H-infinity"
         )
         measured = f"{lqr[0]:.3f} times LQR, {robust[0]:.3f} times H-infinity"
         holds = bool(lqr[2] <= 0.25 and robust[2] < 1)

@@ -77,7 +77,7 @@ def oracle_complexity(small: bool = False) -> Finding:
         Claim(
             "The solutions are the same up to the error of the derivatives (1e-3 of "
             "the cost)",
-            f"{best:.6f}, the other {gap:.1e} away",
+            f"{best:.6f}; the two costs differ by {gap:.1e}",
             bool(gap < 1e-3),
         ),
         Claim(
